@@ -1,0 +1,75 @@
+# Every target first sets up what is missing: Debian packages, .venv, and what pip installs there.
+
+SYSTEM_PYTHON := /usr/bin/python3
+PACKAGES := python3-dolfinx python3-h5py-mpi libopenblas0-serial openmpi-bin \
+    python3-venv python3-dev gcc g++ \
+    libegl1 libgl1-mesa-dri libxrender1
+PYTHON := .venv/bin/python
+READY := .venv/ready
+DEMO := beam
+ARGS :=
+
+# Open MPI refuses root without these two; one BLAS thread per rank.
+export OMPI_ALLOW_RUN_AS_ROOT := 1
+export OMPI_ALLOW_RUN_AS_ROOT_CONFIRM := 1
+export OMP_NUM_THREADS := 1
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all lint bench clean system
+
+help: ## list the targets
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
+
+setup: $(READY) ## install what is missing
+
+demo: $(READY) ## run configs/beam.toml on 2 ranks and print where the report is
+	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
+	@echo "report: $(CURDIR)/results/$(DEMO)/report.html"
+
+test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
+	@$(PYTHON) -m pytest $(ARGS)
+
+test-all: $(READY) ## run the test suite with the slow tests
+	@$(PYTHON) -m pytest -m "not benchmark" $(ARGS)
+
+lint: $(READY) ## check style, types and layers
+	@$(PYTHON) -m ruff check
+	@$(PYTHON) -m ruff format --check
+	@$(PYTHON) -m mypy
+	@.venv/bin/lint-imports
+
+bench: $(READY) ## measure times
+	@$(PYTHON) -m benchmarks $(ARGS)
+
+clean: ## remove .venv and caches; results stay
+	@rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+system:
+	@missing=; for package in $(PACKAGES); do \
+	    case "$$(dpkg-query -W -f '$${db:Status-Status}' $$package 2>/dev/null || true)" in \
+	        installed) ;; *) missing="$$missing $$package" ;; esac; \
+	done; \
+	if [ -n "$$missing" ]; then \
+	    echo "installing:$$missing"; \
+	    command -v apt-get >/dev/null || { echo "apt-get not found: tissuq is set up on Debian 12" >&2; exit 1; }; \
+	    sudo=; [ "$$(id -u)" = 0 ] || sudo=sudo; \
+	    $$sudo apt-get update -qq; \
+	    $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
+	fi
+
+# Debian's h5py is there, but under a name that pip does not know: tell pip, or it fetches a wheel that breaks DOLFINx.
+# A constraint file given by environment holds for build environments too.
+$(READY): pyproject.toml constraints.txt | system
+	@echo "installing Python packages into .venv"
+	@$(SYSTEM_PYTHON) -m venv --system-site-packages .venv
+	@$(PYTHON) -c 'import h5py, pathlib, sysconfig; \
+	    info = pathlib.Path(sysconfig.get_path("purelib"), f"h5py-{h5py.__version__}.dist-info"); \
+	    info.mkdir(exist_ok=True); \
+	    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: h5py\nVersion: {h5py.__version__}\n")'
+	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --editable '.[dev]'
+	@$(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
+	@touch $@

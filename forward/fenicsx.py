@@ -1,0 +1,308 @@
+"""The only file that knows a DOLFINx version: meshes, spaces, compiled forms, assembly, linear solvers.
+
+Written for DOLFINx 0.5.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import basix
+import basix.cell
+import numpy as np
+import ufl
+from dolfinx import fem, geometry, mesh, plot
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from forward.geometry import AXES, Box
+from forward.model import FloatArray, SolveError
+
+_CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
+
+
+# --- compilation -----------------------------------------------------------------------------------------------------
+
+
+def _cache_directory() -> Path:
+    """Compiled forms use the instructions of this processor, so each kind of processor has a folder of its own."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next(line for line in lines if line.startswith("flags"))
+    except (OSError, StopIteration):
+        processor = ""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "tissuq" / f"forms-{hashlib.sha256(processor.encode()).hexdigest()[:12]}"
+
+
+_CACHE = _cache_directory()
+_JIT = {
+    "cffi_extra_compile_args": ["-O3", "-march=native"],
+    "cffi_libraries": ["m"],
+    "cache_dir": str(_CACHE),
+    "timeout": 600,
+}
+
+
+@contextmanager
+def _compiling(comm: Any) -> Iterator[None]:
+    """Let one process of the machine compile at a time.
+
+    A compilation that was killed leaves a source without its end mark, which later ones would wait for; under the
+    lock no one else is compiling, so such leftovers can be removed.
+    """
+    if comm.rank > 0:
+        yield
+        return
+    _CACHE.mkdir(parents=True, exist_ok=True)
+    with (_CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for source in _CACHE.glob("*.c"):
+            if not source.with_suffix(".c.cached").exists():
+                source.unlink()
+        yield
+
+
+def compile_form(form: Any, comm: Any) -> Any:
+    """Compile a UFL form, once per machine; collective over `comm`."""
+    with _compiling(comm):
+        return fem.form(form, jit_params=_JIT)
+
+
+def compile_expression(expression: Any, points: FloatArray, comm: Any) -> Any:
+    """Compile a UFL expression for evaluation at reference `points`; collective over `comm`."""
+    with _compiling(comm):
+        return fem.Expression(expression, points, jit_params=_JIT)
+
+
+# --- meshes and spaces -----------------------------------------------------------------------------------------------
+
+
+def box_mesh(comm: Any, box: Box) -> Any:
+    """Mesh a box; collective over `comm`."""
+    return mesh.create_box(comm, [[0.0, 0.0, 0.0], list(box.size)], list(box.cells), cell_type=_CELLS[box.cell])
+
+
+def box_facets(msh: Any, box: Box) -> dict[str, NDArray[np.int32]]:
+    """Return this rank's facets on each named boundary of a box."""
+    facets = {}
+    for axis, (_, length) in enumerate(zip(AXES, box.size, strict=True)):
+        for end, position in (("min", 0.0), ("max", length)):
+
+            def on_boundary(x: FloatArray, axis: int = axis, position: float = position, length: float = length) -> Any:
+                return np.abs(x[axis] - position) < 1e-9 * length
+
+            facets[f"{AXES[axis]}-{end}"] = mesh.locate_entities_boundary(msh, 2, on_boundary)
+    return facets
+
+
+def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]], degree: int) -> tuple[Any, dict[str, int]]:
+    """Return the surface measure of the named boundaries and the tag of each."""
+    tags = {name: tag for tag, name in enumerate(facets, start=1)}
+    indices = np.concatenate(list(facets.values()))
+    values = np.concatenate([np.full(len(facets[name]), tag, dtype=np.int32) for name, tag in tags.items()])
+    order = np.argsort(indices)
+    marked = mesh.meshtags(msh, 2, indices[order].astype(np.int32), values[order])
+    return ufl.Measure("ds", domain=msh, subdomain_data=marked, metadata={"quadrature_degree": degree}), tags
+
+
+def vector_space(msh: Any, degree: int) -> Any:
+    """Continuous vector-valued Lagrange elements."""
+    return fem.VectorFunctionSpace(msh, ("Lagrange", degree))
+
+
+def quadrature_space(msh: Any, degree: int) -> Any:
+    """Scalars at the quadrature points."""
+    return fem.FunctionSpace(msh, ufl.FiniteElement("Quadrature", msh.ufl_cell(), degree, quad_scheme="default"))
+
+
+def owned_nodes(space: Any) -> int:
+    """Number of nodes that this rank owns."""
+    return int(space.dofmap.index_map.size_local)
+
+
+def node_coordinates(space: Any) -> FloatArray:
+    """Coordinates (n_owned, 3) of the nodes that this rank owns."""
+    return np.asarray(space.tabulate_dof_coordinates()[: owned_nodes(space)])
+
+
+def global_node_numbers(space: Any) -> NDArray[np.int64]:
+    """Global numbers of this rank's nodes, ghosts included."""
+    index_map = space.dofmap.index_map
+    count = index_map.size_local + index_map.num_ghosts
+    return np.asarray(index_map.local_to_global(np.arange(count, dtype=np.int32)))
+
+
+def boundary_nodes(space: Any, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return this rank's nodes (ghosts included) on facets; collective."""
+    return np.asarray(fem.locate_dofs_topological(space, 2, facets))
+
+
+def constraint(space: Any, axis: int, nodes: NDArray[np.int32]) -> Any:
+    """Mark a component of nodes as prescribed, for the assembly of matrices."""
+    return fem.dirichletbc(fem.Constant(space.mesh, PETSc.ScalarType(0)), 3 * nodes + axis, space.sub(axis))
+
+
+def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
+    """Return the nodes (n_cells, k) of this rank's cells in VTK's order, and VTK's number of the cell type."""
+    topology, kinds, _ = plot.create_vtk_mesh(space)
+    owned = space.mesh.topology.index_map(3).size_local
+    return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
+
+
+def point_weights(space: Any, point: tuple[float, float, float]) -> tuple[NDArray[np.int32], FloatArray] | None:
+    """Return nodes and weights that interpolate at a point, where this rank owns a cell around it."""
+    msh = space.mesh
+    tree = geometry.BoundingBoxTree(msh, 3, padding=1e-10)
+    position = np.asarray(point, dtype=float)
+    candidates = geometry.compute_collisions(tree, position[None, :])
+    cells = geometry.compute_colliding_cells(msh, candidates, position[None, :]).links(0)
+    cells = cells[cells < msh.topology.index_map(3).size_local]
+    if len(cells) == 0:
+        return None
+    nodes = space.dofmap.cell_dofs(cells[0])
+    probe = fem.Function(space)
+    weights = np.empty(len(nodes))
+    for k, node in enumerate(nodes):
+        probe.x.array[:] = 0
+        probe.x.array[3 * node] = 1
+        weights[k] = probe.eval(position, cells[0])[0]
+    return nodes, weights
+
+
+def quadrature_points(space: Any, degree: int) -> FloatArray:
+    """Reference points (q, 3) of the quadrature that the integrals use."""
+    cell = basix.cell.string_to_type(space.mesh.ufl_cell().cellname())
+    points, _ = basix.make_quadrature(cell, degree)  # type: ignore[attr-defined]
+    return np.asarray(points)
+
+
+def owned_cells(space: Any) -> NDArray[np.int32]:
+    """Return the cells that this rank owns."""
+    return np.arange(space.mesh.topology.index_map(3).size_local, dtype=np.int32)
+
+
+def constant(msh: Any, value: Any) -> Any:
+    """A constant of forms whose value can change without compiling again."""
+    return fem.Constant(msh, np.asarray(value, dtype=PETSc.ScalarType))
+
+
+def function(space: Any) -> Any:
+    """A finite-element function, zero."""
+    return fem.Function(space)
+
+
+# --- assembly and linear algebra -------------------------------------------------------------------------------------
+
+
+class VectorAssembler:
+    """A compiled linear form with its vector, used again for every assembly."""
+
+    def __init__(self, form: Any, comm: Any) -> None:
+        self._form = compile_form(form, comm)
+        self._vector = fem.petsc.create_vector(self._form)
+
+    def __call__(self) -> FloatArray:
+        """Assemble; return a copy of this rank's part (U_local,)."""
+        with self._vector.localForm() as local:
+            local.set(0.0)
+        fem.petsc.assemble_vector(self._vector, self._form)
+        self._vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        return np.array(self._vector.array_r)
+
+
+class ScalarAssembler:
+    """A compiled functional, summed over the ranks."""
+
+    def __init__(self, form: Any, comm: Any) -> None:
+        self._form = compile_form(form, comm)
+        self._comm = comm
+
+    def __call__(self) -> float:
+        """Assemble; return the same value on every rank."""
+        return float(self._comm.allreduce(fem.assemble_scalar(self._form)))
+
+
+class DirectSolver:
+    """The stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
+
+    One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
+    communicator is created in a loop.
+    """
+
+    def __init__(self, form: Any, constraints: list[Any], comm: Any, *, symmetric: bool) -> None:
+        self._form = compile_form(form, comm)
+        self._constraints = constraints
+        self._matrix = fem.petsc.create_matrix(self._form)
+        self._symmetric = symmetric
+        if symmetric:
+            self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._ksp = PETSc.KSP().create(comm)
+        self._ksp.setOperators(self._matrix)
+        self._ksp.setType("preonly")
+        self._ksp.pc.setType("cholesky" if symmetric else "lu")
+        self._ksp.pc.setFactorSolverType("mumps")
+        self._right = self._matrix.createVecLeft()
+        self._solution = self._matrix.createVecRight()
+
+    def factorise(self) -> None:
+        """Assemble and factorise.
+
+        Raises
+        ------
+        SolveError
+            If the matrix is singular or has entries that are not finite.
+        """
+        self._matrix.zeroEntries()
+        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)  # type: ignore[misc]
+        self._matrix.assemble()
+        self._ksp.setUp()
+        status = self._ksp.pc.getFactorMatrix().getMumpsInfog(1)
+        if status < 0:
+            message = (
+                "the stiffness is singular" if status == -10 else f"the factorisation failed (MUMPS error {status})"
+            )
+            raise SolveError(message)
+
+    def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve with the factor at hand, or with its transpose."""
+        self._right.array[:] = right
+        if transpose and not self._symmetric:
+            self._ksp.solveTranspose(self._right, self._solution)
+        else:
+            self._ksp.solve(self._right, self._solution)
+        return np.array(self._solution.array_r)
+
+    def negative_pivots(self) -> int:
+        """Number of negative pivots of LDLᵀ, that is of negative eigenvalues; −1 where it is not known."""
+        if not self._symmetric:
+            return -1
+        return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))
+
+
+def smallest(comm: Any, value: float) -> float:
+    """Smallest value over the ranks; NaN counts as −∞."""
+    return float(comm.allreduce(value if value == value else -np.inf, op=MPI.MIN))  # noqa: PLR0124
+
+
+def total(comm: Any, values: FloatArray) -> FloatArray:
+    """Sum of arrays over the ranks."""
+    if comm.size == 1:
+        return values
+    result = np.empty_like(values)
+    comm.Allreduce(values, result, op=MPI.SUM)
+    return result
+
+
+def sum_ghosts(values: Any) -> FloatArray:
+    """Send what a function holds at ghost nodes to their owners, add it there, and return the owned part."""
+    vector = values.vector
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    return np.array(vector.array_r)

@@ -1,0 +1,229 @@
+"""Evaluation of the outputs of a finite-element solution, with their derivatives.
+
+Each functional has a value ψ(u, ω), its gradient ∂ψ/∂u over all displacement unknowns, and its explicit partial
+derivative ∂ψ/∂ω. They read the state and the parameters that the discretisation is currently set to.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, assert_never
+
+import numpy as np
+import ufl
+
+from forward import fenicsx, kinematics
+from forward.geometry import AXES
+from forward.model import FloatArray
+from forward.outputs import (
+    MaxDisplacement,
+    MaxVonMises,
+    MeanDisplacement,
+    Output,
+    PointDisplacement,
+    Reaction,
+    StrainEnergy,
+    VolumeChange,
+)
+
+if TYPE_CHECKING:
+    from forward.finite_element import Discretisation
+
+
+class Functional(Protocol):
+    """An output ψ(u, ω) of a discretised body; every method is collective over its ranks."""
+
+    def value(self) -> float:
+        """Return ψ, the same on every rank."""
+
+    def gradient(self) -> FloatArray:
+        """Return this rank's part (U_local,) of ∂ψ/∂u, over free and prescribed unknowns."""
+
+    def partial(self) -> FloatArray:
+        """Return the explicit derivative ∂ψ/∂ω (d,)."""
+
+
+def functional(output: Output, body: Discretisation) -> Functional:
+    """Prepare the evaluation of an output."""
+    match output:
+        case MaxDisplacement():
+            return _Extreme(body, None if output.component == "magnitude" else AXES.index(output.component))
+        case PointDisplacement():
+            return _at_point(body, output)
+        case MeanDisplacement():
+            return _mean_over_boundary(body, output)
+        case Reaction():
+            return _Reaction(body, output)
+        case StrainEnergy():
+            return _Integral(body, body.energy_density, 1.0)
+        case VolumeChange():
+            return _Integral(body, body.J - 1, body.spec.body.volume)
+        case MaxVonMises():
+            return _MaxVonMises(body)
+        case _:
+            assert_never(output)
+
+
+class _Linear:
+    """ψ = ⟨g, u⟩ with a fixed g (U_local,)."""
+
+    def __init__(self, body: Discretisation, g: FloatArray) -> None:
+        self._body = body
+        self._g = g
+
+    def value(self) -> float:
+        return self._body.dot(self._g, self._body.state())
+
+    def gradient(self) -> FloatArray:
+        return self._g
+
+    def partial(self) -> FloatArray:
+        return np.zeros(len(self._body.parameters))
+
+
+def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
+    found = fenicsx.point_weights(body.space, output.at)
+    owners = body.comm.allgather(found is not None)
+    if not any(owners):
+        message = f"output '{output.name}': the point {list(output.at)} lies outside the body"
+        raise ValueError(message)
+    probe = fenicsx.function(body.space)
+    if found is not None and owners.index(True) == body.comm.rank:
+        nodes, weights = found
+        probe.x.array[3 * nodes + AXES.index(output.component)] = weights
+    # Weights of ghost nodes travel to the ranks that own them.
+    return _Linear(body, fenicsx.sum_ghosts(probe))
+
+
+def _mean_over_boundary(body: Discretisation, output: MeanDisplacement) -> _Linear:
+    axis = fenicsx.constant(body.mesh, np.eye(3)[AXES.index(output.component)])
+    surface = body.surface(output.on)
+    weights = fenicsx.VectorAssembler(ufl.inner(axis, body.test) * surface, body.comm)()
+    area = body.dot(weights, np.ones_like(weights))
+    return _Linear(body, weights / area)
+
+
+class _Extreme:
+    """ψ = max over the nodes of |u_c|, or of |u|; of nodes that tie, the first in the canonical order counts."""
+
+    def __init__(self, body: Discretisation, axis: int | None) -> None:
+        self._body = body
+        self._axis = axis
+
+    def _candidates(self) -> FloatArray:
+        u = self._body.state().reshape(-1, 3)
+        return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
+
+    def value(self) -> float:
+        return -fenicsx.smallest(self._body.comm, -self._candidates().max(initial=0.0))
+
+    def gradient(self) -> FloatArray:
+        candidates, top = self._candidates(), self.value()
+        ties = np.flatnonzero(candidates >= top * (1 - 1e-10))
+        position = self._body.layout.positions[ties]
+        first = fenicsx.smallest(self._body.comm, float(position.min(initial=np.iinfo(np.int64).max)))
+        g = np.zeros((len(candidates), 3))
+        if top > 0:
+            for node in ties[position == first]:
+                u = self._body.state().reshape(-1, 3)[node]
+                if self._axis is None:
+                    g[node] = u / np.linalg.norm(u)
+                else:
+                    g[node, self._axis] = np.sign(u[self._axis])
+        return g.ravel()
+
+    def partial(self) -> FloatArray:
+        return np.zeros(len(self._body.parameters))
+
+
+class _Integral:
+    """ψ = 1/size ∫ density(u, ω) dX."""
+
+    def __init__(self, body: Discretisation, density: object, size: float) -> None:
+        self._body = body
+        self._density = density
+        self.size = size
+        self._value = fenicsx.ScalarAssembler(density * body.dx, body.comm)
+
+    def value(self) -> float:
+        return self._value() / self.size
+
+    def gradient(self) -> FloatArray:
+        body = self._body
+        form = body.compiled(
+            self, "gradient", lambda: body.vector(ufl.derivative(self._density * body.dx, body.u, body.test))
+        )
+        return np.asarray(form()) / self.size
+
+    def partial(self) -> FloatArray:
+        body = self._body
+        along = body.along_parameters(self._density)
+        if along is None:
+            return np.zeros(len(body.parameters))
+        form = body.compiled(self, "partial", lambda: fenicsx.ScalarAssembler(along * body.dx, body.comm))
+        return np.array([form() for _ in body.unit_directions()]) / self.size
+
+
+class _Reaction:
+    """ψ = wᵀ r(u, ω), with r the imbalance of all unknowns and w = 1 on a component of a boundary's nodes."""
+
+    def __init__(self, body: Discretisation, output: Reaction) -> None:
+        self._body = body
+        nodes = fenicsx.boundary_nodes(body.space, body.facets[output.on])
+        owned = nodes[nodes < body.nodes_owned]
+        self._w = np.zeros(3 * body.nodes_owned)
+        self._w[3 * owned + AXES.index(output.component)] = 1
+
+    def value(self) -> float:
+        return self._body.dot(self._w, self._body.imbalance())
+
+    def gradient(self) -> FloatArray:
+        return self._body.stiffness_times(self._w, transpose=True)
+
+    def partial(self) -> FloatArray:
+        return np.array([self._body.dot(self._w, force) for force in self._body.parameter_forces()])
+
+
+class _MaxVonMises:
+    """ψ = max of the von Mises stress over the quadrature points; of points that tie, the first of the lowest rank.
+
+    The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
+    so that its derivatives are those of an integral.
+    """
+
+    def __init__(self, body: Discretisation) -> None:
+        self._body = body
+        F = ufl.variable(body.F)
+        cauchy = ufl.diff(body.energy_of(F), F) * F.T / ufl.det(F)
+        stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
+        degree = body.spec.body.quadrature
+        self._expression = fenicsx.compile_expression(stress, fenicsx.quadrature_points(body.space, degree), body.comm)
+        self._selector = fenicsx.function(fenicsx.quadrature_space(body.mesh, degree))
+        self._stress = stress
+
+    def _values(self) -> FloatArray:
+        return np.asarray(self._expression.eval(fenicsx.owned_cells(self._body.space)))
+
+    def value(self) -> float:
+        return -fenicsx.smallest(self._body.comm, -self._values().max(initial=0.0))
+
+    def _at_place(self) -> _Integral:
+        """Return the stress at the point where it is largest now."""
+        body = self._body
+        here = np.argwhere(self._values() >= self.value())
+        holders = body.comm.allgather(len(here) > 0)
+        self._selector.x.array[:] = 0
+        if holders.index(True) == body.comm.rank:
+            cell, point = here[0]
+            self._selector.x.array[self._selector.function_space.dofmap.cell_dofs(cell)[point]] = 1
+        self._selector.x.scatter_forward()
+        stress = body.compiled(self, "stress", lambda: _Integral(body, self._selector * self._stress, 1.0))
+        weight = body.compiled(self, "weight", lambda: fenicsx.ScalarAssembler(self._selector * body.dx, body.comm))
+        stress.size = weight()
+        assert isinstance(stress, _Integral)
+        return stress
+
+    def gradient(self) -> FloatArray:
+        return self._at_place().gradient()
+
+    def partial(self) -> FloatArray:
+        return self._at_place().partial()

@@ -1,0 +1,182 @@
+"""The specification of a hyperelastic body: geometry, material, loads, outputs and solver; no FEniCSx until built."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
+
+from pydantic import Field, TypeAdapter, ValidationError, create_model, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from forward.geometry import Box
+from forward.loads import LOAD_SIZES, Displacement, Load
+from forward.materials import MATERIALS, constants
+from forward.newton import NewtonSettings
+from forward.outputs import Output, PointDisplacement, Reaction
+from forward.settings import Settings, nearest
+
+if TYPE_CHECKING:
+    from forward.finite_element import HyperelasticModel
+
+    Material = Settings
+else:
+    # One block per energy, made from its signature, so that the names of the constants stand in one place.
+    Material = Annotated[
+        Union[  # noqa: UP007 - the members are computed
+            tuple(
+                create_model(
+                    energy.__name__.title().replace("_", ""),
+                    __base__=Settings,
+                    __doc__=energy.__doc__,
+                    kind=(Literal[name], name),
+                    **{
+                        constant: (Annotated[(float, *get_args(admissible)[1:])], ...)
+                        for constant, admissible in constants(energy).items()
+                    },
+                )
+                for name, energy in MATERIALS.items()
+            )
+        ],
+        Field(discriminator="kind"),
+    ]
+
+
+class Scalar(NamedTuple):
+    """A number of the model that can be made a parameter."""
+
+    value: float
+    block: type[Settings]
+    field: str
+
+    def objection(self, value: float) -> str | None:
+        """Say why the number cannot be `value`, or nothing if it can."""
+        try:
+            _admissible(self.block, self.field).validate_python(value)
+        except ValidationError as error:
+            return str(error.errors()[0]["msg"]).lower()
+        return None
+
+
+@cache
+def _admissible(block: type[Settings], field: str) -> TypeAdapter[float]:
+    limits = block.model_fields[field].metadata
+    return TypeAdapter(Annotated[(float, Field(), *limits)])  # type: ignore[valid-type]
+
+
+class Hyperelastic(Settings):
+    """A hyperelastic body under loads, solved by finite elements.
+
+    Parameters
+    ----------
+    body
+        Geometry and mesh.
+    material
+        Strain energy and its constants.
+    clamp
+        Boundaries that do not move.
+    displacements
+        Boundaries with components that are moved by a given amount.
+    loads
+        Gravity, tractions and pressures.
+    outputs
+        What is computed from the deformed body.
+    solver
+        Tolerance and limits of the solver.
+    """
+
+    kind: Literal["hyperelastic"] = "hyperelastic"
+    body: Box
+    material: Material
+    clamp: tuple[str, ...] = ()
+    displacements: tuple[Displacement, ...] = ()
+    loads: tuple[Load, ...] = ()
+    outputs: tuple[Output, ...] = Field(min_length=1)
+    solver: NewtonSettings = NewtonSettings()
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Every number that can be made a parameter, by its path."""
+        found = {}
+        for name in type(self.material).model_fields:
+            if name != "kind":
+                found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for load in self.loads:
+            size = LOAD_SIZES[load.kind]
+            found[f"loads.{load.label}.{size}"] = Scalar(getattr(load, size), type(load), size)
+        for displacement in self.displacements:
+            for axis, value in displacement.components.items():
+                found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
+        return found
+
+    @property
+    def unknowns(self) -> int:
+        """Number of displacement unknowns."""
+        return 3 * self.body.nodes
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> HyperelasticModel:
+        """Mesh the body and compile the forms on a communicator; collective.
+
+        Parameters
+        ----------
+        comm
+            mpi4py communicator of the ranks that share the model.
+        parameters
+            Paths of the numbers that the model's parameter vector holds; the others keep their values.
+        """
+        from forward.finite_element import HyperelasticModel
+
+        return HyperelasticModel(self, comm, parameters)
+
+    @model_validator(mode="after")
+    def _check(self) -> Hyperelastic:
+        mistakes = list(self._mistakes())
+        if mistakes:
+            raise ValidationError.from_exception_data(
+                type(self).__name__,
+                [
+                    InitErrorDetails(
+                        type=PydanticCustomError("model", "{message}", {"message": message}),
+                        loc=place,
+                        input=given,
+                    )
+                    for place, message, given in mistakes
+                ],
+            )
+        return self
+
+    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        """Everything that no single block can see: unknown boundaries, repeated names, a body that can float away."""
+        boundaries = self.body.boundaries
+        places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
+        for block in ("displacements", "loads", "outputs"):
+            for i, item in enumerate(getattr(self, block)):
+                if hasattr(item, "on"):
+                    places.append(((block, i, "on"), item.on))
+        for place, on in places:
+            if on not in boundaries:
+                yield place, f"unknown boundary; {nearest(on, boundaries)}", on
+        for block, label in (("displacements", "label"), ("loads", "label"), ("outputs", "name")):
+            names = Counter(getattr(item, label) for item in getattr(self, block))
+            for name, count in names.items():
+                if count > 1:
+                    yield (block,), f"{count} of them are called '{name}', expected different names", name
+        held = set(self.clamp) | {item.on for item in self.displacements}
+        for i, output in enumerate(self.outputs):
+            if isinstance(output, Reaction) and output.on in boundaries and output.on not in held:
+                yield (
+                    ("outputs", i, "on"),
+                    "nothing holds this boundary, expected one that is clamped or moved",
+                    output.on,
+                )
+            if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
+                yield ("outputs", i, "at"), f"outside the body [0, {list(self.body.size)}]", list(output.at)
+        moved = {axis for item in self.displacements for axis in item.components}
+        if not self.clamp and moved != {"x", "y", "z"}:
+            free = ", ".join(sorted({"x", "y", "z"} - moved))
+            yield (
+                ("clamp",),
+                f"nothing holds the body along {free}, expected a clamp or prescribed displacements",
+                (),
+            )

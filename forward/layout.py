@@ -1,0 +1,64 @@
+"""The canonical order of nodes: sorted by place, so that fields look the same on any number of ranks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward import fenicsx
+from forward.model import FloatArray
+
+
+class Layout:
+    """Where this rank's nodes stand in the canonical order (by x, then y, then z).
+
+    Attributes
+    ----------
+    positions
+        Canonical positions (n_owned,) of the nodes that this rank owns.
+    coordinates
+        Coordinates (N, 3) of all nodes in canonical order, in m, on every rank.
+    """
+
+    def __init__(self, space: Any, comm: Any) -> None:
+        self._space = space
+        self._comm = comm
+        parts = comm.allgather(fenicsx.node_coordinates(space))
+        everywhere = np.concatenate(parts)
+        # Coordinates that differ by rounding only must sort alike on every rank.
+        step = 1e-9 * np.ptp(everywhere, axis=0).max()
+        keys = np.round(everywhere / step).astype(np.int64)
+        order = np.lexsort(keys.T[::-1])
+        self.coordinates: FloatArray = everywhere[order]
+        self._canonical = np.empty(len(order), dtype=np.int64)  # by global number
+        self._canonical[order] = np.arange(len(order))
+        before = sum(len(part) for part in parts[: comm.rank])
+        self.positions: NDArray[np.int64] = self._canonical[before : before + len(parts[comm.rank])]
+        self._unknowns = (3 * self.positions[:, None] + np.arange(3)).ravel()
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
+        if self._comm.size == 1:
+            whole = np.empty_like(rows)
+            whole[:, self._unknowns] = rows
+            return whole
+        parts = self._comm.gather((self._unknowns, rows))
+        if parts is None:
+            return None
+        whole = np.empty((len(rows), self.coordinates.size))
+        for unknowns, part in parts:
+            whole[:, unknowns] = part
+        return whole
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U) in canonical order."""
+        return np.ascontiguousarray(rows[:, self._unknowns])
+
+    def cells(self) -> tuple[NDArray[np.int64], int]:
+        """Return all cells (n_cells, k) as canonical nodes in VTK's order, and VTK's number of the type; collective."""
+        local, kind = fenicsx.vtk_cells(self._space)
+        numbers = self._canonical[fenicsx.global_node_numbers(self._space)]
+        cells = np.concatenate(self._comm.allgather(numbers[local]))
+        return cells[np.lexsort(cells.T[::-1])], kind

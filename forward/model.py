@@ -1,0 +1,202 @@
+"""The contract of a forward model, and a model made of a plain Python function.
+
+A model maps parameters (d,) to a solution; the solution is immutable and carries its own linearisation, so that a
+stale derivative cannot be written. Nothing here knows FEniCSx or MPI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class Work:
+    """What a solution has cost so far, counted in the operations that matter."""
+
+    residuals: int = 0
+    assemblies: int = 0
+    factorisations: int = 0
+    back_substitutions: int = 0
+    load_steps: int = 0
+
+    def as_array(self) -> NDArray[np.int64]:
+        """Return the counts in the order of `WORK`."""
+        return np.array([getattr(self, name) for name in WORK], dtype=np.int64)
+
+
+WORK = tuple(field.name for field in fields(Work))
+
+
+class SolveError(Exception):
+    """The model has no answer at these parameters; the message says where the solver stopped and why.
+
+    Parameters
+    ----------
+    reason
+        One line for the user.
+    history
+        The iterations that led there, one line each.
+    work
+        What was spent on the attempt.
+    """
+
+    def __init__(self, reason: str, history: Sequence[str] = (), work: Work | None = None) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.history = tuple(history)
+        self.work = work or Work()
+
+
+class DerivativeError(Exception):
+    """A derivative was asked for that the model or the output does not have."""
+
+
+class Solution(Protocol):
+    """The answer of a model at one parameter vector, with its linearisation there.
+
+    With d parameters, m outputs and a state of U unknowns (of which a rank of a distributed model holds its part).
+    """
+
+    @property
+    def outputs(self) -> FloatArray:
+        """Values of the outputs (m,)."""
+
+    @property
+    def state(self) -> FloatArray:
+        """This rank's part of the state (U_local,), interleaved by component; empty where there is none."""
+
+    @property
+    def work(self) -> Work:
+        """What this solution has cost so far."""
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,) of the parameters."""
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) with respect to the parameters of the outputs weighted by `weights` (m,)."""
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state (U_local,) along a `direction` (d,) of the parameters."""
+
+
+class ForwardModel(Protocol):
+    """A map from parameters to solutions, for one group of ranks.
+
+    The state of a distributed model is split over the group; `gather` and `scatter` go between this rank's part and
+    the canonical order, which does not depend on the number of ranks.
+    """
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the d parameters, in the order of the vectors."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the m outputs, in the order of the vectors."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have tangents and adjoints."""
+
+    def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> Solution:
+        """Solve at `parameters` (d,), from the state `start` (U_local,) if one is given.
+
+        The start may change the cost, never the answer beyond the solver's tolerance.
+
+        Raises
+        ------
+        SolveError
+            Where there is no answer.
+        """
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) from the group as (k, U) in canonical order on the group's first rank."""
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of fields (k, U) in canonical order."""
+
+
+@dataclass(frozen=True)
+class FunctionModel:
+    """A forward model made of a Python function of a parameter vector.
+
+    Parameters
+    ----------
+    function
+        (d,) → (m,), or a number when there is one output. It may raise `SolveError`.
+    parameters, outputs
+        Names.
+    jacobian
+        (d,) → (m, d); without it the solutions have no derivatives.
+    """
+
+    function: Callable[[FloatArray], ArrayLike]
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    jacobian: Callable[[FloatArray], ArrayLike] | None = None
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether a jacobian was given."""
+        return self.jacobian is not None
+
+    def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> FunctionSolution:
+        """Evaluate the function at `parameters` (d,); there is no state to `start` from."""
+        outputs = np.atleast_1d(np.asarray(self.function(parameters), dtype=float))
+        if outputs.shape != (len(self.outputs),):
+            message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
+            raise ValueError(message)
+        if not np.isfinite(outputs).all():
+            raise SolveError("the model's function returned a value that is not finite")
+        return FunctionSolution(self, parameters, outputs)
+
+    def gather(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+
+@dataclass(frozen=True)
+class FunctionSolution:
+    """The value of a `FunctionModel` at one parameter vector."""
+
+    model: FunctionModel
+    parameters: FloatArray
+    outputs: FloatArray
+
+    @property
+    def state(self) -> FloatArray:
+        """No state: an empty array."""
+        return np.empty(0)
+
+    @property
+    def work(self) -> Work:
+        """No work that is counted."""
+        return Work()
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along `direction` (d,)."""
+        return self._jacobian() @ direction
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,)."""
+        return weights @ self._jacobian()
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """No state: an empty array."""
+        return np.empty(0)
+
+    def _jacobian(self) -> FloatArray:
+        if self.model.jacobian is None:
+            raise DerivativeError("this model was given without a jacobian, so it has no derivatives")
+        return np.asarray(self.model.jacobian(self.parameters), dtype=float).reshape(self.outputs.size, -1)

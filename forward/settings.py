@@ -1,0 +1,54 @@
+"""The frozen, strictly checked block that every specification, method and study is made of."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+
+class Settings(BaseModel):
+    """A frozen block of settings: a constructor call that can be written in TOML.
+
+    Unknown keys are errors that name the nearest known key; lists become tuples, so that a block cannot change
+    after it was checked.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _checked(cls, value: Any, handler: Any) -> Self:
+        try:
+            return handler(_freeze(value))  # type: ignore[no-any-return]
+        except ValidationError as error:
+            raise ValidationError.from_exception_data(
+                cls.__name__, [_explain(cls, line) for line in error.errors(include_url=False)]
+            ) from None
+
+
+def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
+    """Say which of the `known` words was probably meant, or list them: the tail of an error message."""
+    close = get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"expected one of: {', '.join(known)}"
+
+
+def _freeze(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_freeze(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _freeze(item) for key, item in value.items()}
+    return value
+
+
+def _explain(cls: type[BaseModel], line: Any) -> InitErrorDetails:
+    """Carry one pydantic error on; an unknown key of this very block gets its nearest known key."""
+    if line["type"] == "extra_forbidden" and len(line["loc"]) == 1:
+        hint = nearest(str(line["loc"][0]), [name for name in cls.model_fields if name != "kind"])
+        kind: PydanticCustomError | str = PydanticCustomError("unknown_key", "unknown key; {hint}", {"hint": hint})
+    else:
+        message = line["msg"].removeprefix("Value error, ")
+        kind = PydanticCustomError(line["type"], message.replace("{", "(").replace("}", ")"))
+    return InitErrorDetails(type=kind, loc=line["loc"], input=line["input"])

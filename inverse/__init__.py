@@ -1,0 +1,1 @@
+"""Bayesian inversion and model selection."""

@@ -1,0 +1,176 @@
+"""Studies: reading, checking, writing."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from forward.geometry import Box
+from forward.hyperelastic import Hyperelastic
+from forward.loads import Gravity
+from forward.outputs import MaxDisplacement
+from uq.distributions import Normal, Uniform
+from uq.monte_carlo import MonteCarlo
+from workflows.config import Study, StudyError, differences, document, dump, load, parse
+from workflows.starter import starter
+
+CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.toml"))
+
+
+def blocks():
+    return tomllib.loads((Path(__file__).parent.parent / "configs" / "tiny.toml").read_text())
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
+def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
+    study = load(path)
+    assert parse(tomllib.loads(dump(study))) == study
+    assert path.read_text().startswith("# "), "a shipped study begins with what it shows and how long it takes"
+
+
+@pytest.mark.parametrize("kind", ["monte-carlo", "sensitivity-monte-carlo", "local-sensitivity"])
+def test_starters_are_valid(kind):
+    assert parse(tomllib.loads(starter(kind))).method.kind == kind
+
+
+def test_a_study_is_a_few_lines_of_python():
+    model = Hyperelastic(
+        body=Box(size=(0.1, 0.02, 0.02), cells=(4, 1, 1)),
+        material={"kind": "neo-hookean", "C1": 1e4, "D1": 1e5},
+        clamp=("x-min",),
+        loads=(Gravity(density=1000.0),),
+        outputs=(MaxDisplacement(name="sag"),),
+    )
+    study = Study(model=model, parameters={"material.C1": Uniform(lower=5e3, upper=2e4)}, method=MonteCarlo(samples=10))
+    assert parse(document(study)) == study
+
+
+def mistakes(change):
+    document_ = blocks()
+    change(document_)
+    with pytest.raises(StudyError) as caught:
+        parse(document_)
+    return caught.value.args
+
+
+def put(*way):
+    *steps, last, value = way
+
+    def change(document_):
+        here = document_
+        for step in steps:
+            here = here[step]
+        here[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (put("method", "sampels", 5), "method.sampels: unknown key; did you mean 'samples'?"),
+        (put("model", "bodi", {}), "model.bodi: unknown key; did you mean 'body'?"),
+        (put("modle", {}), "modle: unknown key; did you mean 'model'?"),
+        (put("method", "samples", 0), "method.samples: input should be greater than or equal to 2; given 0"),
+        (put("method", "samples", "many"), "method.samples: input should be a valid integer; given 'many'"),
+        (put("method", "kind", "mote-carlo"), "method: "),
+        (put("model", "clamp", ["x-mim"]), "model.clamp[0]: unknown boundary; did you mean 'x-min'?; given 'x-mim'"),
+        (put("model", "clamp", []), "model.clamp: nothing holds the body along x, y, z"),
+        (put("model", "material", "D1", -1.0), "model.material.D1: input should be greater than 0; given -1.0"),
+        (put("model", "material", "D2", 1.0), "model.material.D2: unknown key; did you mean"),
+        (put("model", "body", "size", [0.28, 0.0, 0.087]), "model.body.size[1]: input should be greater than 0"),
+        (put("model", "body", "degree", 3), "model.body.degree: input should be 1 or 2; given 3"),
+        (
+            put("parameters", "material.D2", {"kind": "uniform", "lower": 1.0, "upper": 2.0}),
+            "did you mean 'material.D1'",
+        ),
+        (
+            put("parameters", "material.D1", {"kind": "normal", "mean": 1e5, "std": 1e5}),
+            "parameters.material.D1: reaches -",
+        ),
+        (
+            put("parameters", "loads.gravity.density", {"kind": "uniform", "lower": -1.0, "upper": 2.0}),
+            "parameters.loads.gravity.density: reaches -1, where the model is impossible",
+        ),
+        (
+            put("parameters", "material.D1", {"kind": "uniform", "lower": 2.0, "upper": 1.0}),
+            "parameters.material.D1: lower = 2 and upper = 1, expected lower < upper",
+        ),
+        (put("parameters", {}), "parameters: "),
+        (put("correlations", [{"between": ["a", "b"], "value": 0.5}]), "correlations: correlation of 'a'"),
+        (lambda d: d.pop("method"), "method: missing"),
+        (lambda d: d["model"].pop("body"), "model.body: missing"),
+        (
+            lambda d: d["model"]["outputs"].append(d["model"]["outputs"][0]),
+            "model.outputs: 2 of them are called 'uy_max'",
+        ),
+        (put("model", "loads", 0, "direction", [0, 0, 0]), "model.loads[0]: direction has length zero"),
+    ],
+)
+def test_one_line_for_a_mistake(change, expected):
+    lines = mistakes(change)
+    assert len(lines) == 1, lines
+    assert "\n" not in lines[0]
+    assert expected in lines[0]
+
+
+def test_all_mistakes_are_reported_together():
+    def change(document_):
+        document_["method"]["sampels"] = 5
+        document_["model"]["material"]["C1"] = "soft"
+        document_["model"]["body"]["cell"] = "brick"
+        document_["parameters"]["material.D1"]["kind"] = "bta"
+
+    assert [line.split(":")[0] for line in mistakes(change)] == [
+        "model.body.cell",
+        "model.material.C1",
+        "parameters.material.D1",
+        "method.sampels",
+    ]
+
+
+def test_overrides():
+    study = parse(blocks(), ["method.samples=7", "model.loads.gravity.density=800", "parameters.material.D1.a=3"])
+    assert study.method.samples == 7
+    assert study.model.loads[0].density == 800
+    assert study.parameters["material.D1"].a == 3
+    assert parse(blocks(), ["method.kind=monte-carlo"]).method.kind == "monte-carlo"
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("method.samples", "expected KEY=VALUE"),
+        ("method.samples.x=1", "'samples' is a value, not a block"),
+        ("model.loads.wind.density=1", "no element is called 'wind'"),
+        ("method.sampels=1", "did you mean 'samples'"),
+    ],
+)
+def test_bad_overrides(assignment, message):
+    with pytest.raises(StudyError, match=message):
+        parse(blocks(), [assignment])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "cannot be read: No such file"), (b"[model", "not valid TOML"), (b"\xff\xfe", "not a text file")],
+)
+def test_unreadable_files(tmp_path, content, message):
+    path = tmp_path / "study.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(StudyError, match=message):
+        load(path)
+
+
+def test_differences_name_the_place():
+    old, new = blocks(), blocks()
+    new["method"]["samples"] = 99
+    new["parallel"] = {"ranks_per_model": 2}
+    assert differences(old, new) == ["method.samples: 24 → 99"]
+
+
+def test_tails_may_not_reach_the_impossible():
+    study = blocks()
+    study["parameters"]["material.D1"] = {"kind": "normal", "mean": 3e5, "std": 2e4}
+    assert parse(study).parameters["material.D1"] == Normal(mean=3e5, std=2e4)

@@ -1,0 +1,97 @@
+"""Evaluation in blocks: order, failures, restart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forward.model import FunctionModel, SolveError
+from uq.checkpoint import Checkpoint
+from uq.checkpoint import load as load_evaluations
+from uq.evaluate import BLOCKS, Request, SerialEvaluate
+
+
+def product(p):
+    if p[0] > 0.9:
+        message = "too stiff"
+        raise SolveError(message, ["iteration 0"])
+    return [p[0] * p[1], p[0]]
+
+
+MODEL = FunctionModel(product, ("a", "b"), ("ab", "a"), lambda p: [[p[1], p[0]], [1, 0]])
+POINTS = np.random.default_rng(0).random((1000, 2))
+
+
+def test_rows_are_in_the_order_of_the_points():
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS, tangents=True))
+    ok = POINTS[:, 0] <= 0.9
+    np.testing.assert_array_equal(evaluations.ok, ok)
+    np.testing.assert_array_equal(evaluations.outputs[ok, 0], POINTS[ok].prod(axis=1))
+    np.testing.assert_array_equal(evaluations.tangents[ok, 0], POINTS[ok][:, ::-1])
+
+
+def test_failures_are_kept_with_their_reason():
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS))
+    assert len(evaluations.failures) == (POINTS[:, 0] > 0.9).sum()
+    for failure in evaluations.failures:
+        assert failure.reason == "too stiff"
+        assert failure.history == ("iteration 0",)
+        assert failure.parameters == tuple(POINTS[failure.index])
+        assert np.isnan(evaluations.outputs[failure.index]).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, BLOCKS, BLOCKS + 1, 10_000])
+def test_blocks_cover_all_points_in_order(n):
+    points = np.arange(n, dtype=float)[:, None]
+    blocks = Request(points).blocks()
+    assert len(blocks) <= BLOCKS
+    np.testing.assert_array_equal(np.concatenate([block.points for block in blocks]), points)
+
+
+def test_checkpoint_returns_what_was_saved(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8], tangents=True)
+    evaluations = SerialEvaluate(MODEL)(request)
+    key = checkpoint.key(request)
+    assert checkpoint.load(key) is None
+    checkpoint.save(key, evaluations)
+    found = checkpoint.load(key)
+    np.testing.assert_array_equal(found.outputs, evaluations.outputs)
+    np.testing.assert_array_equal(found.tangents, evaluations.tangents)
+    assert found.failures == evaluations.failures
+    checkpoint.consolidate(evaluations)
+    checkpoint.clear()
+    assert not (tmp_path / "evaluations").exists()
+    np.testing.assert_array_equal(load_evaluations(tmp_path / "evaluations.h5").outputs, evaluations.outputs)
+
+
+def test_a_damaged_block_is_computed_again(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8])
+    key = checkpoint.key(request)
+    checkpoint.save(key, SerialEvaluate(MODEL)(request))
+    path = tmp_path / "evaluations" / f"{key}.h5"
+    path.write_bytes(path.read_bytes()[:100])
+    assert checkpoint.load(key) is None
+    assert not checkpoint.has(key)
+
+
+def test_a_block_is_found_by_what_was_asked(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8])
+    key = checkpoint.key(request)
+    assert key == checkpoint.key(Request(np.asfortranarray(POINTS[:8])))
+    assert key != checkpoint.key(replace(request, tangents=True))
+    assert key != checkpoint.key(Request(POINTS[:8] + 1e-15))
+    assert key != Checkpoint(tmp_path, "another study").key(request)
+
+
+def test_wrong_number_of_outputs_is_the_callers_mistake():
+    model = FunctionModel(lambda p: p, ("a",), ("x", "y"))
+    with pytest.raises(ValueError, match="expected"):
+        SerialEvaluate(model)(Request(np.ones((1, 1))))
+
+
+def test_values_that_are_not_finite_are_failures():
+    model = FunctionModel(lambda p: np.inf, ("a",), ("x",))
+    assert len(SerialEvaluate(model)(Request(np.ones((3, 1)))).failures) == 3

@@ -1,0 +1,85 @@
+"""Estimators against closed forms and against their own error estimates."""
+
+import numpy as np
+import pytest
+
+from uq.moments import estimate, monomials, quantiles
+
+REPEATS, N = 2000, 100
+# w = x + x²/5 with x ~ N(0, 1) has mean 1/5 and variance 1 + 2/25.
+MEAN, STD = 0.2, np.sqrt(1.08)
+
+
+def repeats(**settings):
+    """Many independent estimates at once: the shape of the quantity is the number of repeats."""
+    x = np.random.default_rng(1).normal(size=(N, REPEATS))
+    w = x + x**2 / 5
+    zero = np.zeros(REPEATS)
+    if settings.pop("plain", False):
+        return estimate(monomials(w, None).sum(axis=1), N, zero)
+    return estimate(monomials(w, x).sum(axis=1), N, zero, zero + 1, **settings)
+
+
+def test_plain_estimates_are_numpys():
+    x = np.random.default_rng(0).normal(3, 2, size=(50, 4))
+    reference = np.full(4, 2.9)
+    m = estimate(monomials(x - reference, None).sum(axis=1), 50, reference)
+    np.testing.assert_allclose(m.mean, x.mean(axis=0))
+    np.testing.assert_allclose(m.std, x.std(axis=0, ddof=1))
+    np.testing.assert_allclose(m.mean_error, x.std(axis=0, ddof=1) / np.sqrt(50))
+
+
+VARIANTS = [
+    {"plain": True},
+    {"coefficient": "one"},
+    {"coefficient": "optimal"},
+    {"coefficient": "one", "second_moment": "linear"},
+]
+
+
+@pytest.mark.parametrize("settings", VARIANTS, ids=str)
+def test_unbiased_with_honest_errors(settings):
+    m = repeats(**settings)
+    # The optimal coefficient is estimated on the same samples, which biases by O(1/n).
+    slack = 0.3 / N if settings.get("coefficient") == "optimal" else 0
+    assert abs(m.mean.mean() - MEAN) < 4 * m.mean.std() / np.sqrt(REPEATS) + slack
+    assert abs((m.std**2).mean() - STD**2) < 4 * (m.std**2).std() / np.sqrt(REPEATS) + 4 * slack
+    assert m.mean_error.mean() == pytest.approx(m.mean.std(), rel=0.1)
+    assert m.std_error.mean() == pytest.approx(m.std.std(), rel=0.15)
+
+
+def test_variance_ratio_is_what_is_gained():
+    gained = repeats(plain=True).mean.var() / repeats(coefficient="one").mean.var()
+    assert np.median(repeats(coefficient="one").variance_ratio) == pytest.approx(gained, rel=0.2)
+    assert gained > 10
+
+
+def test_a_control_that_hurts_says_so():
+    x = np.random.default_rng(2).normal(size=(N, REPEATS))
+    zero = np.zeros(REPEATS)
+    m = estimate(monomials(x, -x).sum(axis=1), N, zero, zero + 1, "one")
+    assert np.median(m.variance_ratio) == pytest.approx(1 / 4, rel=0.01)
+    optimal = estimate(monomials(x, -x).sum(axis=1), N, zero, zero + 1, "optimal")
+    np.testing.assert_allclose(optimal.coefficient, -1)
+
+
+def test_expansion_away_from_the_mean_is_caught():
+    """A control whose mean is not zero biases the estimate: the check above would fail."""
+    x = np.random.default_rng(1).normal(size=(N, REPEATS))
+    m = estimate(monomials(x, x + 0.1).sum(axis=1), N, np.zeros(REPEATS), np.ones(REPEATS), "one")
+    assert abs(m.mean.mean()) > 4 * max(m.mean.std(), 1e-12) / np.sqrt(REPEATS)
+
+
+def test_nodes_that_do_not_move_have_no_error():
+    sums = monomials(np.zeros((10, 3)), np.zeros((10, 3))).sum(axis=1)
+    m = estimate(sums, 10, np.zeros(3), np.zeros(3), "optimal")
+    for value in (m.mean, m.mean_error, m.std, m.std_error):
+        np.testing.assert_array_equal(value, 0)
+
+
+def test_quantile_errors_cover():
+    values = np.random.default_rng(3).random((1000, 400))
+    central, error = quantiles(values, (0.05, 0.5))
+    for row, (p, e) in zip(central, zip((0.05, 0.5), error, strict=True), strict=True):
+        inside = np.abs(row - p) < 1.96 * e
+        assert 0.88 < inside.mean() < 0.99

@@ -1,0 +1,128 @@
+"""Finished blocks on disk: one file each while a study runs, one file of all at its end.
+
+A file is written under another name and renamed into place, so that whatever carries its final name is whole. A block
+is found by what was asked, not by who asked: its name is a hash of the points and of everything else that decides the
+answer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from forward.model import WORK
+from uq.evaluate import Evaluations, Failure, Request
+
+
+class Checkpoint:
+    """The finished blocks of a study in a directory.
+
+    Parameters
+    ----------
+    directory
+        The results directory; blocks are kept in its folder `evaluations`.
+    identity
+        Text that decides the answers besides the request (the study, the version of the program).
+    """
+
+    def __init__(self, directory: Path, identity: str) -> None:
+        self._directory = directory
+        self._folder = directory / "evaluations"
+        self._identity = identity.encode()
+
+    def key(self, block: Request) -> str:
+        """Return the name of a block."""
+        digest = hashlib.sha256(self._identity)
+        _digest(digest, block)
+        return digest.hexdigest()[:24]
+
+    def has(self, key: str) -> bool:
+        """Whether a block is finished."""
+        return (self._folder / f"{key}.h5").exists()
+
+    def save(self, key: str, block: Evaluations) -> None:
+        """Write a finished block and rename it into place."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        _write(self._folder / f"{key}.h5", block)
+
+    def load(self, key: str) -> Evaluations | None:
+        """Read a finished block; nothing if there is none or it cannot be read."""
+        path = self._folder / f"{key}.h5"
+        try:
+            return _read(path)
+        except FileNotFoundError:
+            return None
+        except (OSError, KeyError):
+            path.unlink(missing_ok=True)
+            return None
+
+    def consolidate(self, evaluations: Evaluations) -> None:
+        """Write all evaluations as `evaluations.h5`; the blocks stay until `clear`."""
+        _write(self._directory / "evaluations.h5", evaluations)
+
+    def clear(self) -> None:
+        """Remove the files of the blocks: the study is finished."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _digest(digest: Any, value: object) -> None:
+    """Feed a value to a hash: arrays by their numbers, dataclasses by their fields."""
+    if isinstance(value, np.ndarray):
+        digest.update(repr((value.shape, value.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif is_dataclass(value):
+        digest.update(type(value).__name__.encode())
+        for field in fields(value):
+            digest.update(field.name.encode())
+            _digest(digest, getattr(value, field.name))
+    else:
+        digest.update(repr(value).encode())
+
+
+def load(path: Path) -> Evaluations:
+    """Read an `evaluations.h5`."""
+    return _read(path)
+
+
+def _write(path: Path, block: Evaluations) -> None:
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    with h5py.File(partial, "w") as file:
+        file["points"] = block.points
+        file["outputs"] = block.outputs
+        file["seconds"] = block.seconds
+        file["work"] = block.work
+        file["work"].attrs["columns"] = list(WORK)
+        file["failures"] = json.dumps([asdict(failure) for failure in block.failures])
+        if block.tangents is not None:
+            file["tangents"] = block.tangents
+        if block.fields.size:
+            file["fields"] = block.fields
+        file.flush()
+    with partial.open("rb") as written:
+        os.fsync(written.fileno())
+    partial.replace(path)
+
+
+def _read(path: Path) -> Evaluations:
+    with h5py.File(path, "r") as file:
+        failures = tuple(
+            Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))
+            for f in json.loads(file["failures"][()])
+        )
+        return Evaluations(
+            np.asarray(file["points"]),
+            np.asarray(file["outputs"]),
+            np.asarray(file["tangents"]) if "tangents" in file else None,
+            failures,
+            np.asarray(file["seconds"]),
+            np.asarray(file["work"]),
+            np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
+        )

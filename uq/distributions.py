@@ -1,0 +1,168 @@
+"""Distributions of one parameter, as blocks of a study; the mathematics is chaospy's."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray
+from forward.settings import Settings
+
+PositiveFloat = Annotated[float, Gt(0)]
+
+
+class _Distribution(Settings):
+    """A distribution of one parameter, in the units of that parameter."""
+
+    @abstractmethod
+    def _chaospy(self, cp: Any) -> Any:
+        """Build the chaospy distribution."""
+
+    @cached_property
+    def dist(self) -> Any:
+        """The chaospy distribution."""
+        import chaospy
+
+        return self._chaospy(chaospy)
+
+    @cached_property
+    def moments(self) -> tuple[float, float]:
+        """Expected value and standard deviation."""
+        import chaospy
+
+        return float(chaospy.E(self.dist)), float(chaospy.Std(self.dist))
+
+    @property
+    def support(self) -> tuple[float, float] | None:
+        """Ends of a bounded range; nothing for a distribution with tails."""
+        return None
+
+    def quantile(self, probability: FloatArray) -> FloatArray:
+        """Inverse of the distribution function, of any shape."""
+        p = np.asarray(probability, dtype=float)
+        return np.asarray(self.dist.inv(p.ravel()), dtype=float).reshape(p.shape)
+
+    def at(self, probability: float) -> float:
+        """Quantile of one probability."""
+        return float(self.quantile(np.array([probability]))[0])
+
+
+class _Bounded(_Distribution):
+    lower: float
+    upper: float
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Ends of the range."""
+        return self.lower, self.upper
+
+    @model_validator(mode="after")
+    def _check_range(self) -> _Bounded:
+        if not self.lower < self.upper:
+            message = f"lower = {self.lower:g} and upper = {self.upper:g}, expected lower < upper"
+            raise ValueError(message)
+        return self
+
+
+class Uniform(_Bounded):
+    """Uniform on [lower, upper]."""
+
+    kind: Literal["uniform"] = "uniform"
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.Uniform(self.lower, self.upper)
+
+
+class LogUniform(_Bounded):
+    """Logarithm uniform on [ln lower, ln upper], lower > 0."""
+
+    kind: Literal["log-uniform"] = "log-uniform"
+    lower: PositiveFloat
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.LogUniform(np.log(self.lower), np.log(self.upper))
+
+
+class Triangular(_Bounded):
+    """Triangular on [lower, upper] with its peak at `mode`."""
+
+    kind: Literal["triangular"] = "triangular"
+    mode: float
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.Triangle(self.lower, self.mode, self.upper)
+
+    @model_validator(mode="after")
+    def _check_mode(self) -> Triangular:
+        if not self.lower <= self.mode <= self.upper:
+            message = f"mode = {self.mode:g}, expected a value between lower and upper"
+            raise ValueError(message)
+        return self
+
+
+class Beta(_Bounded):
+    """Beta(a, b) stretched to [lower, upper]."""
+
+    kind: Literal["beta"] = "beta"
+    a: PositiveFloat
+    b: PositiveFloat
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.Beta(self.a, self.b, self.lower, self.upper)
+
+
+class TruncatedNormal(_Bounded):
+    """Normal with `mean` and `std` (of the normal before the cut), cut to [lower, upper]."""
+
+    kind: Literal["truncated-normal"] = "truncated-normal"
+    mean: float
+    std: PositiveFloat
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.TruncNormal(self.lower, self.upper, self.mean, self.std)
+
+
+class Normal(_Distribution):
+    """Normal with `mean` and standard deviation `std`."""
+
+    kind: Literal["normal"] = "normal"
+    mean: float
+    std: PositiveFloat
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.Normal(self.mean, self.std)
+
+
+class LogNormal(_Distribution):
+    """Log-normal, given by the `mean` and the standard deviation `std` of the parameter itself."""
+
+    kind: Literal["log-normal"] = "log-normal"
+    mean: PositiveFloat
+    std: PositiveFloat
+
+    def _chaospy(self, cp: Any) -> Any:
+        variance = np.log1p((self.std / self.mean) ** 2)
+        return cp.LogNormal(np.log(self.mean) - variance / 2, np.sqrt(variance))
+
+
+class Gamma(_Distribution):
+    """Gamma with `shape` and `scale`, starting at `shift`: mean shift + shape·scale."""
+
+    kind: Literal["gamma"] = "gamma"
+    shape: PositiveFloat
+    scale: PositiveFloat
+    shift: float = 0.0
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.Gamma(self.shape, self.scale, self.shift)
+
+
+Distribution = Annotated[
+    Uniform | LogUniform | Triangular | Beta | TruncatedNormal | Normal | LogNormal | Gamma,
+    Field(discriminator="kind"),
+]

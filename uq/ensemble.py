@@ -1,0 +1,295 @@
+"""Groups of ranks that evaluate blocks of points side by side.
+
+Rank 0 runs the method; the other ranks serve its requests. A group (the ranks that share one model) takes the next
+block from a counter in rank 0's memory (an MPI window), so that no one waits for a slow neighbour. Which group computes
+a block decides nothing: blocks are added in their order.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from forward.model import ForwardModel
+from uq.checkpoint import Checkpoint
+from uq.evaluate import BlockSolver, Evaluations, Merger, Request
+
+T = TypeVar("T")
+_RESULT = 1
+
+
+class Ensemble:
+    """A world of ranks, split into groups that share a model.
+
+    Attributes
+    ----------
+    world
+        All ranks (a duplicate of what was given).
+    group
+        This rank's group: the communicator of its model.
+    groups
+        Number of groups.
+    """
+
+    def __init__(self, world: Any, group: Any, groups: int, index: int) -> None:
+        self.world = world
+        self.group = group
+        self.groups = groups
+        self.index = index
+
+    @classmethod
+    def split(cls, world: Any, ranks_per_model: int = 1) -> Ensemble:
+        """Split `world` into groups of neighbouring ranks; collective.
+
+        Raises
+        ------
+        ValueError
+            If the number of ranks is not a multiple of `ranks_per_model`.
+        """
+        if world.size % ranks_per_model:
+            message = f"{world.size} ranks cannot be split into groups of ranks_per_model = {ranks_per_model}"
+            raise ValueError(message)
+        index = world.rank // ranks_per_model
+        return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index)
+
+    def run(
+        self,
+        model: ForwardModel,
+        task: Callable[[EnsembleEvaluate], T],
+        *,
+        checkpoint: Checkpoint | None = None,
+        progress: Callable[[int, int], None] = lambda done, failed: None,
+    ) -> T | None:
+        """Run `task` on rank 0 with an evaluation that all groups work on; collective.
+
+        Parameters
+        ----------
+        model
+            This group's model.
+        task
+            Called on rank 0 only, with the evaluation.
+        checkpoint
+            Where finished blocks are kept and found.
+        progress
+            On rank 0: told the numbers of points that were done and that failed since it was last told.
+
+        Returns
+        -------
+        object
+            What the task returned, on rank 0; nothing on the other ranks.
+        """
+        with _counter(self.world) as counter:
+            worker = _Worker(self, model, checkpoint, counter)
+            if self.world.rank > 0:
+                while (order := self.world.bcast(None)) is not None:
+                    worker.work(order)
+                return None
+            try:
+                return task(EnsembleEvaluate(worker, model.parameters, model.outputs, model.differentiable, progress))
+            finally:
+                self.world.bcast(None)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """A request on its way to all ranks: the blocks that are still to be computed, and where each is kept."""
+
+    request: Request
+    pending: tuple[int, ...]
+    keys: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EnsembleEvaluate:
+    """The evaluation that a method sees on rank 0."""
+
+    worker: _Worker
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    differentiable: bool
+    progress: Callable[[int, int], None]
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request on all groups; blocks that are on disk are read."""
+        blocks = request.blocks()
+        checkpoint = self.worker.checkpoint
+        keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
+        pending = tuple(i for i in range(len(blocks)) if not (checkpoint and checkpoint.has(keys[i])))
+        merger = _OrderedMerger(len(blocks))
+
+        def read_finished() -> None:
+            # A block that was on disk but cannot be read any more is computed after the others.
+            while (i := merger.next) < len(blocks) and i not in waiting and checkpoint is not None:
+                block = checkpoint.load(keys[i])
+                if block is None:
+                    waiting.add(i)
+                    lost.append(i)
+                else:
+                    self.progress(len(block.points), len(block.failures))
+                    merger.add(i, block)
+
+        def receive(i: int, block: Evaluations) -> None:
+            merger.add(i, block)
+            read_finished()
+
+        waiting, lost = set(pending), list[int]()
+        read_finished()
+        while pending:
+            self.worker.dispatch(_Order(request, pending, keys), receive, self.progress)
+            pending = tuple(lost)
+            lost.clear()
+        return merger.result()
+
+
+class _OrderedMerger:
+    """Adds blocks in order, whatever the order they come in."""
+
+    def __init__(self, count: int) -> None:
+        self._merger = Merger()
+        self._early: dict[int, Evaluations] = {}
+        self._count = count
+        self.next = 0
+
+    def add(self, index: int, block: Evaluations) -> None:
+        self._early[index] = block
+        while self.next in self._early:
+            self._merger.add(self._early.pop(self.next))
+            self.next += 1
+
+    def result(self) -> Evaluations:
+        assert self.next == self._count
+        return self._merger.result()
+
+
+class _Worker:
+    """What every rank does with an order."""
+
+    def __init__(
+        self, ensemble: Ensemble, model: ForwardModel, checkpoint: Checkpoint | None, counter: _Counter
+    ) -> None:
+        self._ensemble = ensemble
+        self._model = model
+        self.checkpoint = checkpoint
+        self._counter = counter
+
+    def dispatch(
+        self, order: _Order, receive: Callable[[int, Evaluations], None], progress: Callable[[int, int], None]
+    ) -> None:
+        """Rank 0: send an order to all ranks, work on it too, and receive the blocks of the others."""
+        with _abort_all(self._ensemble.world):
+            self._dispatch(order, receive, progress)
+
+    def _dispatch(
+        self, order: _Order, receive: Callable[[int, Evaluations], None], progress: Callable[[int, int], None]
+    ) -> None:
+        world = self._ensemble.world
+        self._counter.reset()
+        world.bcast(order)
+        missing = set(order.pending)
+
+        def accept(i: int, block: Evaluations) -> None:
+            missing.discard(i)
+            receive(i, block)
+
+        def drain() -> None:
+            while world.iprobe(tag=_RESULT):
+                i, block = world.recv(tag=_RESULT)
+                progress(len(block.points), len(block.failures))
+                accept(i, block)
+
+        def own_progress(done: int, failed: int) -> None:
+            progress(done, failed)
+            drain()
+
+        for i, block in self._blocks(order, own_progress):
+            accept(i, block)
+        while missing:
+            i, block = world.recv(tag=_RESULT)
+            progress(len(block.points), len(block.failures))
+            accept(i, block)
+
+    def work(self, order: _Order) -> None:
+        """Compute blocks of an order until none is left, and send them to rank 0."""
+        world, sent = self._ensemble.world, []
+        with _abort_all(world):
+            for result in self._blocks(order, lambda done, failed: None):
+                if self._ensemble.group.rank == 0 and self._ensemble.index > 0:
+                    sent.append(world.isend(result, dest=0, tag=_RESULT))
+                    sent = [request for request in sent if not request.test()[0]]
+            for request in sent:
+                request.wait()
+
+    def _blocks(self, order: _Order, progress: Callable[[int, int], None]) -> Iterator[tuple[int, Evaluations]]:
+        group = self._ensemble.group
+        blocks = order.request.blocks()
+        solver: BlockSolver | None = None
+        while True:
+            turn = self._counter.take() if group.rank == 0 else 0
+            if group.size > 1:
+                turn = group.bcast(turn)
+            if turn >= len(order.pending):
+                return
+            solver = solver or BlockSolver(self._model, order.request)
+            i = order.pending[turn]
+            block = solver(blocks[i].points, progress)
+            if self.checkpoint is not None and group.rank == 0:
+                self.checkpoint.save(order.keys[i], block)
+            yield i, block
+
+
+class _Counter:
+    """A number in rank 0's memory that any rank can read and raise in one step."""
+
+    def __init__(self, world: Any) -> None:
+        self._world = world
+        size = MPI.INT64_T.Get_size()
+        self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
+        self._one = np.ones(1, dtype=np.int64)
+
+    def reset(self) -> None:
+        """Start from zero again (rank 0, while no one takes)."""
+        zero = np.zeros(1, dtype=np.int64)
+        self._window.Lock(0, MPI.LOCK_EXCLUSIVE)
+        self._window.Put(zero, 0)
+        self._window.Unlock(0)
+
+    def take(self) -> int:
+        """Return the number and raise it by one."""
+        value = np.empty(1, dtype=np.int64)
+        self._window.Lock(0, MPI.LOCK_SHARED)
+        self._window.Fetch_and_op(self._one, value, 0, op=MPI.SUM)
+        self._window.Unlock(0)
+        return int(value[0])
+
+    def free(self) -> None:
+        """Give the window back; collective."""
+        self._window.Free()
+
+
+@contextmanager
+def _counter(world: Any) -> Iterator[_Counter]:
+    counter = _Counter(world)
+    try:
+        yield counter
+    finally:
+        counter.free()
+
+
+@contextmanager
+def _abort_all(world: Any) -> Iterator[None]:
+    """An exception that only one rank knows of would leave the others waiting for ever: print it and stop them all."""
+    try:
+        yield
+    except Exception:
+        if world.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        world.Abort(1)

@@ -1,0 +1,256 @@
+"""Evaluation of a model at many points: what a sampling method calls, and what it gets back.
+
+Work is cut into blocks of fixed size; sums of fields are formed in index order inside a block and the blocks are added
+in order. So the result does not depend on who computed which block.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import WORK, FloatArray, ForwardModel, Solution, SolveError
+
+BLOCKS = 128  # an evaluation is cut into at most this many blocks
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A point without an answer, and why."""
+
+    index: int
+    parameters: tuple[float, ...]
+    reason: str
+    history: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Outputs of a model at n points.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    outputs
+        Outputs (n, m); NaN in the rows that failed.
+    tangents
+        dψ/dω (n, m, d) where they were asked for, NaN where a solve failed.
+    failures
+        The points that failed, by index.
+    seconds
+        Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
+    work
+        Counts (n, k) of the operations `forward.model.WORK`.
+    fields
+        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
+    """
+
+    points: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray | None
+    failures: tuple[Failure, ...]
+    seconds: FloatArray
+    work: NDArray[np.int64]
+    fields: FloatArray
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which points (n,) have an answer."""
+        good = np.ones(len(self.points), dtype=bool)
+        good[[failure.index for failure in self.failures]] = False
+        return good
+
+
+class FieldSum(Protocol):
+    """A quantity of each realisation's state that is summed as the realisations stream by."""
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A linear prediction of the state: start of the solver at every point.
+
+    Attributes
+    ----------
+    point
+        Parameters (d,) of the expansion.
+    state
+        State (U,) there, in canonical order.
+    slopes
+        Derivatives (d, U) of the state.
+    """
+
+    point: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model."""
+        state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+        return lambda parameters: state + (parameters - self.point) @ slopes
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of an evaluation."""
+
+    points: FloatArray
+    tangents: bool = False
+    fields: FieldSum | None = None
+    start: Prediction | None = None
+
+    def blocks(self) -> list[Request]:
+        """Cut into blocks that depend on the number of points only."""
+        size = max(1, -(-len(self.points) // BLOCKS))
+        return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
+
+
+class Evaluate(Protocol):
+    """A model seen by a sampling method: points in, evaluations out."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+
+
+@dataclass(frozen=True)
+class SerialEvaluate:
+    """Evaluation of a model in this process, point after point.
+
+    Parameters
+    ----------
+    model
+        The model.
+    progress
+        Told the numbers of points that were done and that failed since it was last told.
+    """
+
+    model: ForwardModel
+    progress: Callable[[int, int], None] = lambda done, failed: None
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.model.differentiable
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+        solver = BlockSolver(self.model, request)
+        return merge([solver(block.points, self.progress) for block in request.blocks()])
+
+
+class BlockSolver:
+    """Solves the blocks of one request on one group's model; collective over the group."""
+
+    def __init__(self, model: ForwardModel, request: Request) -> None:
+        self._model = model
+        self._tangents = request.tangents
+        self._row = request.fields.on(model) if request.fields is not None else None
+        self._start = request.start.on(model) if request.start is not None else None
+
+    def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
+        """Solve at points (n, d); the fields are complete on the group's first rank only."""
+        model, n = self._model, len(points)
+        m, d = len(model.outputs), len(model.parameters)
+        outputs = np.full((n, m), np.nan)
+        tangents = np.full((n, m, d), np.nan) if self._tangents else None
+        seconds = np.empty(n)
+        work = np.zeros((n, len(WORK)), dtype=np.int64)
+        failures: list[Failure] = []
+        total: FloatArray | None = None
+        for i, point in enumerate(points):
+            begin = time.process_time()
+            try:
+                solution = model.solve(point, self._start(point) if self._start is not None else None)
+                row = self._row(solution, point) if self._row is not None else None
+                if tangents is not None:
+                    tangents[i] = np.transpose([solution.tangent(e) for e in np.eye(d)])
+            except SolveError as error:
+                failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
+                work[i] = error.work.as_array()
+            else:
+                outputs[i] = solution.outputs
+                work[i] = solution.work.as_array()
+                if row is not None:
+                    total = row if total is None else total + row
+            seconds[i] = time.process_time() - begin
+            progress(1, int(bool(failures) and failures[-1].index == i))
+        fields = np.zeros((0, 0)) if total is None else model.gather(total)
+        if fields is None:
+            fields = np.zeros((0, 0))
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
+
+
+def merge(blocks: Sequence[Evaluations]) -> Evaluations:
+    """Put the blocks of a request together, in their order."""
+    merger = Merger()
+    for block in blocks:
+        merger.add(block)
+    return merger.result()
+
+
+class Merger:
+    """Adds blocks in their order, keeping one sum of fields."""
+
+    def __init__(self) -> None:
+        self._blocks: list[Evaluations] = []
+        self._fields = np.zeros((0, 0))
+        self._count = 0
+        self._failures: list[Failure] = []
+
+    def add(self, block: Evaluations) -> None:
+        """Append the next block."""
+        if block.fields.size:
+            self._fields = block.fields if self._fields.size == 0 else self._fields + block.fields
+        self._failures += [replace(f, index=f.index + self._count) for f in block.failures]
+        self._count += len(block.points)
+        self._blocks.append(replace(block, fields=np.zeros((0, 0))))
+
+    def result(self) -> Evaluations:
+        """Return everything added so far as one."""
+
+        def joined(pick: Callable[[Evaluations], FloatArray | None]) -> Iterator[FloatArray]:
+            for block in self._blocks:
+                part = pick(block)
+                if part is not None:
+                    yield part
+
+        tangents = list(joined(lambda b: b.tangents))
+        return Evaluations(
+            np.concatenate(list(joined(lambda b: b.points))),
+            np.concatenate(list(joined(lambda b: b.outputs))),
+            np.concatenate(tangents) if tangents else None,
+            tuple(self._failures),
+            np.concatenate(list(joined(lambda b: b.seconds))),
+            np.concatenate([b.work for b in self._blocks]),
+            self._fields,
+        )

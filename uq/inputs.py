@@ -1,0 +1,103 @@
+"""The random parameters of a study: marginal distributions, independent or joined by a Gaussian copula."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from forward.model import FloatArray
+from uq.distributions import Distribution
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """d random parameters.
+
+    Parameters
+    ----------
+    marginals
+        Distribution of each parameter by its name; the order is that of the parameter vectors.
+    correlations
+        Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
+        mapped through the marginals. Pairs that are left out are uncorrelated.
+
+    Raises
+    ------
+    ValueError
+        If the correlations are of unknown names or do not form a positive definite matrix.
+    """
+
+    marginals: dict[str, Distribution]
+    correlations: tuple[tuple[str, str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for a, b, rho in self.correlations:
+            for name in (a, b):
+                if name not in self.marginals:
+                    message = f"correlation of '{name}', expected one of: {', '.join(self.names)}"
+                    raise ValueError(message)
+            if a == b or not -1 < rho < 1:
+                message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
+                raise ValueError(message)
+        smallest = np.linalg.eigvalsh(self._copula).min(initial=1.0)
+        if smallest <= 0:
+            message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
+            raise ValueError(message)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.marginals)
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """Expected values (d,)."""
+        return np.array([m.moments[0] for m in self.marginals.values()])
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviations (d,)."""
+        return np.array([m.moments[1] for m in self.marginals.values()])
+
+    @cached_property
+    def _copula(self) -> FloatArray:
+        """Correlation matrix (d, d) of the underlying normal variables."""
+        matrix = np.eye(len(self.marginals))
+        names = list(self.marginals)
+        for a, b, rho in self.correlations:
+            i, j = names.index(a), names.index(b)
+            matrix[i, j] = matrix[j, i] = rho
+        return matrix
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (d, d) of the parameters, by Gauss–Hermite quadrature for correlated pairs."""
+        covariance = np.diag(self.std**2)
+        nodes, weights = np.polynomial.hermite_e.hermegauss(64)  # type: ignore[no-untyped-call]
+        weights = weights / weights.sum()
+        marginals = list(self.marginals.values())
+        for a, b, rho in self.correlations:
+            i, j = self.names.index(a), self.names.index(b)
+            x = _from_normal(marginals[i], nodes) - self.mean[i]
+            second = rho * nodes[:, None] + np.sqrt(1 - rho**2) * nodes[None, :]
+            y = _from_normal(marginals[j], second) - self.mean[j]
+            covariance[i, j] = covariance[j, i] = float(np.einsum("i,j,i,ij->", weights, weights, x, y))
+        return covariance
+
+    def points(self, uniforms: FloatArray) -> FloatArray:
+        """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
+        marginals = self.marginals.values()
+        if not self.correlations:
+            return np.column_stack([m.quantile(u) for m, u in zip(marginals, uniforms.T, strict=True)])
+        from scipy.special import ndtri
+
+        normals = ndtri(uniforms) @ np.linalg.cholesky(self._copula).T
+        return np.column_stack([_from_normal(m, z) for m, z in zip(marginals, normals.T, strict=True)])
+
+
+def _from_normal(marginal: Distribution, normals: FloatArray) -> FloatArray:
+    from scipy.special import ndtr
+
+    return marginal.quantile(np.clip(ndtr(normals), 1e-16, 1 - 1e-16))

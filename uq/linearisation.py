@@ -1,0 +1,138 @@
+"""The model and its derivatives at the mean parameters: local sensitivities, control variates and predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.settings import Settings
+from uq.evaluate import Evaluate, Prediction, Request
+from uq.inputs import Inputs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A model at one point, with its derivatives there.
+
+    Attributes
+    ----------
+    point
+        Parameters (d,).
+    outputs
+        ψ̄ (m,).
+    tangents
+        dψ/dω (m, d); NaN for a model without derivatives.
+    state
+        ū (U,) in canonical order.
+    slopes
+        dū/dω (d, U); empty (0, U) for a model without derivatives.
+    """
+
+    point: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+
+    @property
+    def prediction(self) -> Prediction | None:
+        """The linear prediction of the state, where there is one."""
+        if self.state.size == 0 or len(self.slopes) == 0:
+            return None
+        return Prediction(self.point, self.state, self.slopes)
+
+
+@dataclass(frozen=True)
+class _StateAndSlopes:
+    derivatives: bool
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        directions = np.eye(len(model.parameters)) if self.derivatives else ()
+        return lambda solution, _: np.array([solution.state, *(solution.state_tangent(e) for e in directions)])
+
+
+def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
+    """Solve at the mean parameters, with all derivatives that the model has.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer there.
+    """
+    derivatives = evaluate.differentiable
+    found = evaluate(Request(inputs.mean[None, :], tangents=derivatives, fields=_StateAndSlopes(derivatives)))
+    for failure in found.failures:
+        message = f"the model has no answer at the mean parameters: {failure.reason}"
+        raise SolveError(message, failure.history)
+    m, d = len(evaluate.outputs), len(evaluate.parameters)
+    tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
+    fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
+    return Linearisation(inputs.mean, found.outputs[0], tangents, fields[0], fields[1:])
+
+
+class LocalSensitivity(Settings):
+    """Derivatives of all outputs and of the displacement field at the mean parameters: one solve and its tangents.
+
+    Results: `derivative` dψ/dω, `derivative_per_std` (times the standard deviation of the parameter),
+    `derivative_per_range` (times upper − lower, for bounded distributions), `field_derivative` du/dω at every node
+    and `field_derivative_norm`, its Euclidean norm over all nodes and components.
+    """
+
+    kind: Literal["local-sensitivity"] = "local-sensitivity"
+
+    @property
+    def planned(self) -> int:
+        """Number of solves."""
+        return 1
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Linearise at the mean parameters.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer there.
+        """
+        if not evaluate.differentiable:
+            message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
+            raise ValueError(message)
+        return local_dataset(inputs, evaluate, linearise(inputs, evaluate), fields=True)
+
+
+def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> xr.Dataset:
+    """Return nominal values and local derivatives as labelled arrays."""
+    import xarray as xr
+
+    ranges = np.array([np.nan if m.support is None else m.support[1] - m.support[0] for m in inputs.marginals.values()])
+    data: dict[str, tuple[tuple[str, ...], FloatArray]] = {
+        "nominal": (("output",), centre.outputs),
+        "parameter_mean": (("parameter",), inputs.mean),
+        "parameter_std": (("parameter",), inputs.std),
+    }
+    if evaluate.differentiable:
+        data |= {
+            "derivative": (("output", "parameter"), centre.tangents),
+            "derivative_per_std": (("output", "parameter"), centre.tangents * inputs.std),
+            "derivative_per_range": (("output", "parameter"), centre.tangents * ranges),
+        }
+    coordinates: dict[str, list[str]] = {
+        "output": list(evaluate.outputs),
+        "parameter": list(evaluate.parameters),
+    }
+    if fields and centre.state.size:
+        coordinates["component"] = ["x", "y", "z"]
+        data["field_nominal"] = (("node", "component"), centre.state.reshape(-1, 3))
+        if len(centre.slopes):
+            shape = (len(centre.slopes), -1, 3)
+            norms = np.linalg.norm(centre.slopes, axis=1)
+            data["field_derivative"] = (("parameter", "node", "component"), centre.slopes.reshape(shape))
+            data["field_derivative_norm"] = (("parameter",), norms)
+            data["field_derivative_norm_per_range"] = (("parameter",), norms * ranges)
+    return xr.Dataset(data, coords=coordinates)

@@ -1,0 +1,157 @@
+"""Mean and standard deviation from sums over samples, with a linear control variate, for scalars and fields alike.
+
+Let w = ψ − ψ̄ be the deviation of a quantity from its value at the mean parameters, and its tangent prediction
+L = Σ_i ∂ψ/∂ω_i(ω̄)(ω_i − ω̄_i), with E[L] = 0 and E[L²] = V known exactly. With sample means ⟨·⟩,
+
+    mean:            ψ̄ + ⟨w − β₁L⟩
+    second moment:   ⟨w² − β₂(L² − V)⟩
+
+β₁ = 1 is the estimator of Cao, Hussaini & Zang, AIAA J. 42 (2004) 703–710; β₂ = 0 is its published second moment (see
+docs/decisions/0003-second-moment-control.md), β₁ = β₂ = 0 is plain Monte Carlo. Everything follows from the means of
+w^a L^b, a + b ≤ 4, which are sums and so can be added up in any grouping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from forward.model import FloatArray
+
+Coefficient = Literal["one", "optimal"]
+SecondMoment = Literal["quadratic", "linear"]
+
+ESTIMATES = ("mean", "mean_error", "std", "std_error")
+EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
+
+
+def monomials(w: FloatArray, L: FloatArray | None) -> FloatArray:
+    """Return the products w^a L^b (k, …) in the order of `EXPONENTS`; only those with b = 0 where there is no L."""
+    if L is None:
+        return np.array([w, w**2, w**3, w**4])
+    powers_w, powers_l = [np.ones_like(w), w], [np.ones_like(L), L]
+    for _ in range(3):
+        powers_w.append(powers_w[-1] * w)
+        powers_l.append(powers_l[-1] * L)
+    return np.array([powers_w[a] * powers_l[b] for a, b in EXPONENTS])
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Estimates with their standard errors, each of the shape of the quantity.
+
+    Attributes
+    ----------
+    mean, mean_error, std, std_error
+        In the unit of the quantity. Errors are one standard error; that of the standard deviation is by linearisation.
+    variance_ratio
+        Variance of one plain sample over that of one controlled sample (for the mean): above 1 the control helps.
+    std_variance_ratio
+        The same for the variance estimate.
+    coefficient
+        β₁.
+    """
+
+    mean: FloatArray
+    mean_error: FloatArray
+    std: FloatArray
+    std_error: FloatArray
+    variance_ratio: FloatArray
+    std_variance_ratio: FloatArray
+    coefficient: FloatArray
+
+
+def estimate(
+    sums: FloatArray,
+    n: int,
+    reference: FloatArray,
+    control_variance: FloatArray | None = None,
+    coefficient: Coefficient = "one",
+    second_moment: SecondMoment = "quadratic",
+) -> Moments:
+    """Estimate mean and standard deviation from the sums of `monomials` over n samples.
+
+    Parameters
+    ----------
+    sums
+        Sums (k, …) of w^a L^b over the samples.
+    n
+        Number of samples, at least 2.
+    reference
+        ψ̄ (…).
+    control_variance
+        V = E[L²] (…); without it the estimators are those of plain Monte Carlo.
+    coefficient
+        β₁ = 1, or the one that is optimal on these samples.
+    second_moment
+        Whether L² − V controls the second moment ("quadratic") or not ("linear", as published).
+    """
+    controlled = control_variance is not None
+    exponents = EXPONENTS if controlled else tuple((a, 0) for a in range(1, 5))
+    means = {e: s / n for e, s in zip(exponents, sums, strict=True)}
+    zero: FloatArray = np.zeros_like(reference)
+
+    def mean_of(a: int, b: int) -> FloatArray:
+        return np.asarray(means.get((a, b), zero))
+
+    V = control_variance if control_variance is not None else zero
+    if not controlled:
+        beta1, beta2 = zero, zero
+    elif coefficient == "one":
+        beta1, beta2 = zero + 1, zero + 1
+    else:
+        beta1 = _ratio(mean_of(1, 1) - mean_of(1, 0) * mean_of(0, 1), mean_of(0, 2) - mean_of(0, 1) ** 2)
+        beta2 = _ratio(mean_of(2, 2) - mean_of(2, 0) * mean_of(0, 2), mean_of(0, 4) - mean_of(0, 2) ** 2)
+    if second_moment == "linear":
+        beta2 = zero
+
+    bessel = n / (n - 1)
+    m1 = mean_of(1, 0) - beta1 * mean_of(0, 1)  # of r1 = w − β₁L
+    q = mean_of(2, 0) - beta2 * mean_of(0, 2)  # of r2 = w² − β₂L²
+    m11 = mean_of(2, 0) - 2 * beta1 * mean_of(1, 1) + beta1**2 * mean_of(0, 2)
+    m12 = mean_of(3, 0) - beta1 * mean_of(2, 1) - beta2 * mean_of(1, 2) + beta1 * beta2 * mean_of(0, 3)
+    m22 = mean_of(4, 0) - 2 * beta2 * mean_of(2, 2) + beta2**2 * mean_of(0, 4)
+    var1 = np.maximum(m11 - m1**2, 0) * bessel
+    cov12 = (m12 - m1 * q) * bessel
+    var2 = np.maximum(m22 - q**2, 0) * bessel
+    # ⟨r1⟩² exceeds its square by Var(r1)/n, which is added back: plain Monte Carlo gets the usual n − 1.
+    variance = np.maximum(q + beta2 * V - m1**2 + var1 / n, 0)
+    variance_error = np.sqrt(np.maximum(var2 - 4 * m1 * cov12 + 4 * m1**2 * var1, 0) / n)
+    std = np.sqrt(variance)
+
+    plain1 = np.maximum(mean_of(2, 0) - mean_of(1, 0) ** 2, 0) * bessel
+    w1, w2 = mean_of(1, 0), mean_of(2, 0)
+    plain_variance = (mean_of(4, 0) - w2**2 - 4 * w1 * (mean_of(3, 0) - w1 * w2) + 4 * w1**2 * (w2 - w1**2)) * bessel
+    return Moments(
+        mean=reference + m1,
+        mean_error=np.sqrt(var1 / n),
+        std=std,
+        std_error=_ratio(variance_error, 2 * std),
+        variance_ratio=_ratio(plain1, var1, empty=1.0),
+        std_variance_ratio=_ratio(plain_variance, n * variance_error**2, empty=1.0),
+        coefficient=beta1,
+    )
+
+
+def _ratio(a: FloatArray, b: FloatArray, empty: float = 0.0) -> FloatArray:
+    """A / b, and `empty` where both vanish (a node that does not move)."""
+    both = (a == 0) & (b == 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(both, empty, a / np.where(both, 1, b))
+
+
+def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Sample quantiles (k, m) of values (n, m), with standard errors from the order statistics around them.
+
+    The error is half the distance between the order statistics at p ± √(p(1−p)/n)
+    (H. A. David, H. N. Nagaraja, Order Statistics (2003), section 7.1).
+    """
+    n = len(values)
+    p = np.array(probabilities)
+    spread = np.sqrt(p * (1 - p) / n)
+    central = np.quantile(values, p, axis=0)
+    upper = np.quantile(values, np.minimum(p + spread, 1), axis=0)
+    lower = np.quantile(values, np.maximum(p - spread, 0), axis=0)
+    return central, (upper - lower) / 2

@@ -1,0 +1,246 @@
+"""Monte Carlo, plain and with sensitivity derivatives, for outputs and for the whole displacement field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.settings import Settings
+from uq.evaluate import Evaluate, Evaluations, Request, merge
+from uq.inputs import Inputs
+from uq.linearisation import Linearisation, linearise, local_dataset
+from uq.moments import ESTIMATES, Coefficient, Moments, SecondMoment, estimate, monomials, quantiles
+from uq.sampling import random_points
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FIRST_ROUND = 64  # samples before a tolerance is first looked at
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class MonteCarlo(Settings):
+    """Plain Monte Carlo.
+
+    Parameters
+    ----------
+    samples
+        Number of samples; with a tolerance, the largest number.
+    tolerance
+        Stop when the standard error of every mean is below this fraction of the mean (of the standard deviation,
+        where the mean is smaller than that).
+    seed
+        Seed of the random points; sample z of a seed is the same in every study.
+    quantiles
+        Probabilities of the quantiles of the outputs.
+    fields
+        Whether mean and standard deviation of the displacement field are computed, node by node.
+    """
+
+    kind: Literal["monte-carlo"] = "monte-carlo"
+    samples: Annotated[int, Field(ge=2)] | None = None
+    tolerance: Annotated[float, Field(gt=0)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
+    fields: bool = True
+
+    @model_validator(mode="after")
+    def _check_amount(self) -> MonteCarlo:
+        if self.samples is None and self.tolerance is None:
+            message = "gives neither samples nor tolerance, expected at least one of them"
+            raise ValueError(message)
+        return self
+
+    @property
+    def planned(self) -> int:
+        """Number of solves, the largest where a tolerance may end the study earlier."""
+        return 1 + (self.samples or 100_000)
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Sample and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            Estimates by output (`mean`, `mean_error`, `std`, `std_error`, `quantiles`, …) and, with `fields`, by node
+            and component (`field_mean`, …); samples (`points`, `values`, `ok`); see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters or at fewer than two samples.
+        """
+        return _sample(self, inputs, evaluate, control=None)
+
+
+class SensitivityMonteCarlo(MonteCarlo):
+    """Monte Carlo with sensitivity derivatives: the tangent at the mean parameters is the control variate.
+
+    Parameters
+    ----------
+    coefficient
+        "one", or "optimal": β = Cov(ψ, L)/Var L estimated on the samples.
+    second_moment
+        "quadratic" controls it by the square of the tangent, "linear" is the published form.
+    """
+
+    kind: Literal["sensitivity-monte-carlo"] = "sensitivity-monte-carlo"  # type: ignore[assignment]
+    coefficient: Coefficient = "one"
+    second_moment: SecondMoment = "quadratic"
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Linearise at the mean parameters, sample and estimate; results as of `MonteCarlo`, and `variance_ratio`.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters or at fewer than two samples.
+        ValueError
+            If the model has no derivatives.
+        """
+        if not evaluate.differentiable:
+            message = "the model has no derivatives, expected one that has for method.kind = 'sensitivity-monte-carlo'"
+            raise ValueError(message)
+        return _sample(self, inputs, evaluate, control=(self.coefficient, self.second_moment))
+
+
+@dataclass(frozen=True)
+class _JointMoments:
+    """Sum of the monomials of the state's deviation and of its tangent prediction."""
+
+    point: FloatArray
+    state: FloatArray
+    slopes: FloatArray | None
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        state = model.scatter(self.state[None, :])[0]
+        slopes = None if self.slopes is None else model.scatter(self.slopes)
+
+        def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
+            prediction = None if slopes is None else (parameters - self.point) @ slopes
+            return monomials(solution.state - state, prediction)
+
+        return rows
+
+
+def _sample(
+    method: MonteCarlo, inputs: Inputs, evaluate: Evaluate, control: tuple[Coefficient, SecondMoment] | None
+) -> xr.Dataset:
+    centre = linearise(inputs, evaluate)
+    slopes = centre.slopes if control else None
+    fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
+    rounds: list[Evaluations] = []
+    limit = method.planned - 1
+    target = limit if method.tolerance is None else min(limit, FIRST_ROUND)
+    count = 0
+    while True:
+        points = inputs.points(random_points(method.seed, count, target, len(inputs.names)))
+        rounds.append(evaluate(Request(points, fields=fields, start=centre.prediction)))
+        count = target
+        evaluations = merge(rounds)
+        scalars = _scalar_moments(evaluations, inputs, centre, control)
+        if method.tolerance is None:
+            stopped = f"{count} samples, as asked"
+            break
+        reached = float(_relative_error(scalars).max())
+        if reached <= method.tolerance:
+            stopped = f"tolerance {method.tolerance:g} met: relative error {reached:.3g} after {count} samples"
+            break
+        if count >= limit:
+            stopped = f"tolerance {method.tolerance:g} not met: relative error {reached:.3g} after all {count} samples"
+            break
+        growth = min(4.0, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
+        target = min(limit, int(count * growth) + 1)
+    return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
+
+
+def _relative_error(moments: Moments) -> FloatArray:
+    scale = np.maximum(np.abs(moments.mean), moments.std)
+    return np.where(scale > 0, moments.mean_error / np.where(scale > 0, scale, 1), 0)
+
+
+def _scalar_moments(
+    evaluations: Evaluations,
+    inputs: Inputs,
+    centre: Linearisation,
+    control: tuple[Coefficient, SecondMoment] | None,
+) -> Moments:
+    ok = evaluations.ok
+    n = int(ok.sum())
+    if n < 2:
+        reasons = sorted({failure.reason for failure in evaluations.failures})
+        message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {'; '.join(reasons[:3])}"
+        raise SolveError(message)
+    deviations = evaluations.outputs[ok] - centre.outputs
+    if control is None:
+        return estimate(monomials(deviations, None).sum(axis=1), n, centre.outputs)
+    predictions = (evaluations.points[ok] - centre.point) @ centre.tangents.T
+    variance = np.einsum("mi,ij,mj->m", centre.tangents, inputs.covariance, centre.tangents)
+    return estimate(monomials(deviations, predictions).sum(axis=1), n, centre.outputs, variance, *control)
+
+
+def _field_moments(
+    evaluations: Evaluations,
+    inputs: Inputs,
+    centre: Linearisation,
+    control: tuple[Coefficient, SecondMoment] | None,
+) -> Moments:
+    n = int(evaluations.ok.sum())
+    if control is None:
+        return estimate(evaluations.fields, n, centre.state)
+    variance = np.einsum("iu,ij,ju->u", centre.slopes, inputs.covariance, centre.slopes)
+    return estimate(evaluations.fields, n, centre.state, variance, *control)
+
+
+def _dataset(
+    method: MonteCarlo,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    centre: Linearisation,
+    evaluations: Evaluations,
+    scalars: Moments,
+    control: tuple[Coefficient, SecondMoment] | None,
+    stopped: str,
+) -> xr.Dataset:
+    ok = evaluations.ok
+    central, central_error = quantiles(evaluations.outputs[ok], method.quantiles)
+    dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
+    dataset = dataset.assign_coords(quantile=list(method.quantiles))
+    by_output = ("output",)
+    dataset = dataset.assign(
+        {
+            **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
+            "quantiles": (("quantile", "output"), central),
+            "quantiles_error": (("quantile", "output"), central_error),
+            "points": (("sample", "parameter"), evaluations.points),
+            "values": (("sample", "output"), evaluations.outputs),
+            "ok": (("sample",), ok),
+        }
+    )
+    if control is not None:
+        gains = ("variance_ratio", "std_variance_ratio", "coefficient")
+        plain = _scalar_moments(evaluations, inputs, centre, None)
+        dataset = dataset.assign(
+            {
+                **{name: (by_output, getattr(scalars, name)) for name in gains},
+                **{f"plain_{name}": (by_output, getattr(plain, name)) for name in ESTIMATES},
+            }
+        )
+    if evaluations.fields.size:
+        field = _field_moments(evaluations, inputs, centre, control)
+        by_node = ("node", "component")
+        by_node = {f"field_{name}": getattr(field, name).reshape(-1, 3) for name in ESTIMATES}
+        dataset = dataset.assign({name: (("node", "component"), values) for name, values in by_node.items()})
+    dataset.attrs["stopped"] = stopped
+    failed = int((~ok).sum())
+    if failed:
+        dataset.attrs["note"] = (
+            f"{failed} of {len(ok)} samples have no answer; all estimates are over the {len(ok) - failed} others, "
+            "that is, conditional on the model having an answer"
+        )
+    return dataset

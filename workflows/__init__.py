@@ -1,0 +1,1 @@
+"""Studies: configuration, the run, results, report and the command line."""

@@ -1,0 +1,129 @@
+"""The command line: tissuq check | run | report | init."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+# One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+DONE, FAILED, BAD = 0, 1, 2
+_RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Returns
+    -------
+    int
+        0 done; 1 failed, with one line that says why; 2 bad study or arguments; 3 finished, but some solves failed.
+    """
+    options = _parser().parse_args(arguments)
+    from forward.model import SolveError
+    from workflows.config import StudyError
+
+    try:
+        return int(options.command(options))
+    except StudyError as error:
+        _say(str(error))
+        return BAD
+    except (SolveError, FileNotFoundError, PermissionError) as error:
+        _say(f"failed: {error}")
+        return FAILED
+    except KeyboardInterrupt:
+        _say("interrupted; the same command continues")
+        return FAILED
+    except Exception:
+        traceback.print_exc()
+        _abort_all()
+        return FAILED
+
+
+def _say(text: str) -> None:
+    """Print errors once, on the first rank of the job."""
+    if next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0":
+        sys.stderr.write(f"{text}\n")
+
+
+def _abort_all() -> None:
+    mpi = sys.modules.get("mpi4py.MPI")
+    if mpi is not None and mpi.COMM_WORLD.size > 1:
+        sys.stderr.flush()
+        mpi.COMM_WORLD.Abort(FAILED)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="tissuq",
+        description="Uncertainty quantification and Bayesian model selection for hyperelastic soft tissue.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    check = commands.add_parser("check", help="validate a study and print what it will cost")
+    run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
+    report = commands.add_parser("report", help="build the report of results again; several are compared side by side")
+    init = commands.add_parser("init", help="print a commented starter study")
+    for command in (check, run):
+        command.add_argument("study", type=Path, metavar="STUDY.toml")
+        command.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help="change one value, such as method.samples=512",
+        )
+    run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
+    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
+    report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
+    init.add_argument("kind", metavar="KIND", help="monte-carlo, sensitivity-monte-carlo or local-sensitivity")
+    check.set_defaults(command=_check)
+    run.set_defaults(command=_run)
+    report.set_defaults(command=_report)
+    init.set_defaults(command=_init)
+    return parser
+
+
+def _check(options: argparse.Namespace) -> int:
+    from workflows.config import load
+    from workflows.plan import plan
+
+    study = load(options.study, options.set)
+    sys.stdout.write("\n".join([f"{options.study}: a valid study", *plan(study)]) + "\n")
+    return DONE
+
+
+def _run(options: argparse.Namespace) -> int:
+    from workflows.config import load
+
+    study = load(options.study, options.set)
+    from workflows.study import run
+
+    return run(study, options.study.stem, options.out or Path("results") / options.study.stem, quiet=options.quiet)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from workflows.report import compare, write_report
+
+    for directory in options.directories:
+        sys.stdout.write(f"{write_report(directory)}\n")
+    if len(options.directories) > 1:
+        sys.stdout.write(f"{compare(options.directories, options.out or Path('comparison.html'))}\n")
+    return DONE
+
+
+def _init(options: argparse.Namespace) -> int:
+    from workflows.starter import starter
+
+    sys.stdout.write(starter(options.kind))
+    return DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""What a study will cost, before anything is imported or computed."""
+
+from __future__ import annotations
+
+from workflows.config import Study
+
+# Rough cost of one Newton iteration on one core in seconds, and bytes of the factor, as powers of the unknowns:
+# fitted to a structured box with 3·10³, 10⁴ and 7·10⁴ unknowns on a 2.8 GHz core (python -m benchmarks newton).
+ITERATIONS = 3.0
+
+
+def seconds_per_solve(unknowns: int) -> float:
+    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so."""
+    return float(ITERATIONS * (1.3e-5 * unknowns + 2.2e-8 * unknowns**1.6))
+
+
+def bytes_per_model(unknowns: int) -> float:
+    """Predict the memory of one model with its factorised stiffness, to a factor of two or so."""
+    return float(1.5e8 + 8 * (200 * unknowns + 30 * unknowns ** (4 / 3)))
+
+
+def plan(study: Study, groups: int = 1) -> list[str]:
+    """Describe a study in lines: unknowns, solves, memory and predicted time."""
+    unknowns = study.model.unknowns
+    solves = study.method.planned
+    seconds = solves * seconds_per_solve(unknowns) / groups
+    body = study.model.body
+    cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
+    up_to = "up to " if getattr(study.method, "tolerance", None) is not None else ""
+    return [
+        f"method      {study.method.kind}",
+        f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree})",
+        f"parameters  {', '.join(study.parameters)}",
+        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"solves      {up_to}{solves:,}",
+        f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
+        f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
+        f" (rough; {seconds_per_solve(unknowns):.2g} s a solve)",
+    ]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

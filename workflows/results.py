@@ -1,0 +1,150 @@
+"""The results directory: results.nc, summary.json and files for ParaView; each written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uq.moments import ESTIMATES
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file under another name and rename it into place."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def write_dataset(path: Path, dataset: xr.Dataset) -> None:
+    """Write a netCDF-4 file and rename it into place; equal datasets give equal bytes."""
+    import h5netcdf
+    import h5py
+    from xarray.backends import H5NetCDFStore
+
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    # HDF5 stamps its root group with the time unless it is told not to; netCDF-4 needs the order of creation.
+    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    creation.set_obj_track_times(False)
+    order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
+    creation.set_link_creation_order(order)
+    creation.set_attr_creation_order(order)
+    created = h5py.h5f.create(os.fsencode(partial), fcpl=creation)
+    with h5py.File(created) as file, h5netcdf.File(file, "a") as netcdf:
+        dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
+    partial.replace(path)
+
+
+def read_dataset(directory: Path) -> xr.Dataset:
+    """Read the results of a study into memory.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the directory holds no results.
+    """
+    import xarray as xr
+
+    path = directory / "results.nc"
+    if not path.exists():
+        message = f"{directory}: holds no results.nc, expected the directory of a finished study"
+        raise FileNotFoundError(message)
+    return xr.load_dataset(path, engine="h5netcdf")
+
+
+def read_summary(directory: Path) -> dict[str, Any] | None:
+    """Read summary.json; nothing if there is none."""
+    try:
+        return dict(json.loads((directory / "summary.json").read_text(encoding="utf-8")))
+    except (FileNotFoundError, json.JSONDecodeError):
+        return None
+
+
+def summarise(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the part of summary.json that follows from the results: `outputs` and `local`."""
+    summary: dict[str, Any] = {}
+    outputs = [str(name) for name in dataset.output.values]
+    if "mean" in dataset:
+        names = [name for name in (*ESTIMATES, "variance_ratio", "std_variance_ratio") if name in dataset]
+        summary["outputs"] = {
+            output: {name: float(dataset[name].sel(output=output)) for name in names} for output in outputs
+        }
+    for key, variable in (
+        ("local", "derivative"),
+        ("local_per_std", "derivative_per_std"),
+        ("local_per_range", "derivative_per_range"),
+    ):
+        if variable in dataset:
+            summary[key] = {
+                output: {
+                    str(parameter): _number(dataset[variable].sel(output=output, parameter=parameter))
+                    for parameter in dataset.parameter.values
+                }
+                for output in outputs
+            }
+    return summary
+
+
+def _number(value: Any) -> float | None:
+    """A number, or nothing where it is not finite: JSON has no NaN."""
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def body_grid(dataset: xr.Dataset) -> Any:
+    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
+    import pyvista
+
+    cells = dataset["cell_nodes"].to_numpy()
+    sizes = np.full((len(cells), 1), cells.shape[1])
+    kinds = np.full(len(cells), dataset["cell_nodes"].attrs["vtk_cell_type"])
+    grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
+    for name, values in node_fields(dataset).items():
+        grid.point_data[name] = values
+    return grid
+
+
+def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
+    """Write the displacement fields of the results on the undeformed mesh, for ParaView; nothing if there are none."""
+    if "cell_nodes" not in dataset:
+        return None
+    directory.mkdir(exist_ok=True)
+    path = directory / "displacement.vtu"
+    partial = path.with_name(f".{os.getpid()}.{path.name}")
+    body_grid(dataset).save(partial)
+    partial.replace(path)
+    return path
+
+
+def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
+    """Return the fields (n_nodes, 3) of the results by a name that tells what they are."""
+    arrays = {}
+    for name, variable in dataset.data_vars.items():
+        if set(variable.dims) == {"node", "component"}:
+            arrays[str(name).removeprefix("field_")] = variable.to_numpy()
+        elif variable.dims == ("parameter", "node", "component"):
+            for parameter in dataset.parameter.values:
+                arrays[f"{str(name).removeprefix('field_')} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
+    return arrays
+
+
+def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any, vtk_cell_type: int) -> xr.Dataset:
+    """Add the mesh, where there are fields, and the units of the outputs."""
+    dataset = dataset.assign_coords(unit=("output", [units[str(name)] for name in dataset.output.values]))
+    if "node" in dataset.dims:
+        dataset = dataset.assign(
+            node_position=(("node", "axis"), nodes),
+            cell_nodes=(("cell", "corner"), cells, {"vtk_cell_type": vtk_cell_type}),
+        )
+        for name in dataset.data_vars:
+            if str(name).startswith("field_") and "derivative" not in str(name):
+                dataset[name].attrs["units"] = "m"
+    return dataset

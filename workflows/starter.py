@@ -1,0 +1,80 @@
+"""Starter studies: what `tissuq init` prints."""
+
+from __future__ import annotations
+
+from forward.settings import nearest
+from workflows.config import StudyError
+
+_MODEL = """\
+# A study of tissuq. SI units throughout. Check it with `tissuq check FILE`, run it with `mpirun -n 2 tissuq run FILE`.
+
+[model]
+kind = "hyperelastic"
+# A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+# cell = "hexahedron" | "tetrahedron", degree = 1 | 2
+body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
+# "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1) or "neo-hookean-coupled" (mu, lmbda), in Pa.
+material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
+clamp = ["x-min"]
+# Boundaries that are moved by a given amount (m), component by component:
+# displacements = [{ on = "x-max", x = 0.01 }]
+loads = [
+    { kind = "gravity", direction = [0, -1, 0], density = 1000 },
+    # { kind = "traction", on = "x-max", direction = [0, 0, 1], size = 100 },
+    # { kind = "pressure", on = "y-max", size = 50 },
+]
+# max-displacement (component x, y, z or magnitude), displacement (at, component), mean-displacement (on, component),
+# reaction (on, component), strain-energy, volume-change, max-von-mises
+outputs = [
+    { name = "sag", kind = "max-displacement", component = "y" },
+    { name = "energy", kind = "strain-energy" },
+]
+# solver = { tolerance = 1e-8 }
+
+[parameters]
+# Any number of the model by its path: material.*, loads.<name or kind>.density|size, displacements.<name or boundary>.x
+# uniform, log-uniform, triangular, beta, truncated-normal, normal, log-normal, gamma
+"material.C1" = { kind = "uniform", lower = 0.5e4, upper = 1.5e4 }
+"loads.gravity.density" = { kind = "truncated-normal", mean = 1000, std = 50, lower = 800, upper = 1200 }
+
+# [[correlations]]
+# between = ["material.C1", "loads.gravity.density"]
+# value = 0.3
+
+[method]
+"""
+
+_METHODS = {
+    "monte-carlo": """\
+kind = "monte-carlo"
+samples = 200         # or tolerance = 0.01: relative standard error of the means; both: whichever comes first
+seed = 1
+quantiles = [0.05, 0.5, 0.95]
+fields = true         # mean and standard deviation of the displacement at every node
+""",
+    "sensitivity-monte-carlo": """\
+kind = "sensitivity-monte-carlo"
+samples = 100         # or tolerance = 0.01: relative standard error of the means; both: whichever comes first
+seed = 1
+coefficient = "one"   # or "optimal": estimated on the samples
+second_moment = "quadratic"   # or "linear": the published form
+fields = true         # mean and standard deviation of the displacement at every node
+""",
+    "local-sensitivity": """\
+kind = "local-sensitivity"
+""",
+}
+
+
+def starter(kind: str) -> str:
+    """Return a commented study that runs as it is.
+
+    Raises
+    ------
+    StudyError
+        If there is no method of that kind.
+    """
+    if kind not in _METHODS:
+        message = f"init {kind}: unknown kind of study; {nearest(kind, tuple(_METHODS))}"
+        raise StudyError(message)
+    return _MODEL + _METHODS[kind]

@@ -1,0 +1,291 @@
+"""The run of a study: the one place where model, method and MPI meet."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+import tomllib
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uq.evaluate import BLOCKS, Evaluate, Evaluations, Request
+from workflows.config import Study, StudyError, differences, document, dump
+from workflows.progress import Progress
+from workflows.results import label, read_summary, summarise, write_dataset, write_fields, write_text
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
+LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
+
+
+def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int:
+    """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
+
+    Parameters
+    ----------
+    study
+        What to compute.
+    name
+        Name of the study in results.
+    directory
+        Where results go; made if it does not exist.
+    quiet
+        Print nothing but errors.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 3 finished but some solves failed (on rank 0; 0 on the others).
+
+    Raises
+    ------
+    StudyError
+        If the directory holds another study or cannot be written, or if there is less work than groups of ranks.
+    SolveError
+        If the study cannot be finished because the model has no answer.
+    """
+    from mpi4py import MPI
+
+    from workflows.report import write_report
+
+    world = MPI.COMM_WORLD
+    begin = time.monotonic()
+    refusal, finished = None, None
+    if world.rank == 0:
+        try:
+            finished = _prepare(study, directory, world.size)
+        except StudyError as error:
+            refusal = error
+    refusal, finished = world.bcast((refusal, finished))
+    if refusal is not None:
+        raise refusal
+    if finished is not None:
+        if world.rank == 0:
+            if not (directory / "report.html").exists():
+                write_report(directory)
+            if not quiet:
+                sys.stdout.write(f"{directory}: finished before, nothing to do\n")
+        return int(finished)
+
+    from uq.checkpoint import Checkpoint
+    from uq.ensemble import Ensemble
+
+    ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
+    inputs = study.inputs
+    model = study.model.build(ensemble.group, inputs.names)
+    progress = Progress(study.method.planned, quiet=quiet or world.rank > 0)
+    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
+    log = _Log()
+    dataset = ensemble.run(
+        model,
+        lambda evaluate: study.method.run(inputs, _Recorded(evaluate, log)),
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    cells, kind = model.layout.cells() if ensemble.index == 0 else (None, 0)
+    if dataset is None:
+        world.barrier()
+        return DONE
+    progress.close()
+    dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
+    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
+    write_dataset(directory / "results.nc", dataset)
+    write_fields(directory / "fields", dataset)
+    summary = _summary(study, name, dataset, log, world.size, ensemble.groups, time.monotonic() - begin)
+    checkpoint.consolidate(log.all())
+    # The summary says that the study is finished: only then may the blocks go.
+    write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+    checkpoint.clear()
+    write_report(directory)
+    if not quiet:
+        sys.stdout.write(_closing_words(directory, dataset, summary))
+    world.barrier()
+    return PARTIAL if summary["failed"] else DONE
+
+
+@dataclass
+class _Log:
+    """Every evaluation of a study, in order."""
+
+    evaluations: list[Evaluations] = field(default_factory=list)
+
+    def all(self) -> Evaluations:
+        """All of them as one, without derivatives and fields."""
+        from dataclasses import replace
+
+        from uq.evaluate import merge
+
+        return merge([replace(e, tangents=None, fields=e.fields[:0]) for e in self.evaluations])
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """An evaluation that keeps what it returns in a log."""
+
+    evaluate: Evaluate
+    log: _Log
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return self.evaluate.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.evaluate.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        return self.evaluate.differentiable
+
+    def __call__(self, request: Request) -> Evaluations:
+        evaluations = self.evaluate(request)
+        self.log.evaluations.append(evaluations)
+        return evaluations
+
+
+def _identity(study: Study) -> dict[str, Any]:
+    return {key: value for key, value in document(study).items() if key != "parallel"}
+
+
+def _prepare(study: Study, directory: Path, ranks: int) -> int | None:
+    """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
+    share = study.parallel.ranks_per_model
+    if ranks % share:
+        message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
+        raise StudyError(message)
+    groups, blocks = ranks // share, min(max(study.method.planned - 1, 1), BLOCKS)
+    if groups > blocks:
+        message = (
+            f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
+            f"start mpirun -n {blocks * share}, or set parallel.ranks_per_model"
+        )
+        raise StudyError(message)
+    kept = directory / "study.toml"
+    try:
+        if kept.exists():
+            changes = differences(tomllib.loads(kept.read_text(encoding="utf-8")), document(study))
+            if changes:
+                message = f"{directory}: holds another study ({'; '.join(changes[:5])}); choose another --out"
+                raise StudyError(message)
+        elif directory.exists() and any(directory.iterdir()):
+            message = f"{directory}: is not empty and holds no study, expected a new directory or one of this study"
+            raise StudyError(message)
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.W_OK | os.X_OK):
+            message = f"{directory}: cannot be written: permission denied"
+            raise StudyError(message)
+        for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")]:
+            leftover.unlink()
+        if not kept.exists():
+            write_text(kept, dump(study))
+    except tomllib.TOMLDecodeError:
+        message = f"{kept}: is not a study, expected a directory of this study"
+        raise StudyError(message) from None
+    except OSError as error:
+        message = f"{directory}: cannot be written: {error.strerror}"
+        raise StudyError(message) from None
+    summary = read_summary(directory)
+    if summary is None:
+        return None
+    return PARTIAL if summary["failed"] else DONE
+
+
+def _units(study: Study) -> dict[str, str]:
+    return {output.name: output.unit for output in study.model.outputs}
+
+
+def _version() -> str:
+    try:
+        return version("tissuq")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _summary(
+    study: Study, name: str, dataset: xr.Dataset, log: _Log, ranks: int, groups: int, wall: float
+) -> dict[str, Any]:
+    from forward.model import WORK
+
+    evaluations = log.all()
+    failed = len(evaluations.failures)
+    return {
+        "study": name,
+        "method": study.method.kind,
+        "status": "partial" if failed else "complete",
+        "stopped": dataset.attrs.get("stopped", "one linearisation"),
+        **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
+        "evaluations": len(evaluations.points),
+        "failed": failed,
+        "failures": [
+            {
+                "parameters": dict(zip(dataset.parameter.values.tolist(), f.parameters, strict=True)),
+                "reason": f.reason,
+            }
+            for f in evaluations.failures[:LISTED]
+        ],
+        "wall_seconds": wall,
+        "cpu_seconds": float(evaluations.seconds.sum()) * study.parallel.ranks_per_model,
+        "work": dict(zip(WORK, evaluations.work.sum(axis=0).tolist(), strict=True)),
+        **summarise(dataset),
+        "provenance": {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seed": getattr(study.method, "seed", None),
+            "ranks": ranks,
+            "groups": groups,
+            "processor": platform.machine(),
+            "commit": _commit(),
+            "versions": {"python": platform.python_version(), **_versions()},
+        },
+    }
+
+
+def _versions() -> dict[str, str]:
+    names = ("tissuq", "fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
+    found = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def _commit() -> str | None:
+    """Return the commit of the source tree, where there is one."""
+    import subprocess
+
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    lines = []
+    for output, values in summary.get("outputs", {}).items():
+        unit = dataset.unit.sel(output=output).item()
+        lines.append(
+            f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
+            f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+        )
+    if not lines:
+        for output, slopes in summary.get("local_per_range", {}).items():
+            shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
+            lines.append(f"{output}: derivative × range of the parameter: {shown}")
+    lines.append(f"{summary['evaluations']} solves in {summary['wall_seconds']:.1f} s, {summary['failed']} failed")
+    if "note" in summary:
+        lines.append(summary["note"])
+    lines.append(f"report: {directory / 'report.html'}")
+    return "\n".join(lines) + "\n"
