@@ -25,9 +25,8 @@ help: ## list the targets
 
 setup: $(READY) ## install what is missing
 
-demo: $(READY) ## run configs/beam.toml on 2 ranks and print where the report is
+demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the report is
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
-	@echo "report: $(CURDIR)/results/$(DEMO)/report.html"
 
 test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
 	@$(PYTHON) -m pytest $(ARGS)

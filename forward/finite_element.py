@@ -80,6 +80,7 @@ class Discretisation:
         )
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
+        self._rounding = 0.0
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
@@ -202,7 +203,15 @@ class Discretisation:
         self._moves = any(self._values[path] != 0 for path in self._movers)
 
     def measure_loads(self) -> None:
-        """Find the scale of residuals: ‖F(0)‖ at full load (all energies are free of stress at 0)."""
+        """Find the scale of residuals, and what of them is rounding.
+
+        The scale is ‖F(0)‖ at full load (all energies are free of stress at 0). The rounding is that of stresses of
+        the size of the stiffness: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch of the body.
+        """
+        self.at_load(0.0)
+        stretch = 1e-6
+        r = self._imbalance(stretch * fenicsx.node_coordinates(self.space).ravel())
+        self._rounding = 4 * float(np.finfo(float).eps) * self.norm(r) / stretch
         self.at_load(1.0)
         r = self._imbalance(np.zeros(3 * self.nodes_owned))
         r[self._fixed] = 0
@@ -248,7 +257,7 @@ class Discretisation:
         scale = float(self._load.value) * self._external
         if self._moves:
             scale = max(scale, float(np.sqrt(fixed)))
-        return Residual(r, float(np.sqrt(free)), scale, float(np.sqrt(apart)))
+        return Residual(r, float(np.sqrt(free)), scale, self._rounding, float(np.sqrt(apart)))
 
     def factorise(self, u: FloatArray) -> None:
         """Assemble and factorise the stiffness at u (U_local,)."""
@@ -403,6 +412,7 @@ class HyperelasticModel:
         """Factorise the stiffness at a solution, if the factor at hand is another's."""
         body = self.visit(solution)
         if self._factorised is not solution:
+            self._factorised = None  # a factorisation that fails leaves no factor
             body.factorise(solution.state)
             self._factorised = solution
         return body

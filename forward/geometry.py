@@ -63,6 +63,13 @@ class Box(Settings):
         a, b, c = self.size
         return a * b * c
 
+    def corners(self, boundary: str) -> list[Vector]:
+        """Corners of a boundary, in units of the edge lengths."""
+        axis, end = boundary.split("-")
+        place = {"min": 0.0, "max": 1.0}[end]
+        corners = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)]
+        return [corner for corner in corners if corner["xyz".index(axis)] == place]
+
     def contains(self, point: Vector) -> bool:
         """Whether a point (m) lies in the undeformed body."""
         return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))

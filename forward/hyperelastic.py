@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
+import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, create_model, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.geometry import Box
+from forward.geometry import AXES, Box
 from forward.loads import LOAD_SIZES, Displacement, Load
 from forward.materials import MATERIALS, constants
 from forward.newton import NewtonSettings
@@ -43,6 +44,9 @@ else:
     ]
 
 
+Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
+
+
 class Scalar(NamedTuple):
     """A number of the model that can be made a parameter."""
 
@@ -62,7 +66,7 @@ class Scalar(NamedTuple):
 @cache
 def _admissible(block: type[Settings], field: str) -> TypeAdapter[float]:
     limits = block.model_fields[field].metadata
-    return TypeAdapter(Annotated[(float, Field(), *limits)])  # type: ignore[valid-type]
+    return TypeAdapter(Annotated[(float, Field(), *limits)])
 
 
 class Hyperelastic(Settings):
@@ -146,7 +150,7 @@ class Hyperelastic(Settings):
             )
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         """Everything that no single block can see: unknown boundaries, repeated names, a body that can float away."""
         boundaries = self.body.boundaries
         places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
@@ -154,24 +158,16 @@ class Hyperelastic(Settings):
             for i, item in enumerate(getattr(self, block)):
                 if hasattr(item, "on"):
                     places.append(((block, i, "on"), item.on))
-        for place, on in places:
-            if on not in boundaries:
-                yield place, f"unknown boundary; {nearest(on, boundaries)}", on
+        unknown = [(place, on) for place, on in places if on not in boundaries]
+        for place, on in unknown:
+            yield place, f"unknown boundary; {nearest(on, boundaries)}", on
         for block, label in (("displacements", "label"), ("loads", "label"), ("outputs", "name")):
             names = Counter(getattr(item, label) for item in getattr(self, block))
             for name, count in names.items():
                 if count > 1:
                     yield (block,), f"{count} of them are called '{name}', expected different names", name
-        held = set(self.clamp) | {item.on for item in self.displacements}
-        for i, output in enumerate(self.outputs):
-            if isinstance(output, Reaction) and output.on in boundaries and output.on not in held:
-                yield (
-                    ("outputs", i, "on"),
-                    "nothing holds this boundary, expected one that is clamped or moved",
-                    output.on,
-                )
-            if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
-                yield ("outputs", i, "at"), f"outside the body [0, {list(self.body.size)}]", list(output.at)
+        yield from self._mistakes_of_outputs()
+        yield from self._contradictions()
         moved = {axis for item in self.displacements for axis in item.components}
         if not self.clamp and moved != {"x", "y", "z"}:
             free = ", ".join(sorted({"x", "y", "z"} - moved))
@@ -180,3 +176,41 @@ class Hyperelastic(Settings):
                 f"nothing holds the body along {free}, expected a clamp or prescribed displacements",
                 (),
             )
+        elif not unknown and not self._held_against_turning():
+            message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
+            yield ("displacements",), message, ()
+
+    def _mistakes_of_outputs(self) -> Iterator[Mistake]:
+        held = set(self.clamp) | {item.on for item in self.displacements}
+        for i, output in enumerate(self.outputs):
+            if isinstance(output, Reaction) and output.on in self.body.boundaries and output.on not in held:
+                yield (
+                    ("outputs", i, "on"),
+                    "nothing holds this boundary, expected one that is clamped or moved",
+                    output.on,
+                )
+            if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
+                yield ("outputs", i, "at"), f"outside the body [0, {list(self.body.size)}]", list(output.at)
+
+    def _contradictions(self) -> Iterator[Mistake]:
+        """Boundaries that are both clamped and moved, and components that are prescribed twice."""
+        times = Counter((item.on, axis) for item in self.displacements for axis in item.components)
+        for i, item in enumerate(self.displacements):
+            twice = [axis for axis in item.components if times[item.on, axis] > 1]
+            if item.on in self.clamp:
+                yield ("displacements", i, "on"), "this boundary is clamped, expected one that is not", item.on
+            elif twice:
+                message = f"{', '.join(twice)} prescribed more than once on this boundary"
+                yield ("displacements", i, "on"), message, item.on
+
+    def _held_against_turning(self) -> bool:
+        """Whether none of the 6 small rigid motions t + r × x leaves all that is clamped or prescribed in place."""
+        held = [(on, axis) for on in self.clamp for axis in AXES]
+        held += [(item.on, axis) for item in self.displacements for axis in item.components]
+        rows = [
+            np.concatenate([unit, np.cross(corner, unit)])  # the component of t + r × x: t·e + r·(x × e)
+            for on, axis in held
+            for unit in [np.eye(3)[AXES.index(axis)]]
+            for corner in self.body.corners(on)
+        ]
+        return int(np.linalg.matrix_rank(rows)) == 6

@@ -27,9 +27,10 @@ class Layout:
         self._comm = comm
         parts = comm.allgather(fenicsx.node_coordinates(space))
         everywhere = np.concatenate(parts)
-        # Coordinates that differ by rounding only must sort alike on every rank.
+        # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
+        # simple fractions of the largest extent, off the ends of the intervals.
         step = 1e-9 * np.ptp(everywhere, axis=0).max()
-        keys = np.round(everywhere / step).astype(np.int64)
+        keys = np.floor(everywhere / step + 1 / np.pi).astype(np.int64)
         order = np.lexsort(keys.T[::-1])
         self.coordinates: FloatArray = everywhere[order]
         self._canonical = np.empty(len(order), dtype=np.int64)  # by global number

@@ -149,13 +149,17 @@ class FunctionModel:
 
     def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> FunctionSolution:
         """Evaluate the function at `parameters` (d,); there is no state to `start` from."""
-        outputs = np.atleast_1d(np.asarray(self.function(parameters), dtype=float))
+        # Copies: neither the caller nor the function can change a solution afterwards.
+        point = np.array(parameters, dtype=float)
+        point.flags.writeable = False
+        outputs = np.array(self.function(point), dtype=float, ndmin=1)
         if outputs.shape != (len(self.outputs),):
             message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
             raise ValueError(message)
         if not np.isfinite(outputs).all():
             raise SolveError("the model's function returned a value that is not finite")
-        return FunctionSolution(self, parameters, outputs)
+        outputs.flags.writeable = False
+        return FunctionSolution(self, point, outputs)
 
     def gather(self, rows: FloatArray) -> FloatArray:
         """Return the (empty) rows as they are."""

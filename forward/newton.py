@@ -57,6 +57,8 @@ class Residual:
         Euclidean norm over the free unknowns, of all ranks (N).
     scale
         What `size` is compared with (N).
+    rounding
+        What `size` cannot be expected to fall below, whatever the loads (N).
     gap
         Largest distance of a prescribed unknown from its target (m).
     """
@@ -64,6 +66,7 @@ class Residual:
     vector: FloatArray
     size: float
     scale: float
+    rounding: float
     gap: float
 
     @property
@@ -72,8 +75,8 @@ class Residual:
         return self.size / self.scale if self.scale > 0 else self.size
 
     def converged(self, tolerance: float) -> bool:
-        """Whether the state is an equilibrium to `tolerance`."""
-        return self.gap == 0 and self.size <= tolerance * self.scale
+        """Whether the state is an equilibrium to `tolerance`, or to rounding."""
+        return self.gap == 0 and self.size <= max(tolerance * self.scale, self.rounding)
 
 
 class System(Protocol):

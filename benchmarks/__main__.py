@@ -1,0 +1,30 @@
+"""Run benchmarks: python -m benchmarks [NAME ...] (default: all). Ratios are measured side by side in one run."""
+
+from __future__ import annotations
+
+import sys
+
+from benchmarks import bookkeeping, newton, throughput, variance
+
+ALL = {
+    "newton": newton.main,
+    "bookkeeping": bookkeeping.main,
+    "throughput": throughput.main,
+    "variance": variance.main,
+}
+
+
+def main() -> int:
+    """Run the benchmarks that are named, or all of them."""
+    names = sys.argv[1:] or list(ALL)
+    unknown = [name for name in names if name not in ALL]
+    if unknown:
+        sys.stderr.write(f"unknown benchmark {unknown[0]}, expected one of: {', '.join(ALL)}\n")
+        return 2
+    for name in names:
+        print(f"\n## {name}\n")
+        ALL[name]()
+    return 0
+
+
+sys.exit(main())

@@ -1,0 +1,14 @@
+"""The published beam on meshes of several sizes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from workflows.config import Study, load
+
+CONFIG = Path(__file__).parent.parent / "configs" / "beam.toml"
+
+
+def beam(cells: tuple[int, int, int], *changes: str) -> Study:
+    """Return the study of the published beam on a mesh of P2 hexahedra."""
+    return load(CONFIG, [f"model.body.cells={list(cells)}", *changes])
