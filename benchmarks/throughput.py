@@ -61,7 +61,8 @@ def memory(realisations: int = 10_000) -> str:
         model.solve(study.inputs.mean * (1 + 0.01 * np.sin(i)), start).tangent(np.ones(2))
         if i % (realisations // 10) == realisations // 10 - 1:
             sizes.append(resident())
-    return f"memory: {sizes[0]:.1f} MiB after {realisations // 10:,} realisations, {sizes[-1]:.1f} MiB after {realisations:,}"
+    few, many = realisations // 10, realisations
+    return f"memory: {sizes[0]:.1f} MiB after {few:,} realisations, {sizes[-1]:.1f} MiB after {many:,}"
 
 
 def resident() -> float:

@@ -14,31 +14,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-ROOT = Path(__file__).parent.parent
+from tests.launch import ROOT, environment, on_ranks, run, run_script
+
 TINY = ROOT / "configs" / "tiny.toml"
+TISSUQ = Path(sys.executable).parent / "tissuq"
 
 
-def environment():
-    """The environment of a fresh shell: a process that has initialised MPI cannot start mpirun with its own."""
-    clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PMI_"))}
-    return clean | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"}
-
-
-def command(*arguments, ranks=None):
-    start = [str(Path(sys.executable).parent / "tissuq"), *map(str, arguments)]
-    return start if ranks is None else ["mpirun", "--oversubscribe", "-n", str(ranks), *start]
-
-
-def tissuq(*arguments, ranks=None, **options):
-    return subprocess.run(
-        command(*arguments, ranks=ranks),
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env=environment(),
-        check=False,
-        **options,
-    )
+def tissuq(*arguments, ranks=None):
+    return run(ranks, TISSUQ, *arguments)
 
 
 def assert_same_bits(a, b):
@@ -63,9 +46,7 @@ def test_check_needs_neither_fenicsx_nor_mpi():
         "heavy = {'dolfinx', 'mpi4py', 'petsc4py', 'ufl', 'xarray', 'matplotlib', 'pyvista', 'h5py', 'inverse'}; "
         "print(sorted(heavy & set(sys.modules))); sys.exit(code)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(TINY)], capture_output=True, text=True, check=False, cwd=ROOT
-    )
+    done = run_script(None, script, TINY)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
     assert "unknowns    405" in done.stdout
@@ -76,7 +57,7 @@ def test_uq_does_not_import_fenicsx():
         "import sys, uq.monte_carlo, uq.evaluate, uq.checkpoint, uq.inputs; "
         "print(sorted({'dolfinx', 'mpi4py', 'inverse'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    done = run_script(None, script)
     assert done.stdout.strip() == "[]"
 
 
@@ -180,7 +161,7 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     kills = 0
     for ranks in (2, 1, 3, 2):
         process = subprocess.Popen(
-            command(*arguments, broken, ranks=ranks),
+            on_ranks(ranks, TISSUQ, *arguments, broken),
             env=environment(),
             start_new_session=True,
             stdout=subprocess.DEVNULL,

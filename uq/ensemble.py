@@ -214,6 +214,8 @@ class _Worker:
             i, block = world.recv(tag=_RESULT)
             progress(len(block.points), len(block.failures))
             accept(i, block)
+        # Only when everyone has seen that no turn is left may the counter start again for the next order.
+        world.barrier()
 
     def work(self, order: _Order) -> None:
         """Compute blocks of an order until none is left, and send them to rank 0."""
@@ -225,6 +227,7 @@ class _Worker:
                     sent = [request for request in sent if not request.test()[0]]
             for request in sent:
                 request.wait()
+            world.barrier()
 
     def _blocks(self, order: _Order, progress: Callable[[int, int], None]) -> Iterator[tuple[int, Evaluations]]:
         group = self._ensemble.group

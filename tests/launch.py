@@ -1,0 +1,37 @@
+"""Start programs as a user's shell would, under mpirun too."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+
+def environment():
+    """The environment of a fresh shell: a process that has initialised MPI cannot start mpirun with its own."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PMI_"))}
+    return clean | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"}
+
+
+def on_ranks(ranks, *command):
+    """The command, under mpirun where a number of ranks is given."""
+    return list(map(str, command if ranks is None else ("mpirun", "--oversubscribe", "-n", ranks, *command)))
+
+
+def run(ranks, *command):
+    """Run to the end; exit code and output are in what is returned."""
+    return subprocess.run(
+        on_ranks(ranks, *command),
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env=environment(),
+        check=False,
+        cwd=ROOT,
+    )
+
+
+def run_script(ranks, script, *arguments):
+    """Run a Python script."""
+    return run(ranks, sys.executable, "-c", script, *arguments)
