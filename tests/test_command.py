@@ -212,6 +212,17 @@ def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
 
 
 @pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks_per_model", [1, 2])
+def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_model):
+    heavy = "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"
+    share = f"parallel.ranks_per_model={ranks_per_model}"
+    done = tissuq("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, ranks=2)
+    assert done.returncode == 1
+    assert done.stderr.count("failed: the model has no answer at the mean parameters") == 1
+
+
+@pytest.mark.fem
 def test_a_model_without_answer_exits_with_1_and_one_line(tmp_path):
     heavy = ["--set", "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"]
     done = tissuq("run", TINY, "--out", tmp_path / "out", *heavy)

@@ -233,7 +233,6 @@ def _dataset(
         )
     if evaluations.fields.size:
         field = _field_moments(evaluations, inputs, centre, control)
-        by_node = ("node", "component")
         fields = {f"field_{name}": getattr(field, name).reshape(-1, 3) for name in ESTIMATES}
         dataset = dataset.assign({name: (("node", "component"), values) for name, values in fields.items()})
     dataset.attrs["stopped"] = stopped

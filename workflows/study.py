@@ -84,15 +84,15 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     progress = Progress(study.method.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     log = _Log()
+    # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
     dataset = ensemble.run(
         model,
         lambda evaluate: study.method.run(inputs, _Recorded(evaluate, log)),
         checkpoint=checkpoint,
         progress=progress,
     )
-    cells, kind = model.layout.cells() if ensemble.index == 0 else (None, 0)
     if dataset is None:
-        world.barrier()
         return DONE
     progress.close()
     dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
@@ -107,7 +107,6 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     write_report(directory)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
-    world.barrier()
     return PARTIAL if summary["failed"] else DONE
 
 
