@@ -45,24 +45,28 @@ class Checkpoint:
         return digest.hexdigest()[:24]
 
     def has(self, key: str) -> bool:
-        """Whether a block is finished."""
-        return (self._folder / f"{key}.h5").exists()
+        """Whether a block is finished; a file that cannot be read is removed."""
+        path = self._path(key)
+        if not path.exists():
+            return False
+        try:
+            with h5py.File(path, "r"):
+                return True
+        except OSError:
+            path.unlink()
+            return False
 
     def save(self, key: str, block: Evaluations) -> None:
         """Write a finished block and rename it into place."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        _write(self._folder / f"{key}.h5", block)
+        _write(self._path(key), block)
 
-    def load(self, key: str) -> Evaluations | None:
-        """Read a finished block; nothing if there is none or it cannot be read."""
-        path = self._folder / f"{key}.h5"
-        try:
-            return _read(path)
-        except FileNotFoundError:
-            return None
-        except (OSError, KeyError):
-            path.unlink(missing_ok=True)
-            return None
+    def load(self, key: str) -> Evaluations:
+        """Read a finished block."""
+        return load(self._path(key))
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{key}.h5"
 
     def consolidate(self, evaluations: Evaluations) -> None:
         """Write all evaluations as `evaluations.h5`; the blocks stay until `clear`."""
@@ -87,11 +91,6 @@ def _digest(digest: Any, value: object) -> None:
         digest.update(repr(value).encode())
 
 
-def load(path: Path) -> Evaluations:
-    """Read an `evaluations.h5`."""
-    return _read(path)
-
-
 def _write(path: Path, block: Evaluations) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     with h5py.File(partial, "w") as file:
@@ -111,7 +110,8 @@ def _write(path: Path, block: Evaluations) -> None:
     partial.replace(path)
 
 
-def _read(path: Path) -> Evaluations:
+def load(path: Path) -> Evaluations:
+    """Read evaluations, such as those of an `evaluations.h5`."""
     with h5py.File(path, "r") as file:
         failures = tuple(
             Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))

@@ -121,51 +121,28 @@ class EnsembleEvaluate:
         blocks = request.blocks()
         checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
-        pending = tuple(i for i in range(len(blocks)) if not (checkpoint and checkpoint.has(keys[i])))
-        merger = _OrderedMerger(len(blocks))
+        kept = {i: key for i, key in enumerate(keys) if checkpoint and checkpoint.has(key)}
+        pending = tuple(i for i in range(len(blocks)) if i not in kept)
+        merger, early = Merger(), dict[int, Evaluations]()
 
-        def read_finished() -> None:
-            # A block that was on disk but cannot be read any more is computed after the others.
-            while (i := merger.next) < len(blocks) and i not in waiting and checkpoint is not None:
-                block = checkpoint.load(keys[i])
+        def receive(index: int, block: Evaluations) -> None:
+            early[index] = block
+            add_in_order()
+
+        def add_in_order() -> None:
+            while (i := merger.count) in early or i in kept:
+                block = early.pop(i, None)
                 if block is None:
-                    waiting.add(i)
-                    lost.append(i)
-                else:
+                    assert checkpoint is not None
+                    block = checkpoint.load(kept[i])
                     self.progress(len(block.points), len(block.failures))
-                    merger.add(i, block)
+                merger.add(block)
 
-        def receive(i: int, block: Evaluations) -> None:
-            merger.add(i, block)
-            read_finished()
-
-        waiting, lost = set(pending), list[int]()
-        read_finished()
-        while pending:
+        add_in_order()
+        if pending:
             self.worker.dispatch(_Order(request, pending, keys), receive, self.progress)
-            pending = tuple(lost)
-            lost.clear()
+        assert merger.count == len(blocks)
         return merger.result()
-
-
-class _OrderedMerger:
-    """Adds blocks in order, whatever the order they come in."""
-
-    def __init__(self, count: int) -> None:
-        self._merger = Merger()
-        self._early: dict[int, Evaluations] = {}
-        self._count = count
-        self.next = 0
-
-    def add(self, index: int, block: Evaluations) -> None:
-        self._early[index] = block
-        while self.next in self._early:
-            self._merger.add(self._early.pop(self.next))
-            self.next += 1
-
-    def result(self) -> Evaluations:
-        assert self.next == self._count
-        return self._merger.result()
 
 
 class _Worker:

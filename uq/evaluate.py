@@ -219,20 +219,28 @@ def merge(blocks: Sequence[Evaluations]) -> Evaluations:
 
 
 class Merger:
-    """Adds blocks in their order, keeping one sum of fields."""
+    """Adds blocks in their order, keeping one sum of fields.
+
+    Attributes
+    ----------
+    count
+        Number of blocks added so far.
+    """
 
     def __init__(self) -> None:
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
-        self._count = 0
+        self._points = 0
+        self.count = 0
         self._failures: list[Failure] = []
 
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
         if block.fields.size:
             self._fields = block.fields if self._fields.size == 0 else self._fields + block.fields
-        self._failures += [replace(f, index=f.index + self._count) for f in block.failures]
-        self._count += len(block.points)
+        self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
+        self._points += len(block.points)
+        self.count += 1
         self._blocks.append(replace(block, fields=np.zeros((0, 0))))
 
     def result(self) -> Evaluations:
