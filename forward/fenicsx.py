@@ -87,7 +87,14 @@ def compile_expression(expression: Any, points: FloatArray, comm: Any) -> Any:
 
 def box_mesh(comm: Any, box: Box) -> Any:
     """Mesh a box; collective over `comm`."""
-    return mesh.create_box(comm, [[0.0, 0.0, 0.0], list(box.size)], list(box.cells), cell_type=_CELLS[box.cell])
+    msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(box.size)], list(box.cells), cell_type=_CELLS[box.cell])
+    # FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name
+    # from the start, a form that was compiled in one run is found by the next.
+    domain = msh.ufl_domain()
+    plain = domain.ufl_coordinate_element()
+    named = ufl.FiniteElement(plain.family(), plain.cell(), plain.degree(), variant="equispaced")
+    domain._ufl_coordinate_element = ufl.VectorElement(named)
+    return msh
 
 
 def box_facets(msh: Any, box: Box) -> dict[str, NDArray[np.int32]]:
@@ -158,8 +165,9 @@ def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
 
 
 def point_weights(space: Any, point: tuple[float, float, float]) -> tuple[NDArray[np.int32], FloatArray] | None:
-    """Return nodes and weights that interpolate at a point, where this rank owns a cell around it."""
+    """Return nodes and weights that interpolate at a point, where this rank owns a cell around it; collective."""
     msh = space.mesh
+    probe = fem.Function(space)  # on every rank: making one is collective
     tree = geometry.BoundingBoxTree(msh, 3, padding=1e-10)
     position = np.asarray(point, dtype=float)
     candidates = geometry.compute_collisions(tree, position[None, :])
@@ -168,7 +176,6 @@ def point_weights(space: Any, point: tuple[float, float, float]) -> tuple[NDArra
     if len(cells) == 0:
         return None
     nodes = space.dofmap.cell_dofs(cells[0])
-    probe = fem.Function(space)
     weights = np.empty(len(nodes))
     for k, node in enumerate(nodes):
         probe.x.array[:] = 0

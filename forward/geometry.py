@@ -30,7 +30,8 @@ class Box(Settings):
     degree
         Polynomial degree of the displacement.
     quadrature_degree
-        Degree that the integrals are exact for; by default the lowest that keeps the order of convergence.
+        Degree that the integrals are exact for; by default the lowest that keeps the order of convergence. Less than 2
+        (quadratic tetrahedra, linear hexahedra) or 4 (quadratic hexahedra) leaves deformations without energy.
     """
 
     kind: Literal["box"] = "box"
@@ -78,5 +79,13 @@ class Box(Settings):
     def _check(self) -> Box:
         if self.nodes > 20_000_000:
             message = f"cells = {list(self.cells)} gives {3 * self.nodes:,} unknowns, expected at most 60 million"
+            raise ValueError(message)
+        lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
+        needed = lowest[self.cell, self.degree]
+        if self.quadrature < needed:
+            message = (
+                f"quadrature_degree = {self.quadrature} leaves deformations of {self.cell} cells of degree "
+                f"{self.degree} without energy, expected at least {needed}"
+            )
             raise ValueError(message)
         return self

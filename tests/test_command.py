@@ -208,6 +208,7 @@ def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
     assert summary["failed"] == len(summary["failures"]) > 0
     assert "of the load" in summary["failures"][0]["reason"]
     assert f"{summary['failed']} of 24 samples have no answer" in summary["note"]
+    assert "their errors do not cover" in summary["note"]
     assert summary["failures"][0]["reason"] in (tmp_path / "out" / "report.html").read_text()
 
 

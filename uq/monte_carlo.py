@@ -238,8 +238,13 @@ def _dataset(
     dataset.attrs["stopped"] = stopped
     failed = int((~ok).sum())
     if failed:
-        dataset.attrs["note"] = (
-            f"{failed} of {len(ok)} samples have no answer; all estimates are over the {len(ok) - failed} others, "
+        which = "plain estimates" if control else "all estimates"
+        note = (
+            f"{failed} of {len(ok)} samples have no answer; {which} are over the {len(ok) - failed} others, "
             "that is, conditional on the model having an answer"
         )
+        if control:
+            # E[L] = 0 holds over all samples, also those that failed.
+            note += "; controlled estimates take the failed ones to follow the tangent, which their errors do not cover"
+        dataset.attrs["note"] = note
     return dataset

@@ -1,5 +1,188 @@
-"""Placeholder."""
+"""The report of a study, and several studies side by side: one HTML file each, with its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import tomllib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workflows import bodies, plots, tables
+from workflows.config import parse
+from workflows.results import read_dataset, read_summary, write_text
+from workflows.tables import Results
+from workflows.words import model_in_words, number
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
+NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG in base64 with what it shows."""
+
+    data: str
+    caption: str
+
+
 def write_report(directory: Path) -> Path:
-    return directory / "report.html"
-def compare(directories, out): return out
+    """Write report.html beside the results of a study.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the directory holds no results.
+    """
+    path = directory / "report.html"
+    write_text(path, _render("report.html.jinja", _context(_read(directory))))
+    return path
+
+
+def compare(directories: Sequence[Path], out: Path) -> Path:
+    """Write the estimates of several studies side by side to the file `out`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If one of the directories holds no results.
+    """
+    names = _names(directories)
+    studies = {name: _read(directory) for name, directory in zip(names, directories, strict=True)}
+    outputs = dict.fromkeys(output for results in studies.values() for output in results.outputs)
+    context = {
+        "count": len(studies),
+        "studies": tables.costs(studies),
+        "outputs": [(output, tables.estimates(studies, output), _compared(studies, output)) for output in outputs],
+    }
+    write_text(out, _render("comparison.html.jinja", context))
+    return out
+
+
+def _read(directory: Path) -> Results:
+    dataset = read_dataset(directory)
+    summary = read_summary(directory)
+    if summary is None:
+        message = f"{directory}: holds no summary.json, expected the directory of a finished study"
+        raise FileNotFoundError(message)
+    return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"])))
+
+
+def _render(template: str, context: dict[str, Any]) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(context)
+
+
+def _context(results: Results) -> dict[str, Any]:
+    """Everything that the template of a report shows."""
+    dataset, summary = results.dataset, results.summary
+    sampled, differentiated = "values" in dataset, "derivative" in dataset
+    field_lines, drawn = _bodies(dataset)
+    return {
+        "title": f"Study {summary['study']}",
+        "method": str(type(results.study.method).__doc__).partition("\n")[0],
+        "amount": f"{summary['stopped']}; {tables.solves(summary)}, {summary['failed']:,} failed",
+        "note": summary.get("note"),
+        "model": list(model_in_words(results.study)),
+        "parameters": tables.parameters(results),
+        "nominal": tables.nominal(results),
+        "moments": tables.moments(results) if sampled else None,
+        "gains": list(tables.gains(dataset)),
+        "quantiles": tables.quantiles(results) if sampled else None,
+        "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
+        "field_lines": field_lines,
+        "bodies": drawn,
+        "sensitivities": [(o, tables.sensitivities(results, o)) for o in results.outputs] if differentiated else [],
+        "tornados": [_tornado(dataset, o) for o in results.outputs] if differentiated else [],
+        "field_norms": tables.field_norms(results) if "field_derivative_norm" in dataset else None,
+        "failures": tables.failures(results) if summary["failures"] else None,
+        "failures_line": tables.failures_line(summary),
+        "times": list(tables.times(summary)),
+        "provenance": list(tables.provenance(summary)),
+        "config": dataset.attrs["config"],
+    }
+
+
+def _picture(ax: Axes, caption: str) -> Picture:
+    return Picture(base64.b64encode(plots.png(ax)).decode(), caption)
+
+
+def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
+    return [
+        _picture(plots.histogram(dataset, output), f"Samples of {output}: density, mean and quantiles."),
+        _picture(plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
+        _picture(plots.standard_error(dataset, output), f"Standard error of the mean of {output}."),
+    ]
+
+
+def _tornado(dataset: xr.Dataset, output: str) -> Picture:
+    return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order.")
+
+
+def _bodies(dataset: xr.Dataset) -> tuple[list[str], list[Picture]]:
+    """Pictures of the deformed body, and what is to be said beside them."""
+    if "cell_nodes" not in dataset:
+        return ["This study keeps no displacement field."], []
+    captions = _body_captions(dataset)
+    drawn = bodies.pictures(dataset, list(captions))
+    if drawn is None:
+        return [NO_BODY], []
+    where = "its mean displacement" if "field_mean" in dataset else "the displacement at the mean parameters"
+    lines = [f"Deformed by {where}, in true scale; the grey lines are the undeformed body."]
+    return lines, [Picture(base64.b64encode(drawn[name]).decode(), caption) for name, caption in captions.items()]
+
+
+def _body_captions(dataset: xr.Dataset) -> dict[str, str]:
+    """Return what of the body is drawn, and what the picture shows."""
+
+    def largest(field: str) -> str:
+        return f"at most {number(float(np.linalg.norm(dataset[field].to_numpy(), axis=1).max()))} m"
+
+    if "field_mean" in dataset:
+        captions = {
+            "mean": f"Mean displacement, {largest('field_mean')}.",
+            "std": f"Standard deviation of the displacement, {largest('field_std')}. Orange lines: the edges of the "
+            "body where every component is one standard deviation larger, and smaller, than its mean.",
+        }
+    else:
+        captions = {"nominal": f"Displacement at the mean parameters, {largest('field_nominal')}."}
+    if "field_derivative" in dataset:
+        effects = dataset["field_derivative_norm"] * dataset["parameter_std"]
+        strongest = dataset["parameter"].to_numpy()[np.argsort(-effects.to_numpy())][:DERIVATIVES_DRAWN]
+        for name in strongest:
+            captions[f"derivative {name}"] = f"What one standard deviation of {name} moves, to first order."
+    return captions
+
+
+def _names(directories: Sequence[Path]) -> list[str]:
+    """Name directories by their last part, or in full where that is not unique."""
+    times = Counter(directory.resolve().name for directory in directories)
+    names = [d.resolve().name if times[d.resolve().name] == 1 else str(d) for d in directories]
+    return names if len(set(names)) == len(names) else [f"{i}: {name}" for i, name in enumerate(names, start=1)]
+
+
+def _compared(studies: dict[str, Results], output: str) -> list[Picture]:
+    """Mean and standard deviation beside each other; nothing where no study estimates them."""
+    datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
+    if not datasets:
+        return []
+    return [
+        _picture(plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
+        _picture(plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
+    ]

@@ -1,0 +1,50 @@
+"""Bodies of which the compiled forms are the same: compiling is what takes time in tests of finite elements."""
+
+from forward.hyperelastic import Hyperelastic
+
+MATERIALS = {
+    "mooney-rivlin": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 2e4, "D1": 2e5},
+    "neo-hookean": {"kind": "neo-hookean", "C1": 1e4, "D1": 3e5},
+    "neo-hookean-coupled": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 2e5},
+}
+CELLS = {
+    "mooney-rivlin": ("hexahedron", 1),
+    "neo-hookean": ("tetrahedron", 2),
+    "neo-hookean-coupled": ("hexahedron", 1),
+}
+OUTPUTS = (
+    {"kind": "max-displacement", "name": "largest"},
+    {"kind": "max-displacement", "name": "largest-z", "component": "z"},
+    {"kind": "displacement", "name": "point", "at": (0.9, 0.35, 0.6), "component": "z"},
+    {"kind": "mean-displacement", "name": "mean", "on": "x-max", "component": "y"},
+    {"kind": "reaction", "name": "reaction-x", "on": "x-min", "component": "x"},
+    {"kind": "reaction", "name": "reaction-y", "on": "y-max", "component": "y"},
+    {"kind": "strain-energy", "name": "energy"},
+    {"kind": "volume-change", "name": "volume"},
+    {"kind": "max-von-mises", "name": "stress"},
+)
+
+
+def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **changes):
+    """A block under every kind of load; loads of size zero keep its compiled forms the same."""
+    cell, degree = CELLS[material]
+    body = {"size": (1.0, 0.7, 0.8), "cells": (2, 1, 1), "cell": cell, "degree": degree} | changes.pop("body", {})
+    blocks = {
+        "body": body,
+        "material": MATERIALS[material],
+        "clamp": ("x-min",),
+        "displacements": ({"on": "y-max", "y": 0.05},),
+        "loads": (
+            {"kind": "gravity", "direction": (0.0, -1.0, 0.3), "density": density},
+            {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 1.0), "size": traction},
+            {"kind": "pressure", "on": "z-max", "size": pressure},
+        ),
+        "outputs": OUTPUTS,
+        "solver": {"tolerance": 1e-12},
+    }
+    return Hyperelastic.model_validate(blocks | changes)
+
+
+def unloaded_body(material, **changes):
+    """The same block without loads."""
+    return loaded_body(material, density=0.0, traction=0.0, pressure=0.0, **changes)

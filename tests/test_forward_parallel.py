@@ -1,0 +1,91 @@
+"""A model spread over several ranks gives what one rank gives."""
+
+import numpy as np
+import pytest
+
+from tests.launch import run_script
+
+pytestmark = [pytest.mark.fem, pytest.mark.mpi]
+
+SCRIPT = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from forward.conformance import check_derivatives
+from forward.model import SolveError
+from tests.bodies import OUTPUTS, loaded_body
+
+comm = MPI.COMM_WORLD
+# Corners, edges and faces of cells, and their insides: every kind of place that ranks can share.
+places = [(x, y, z) for x in (1.0, 0.25, 0.37) for y in (0.35, 0.51) for z in (0.8, 0.4, 0.11)]
+points = tuple(
+    {"kind": "displacement", "name": f"point {i}", "at": at, "component": "xyz"[i % 3]} for i, at in enumerate(places)
+)
+
+def solve(material):
+    spec = loaded_body(material, body={"cells": (4, 2, 2)}, outputs=OUTPUTS + points)
+    parameters = tuple(spec.scalars)
+    values = np.array([scalar.value for scalar in spec.scalars.values()])
+    model = spec.build(comm, parameters)
+
+    try:
+        model.solve(np.where(np.array(parameters) == "loads.gravity.density", 1e9, values))
+    except SolveError as error:
+        reasons = comm.allgather(str(error))
+    assert len(set(reasons)) == 1, reasons
+
+    solution = model.solve(values)
+    state = model.gather(solution.state[None])
+    slopes = model.gather(np.array([solution.state_tangent(direction) for direction in np.diag(values)]))
+    tangents = np.array([solution.tangent(direction) for direction in np.diag(values)])
+    gradients = np.array([solution.adjoint(weights) for weights in np.eye(len(model.outputs))])
+    for array in (solution.outputs, tangents, gradients):
+        assert all(np.array_equal(array, other) for other in comm.allgather(array)), "ranks disagree"
+
+    # Back and forth through the canonical order; a state from elsewhere is a start.
+    whole = comm.bcast(state)
+    assert np.array_equal(model.scatter(whole)[0], solution.state)
+    assert model.solve(values, model.scatter(whole)[0]).work.factorisations == 0
+
+    steps = 1 / 16, 1 / 32, 1 / 64
+    directions = np.ones((1, len(values)))
+    check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, noise=1e-12).require()
+    cells, _ = model.layout.cells()
+    return {
+        "outputs": solution.outputs,
+        "state": state,
+        "slopes": slopes,
+        "tangents": tangents,
+        "gradients": gradients,
+        "coordinates": model.layout.coordinates,
+        "cells": cells,
+    }
+
+for material in sys.argv[2:]:
+    arrays = solve(material)
+    if comm.rank == 0:
+        np.savez(f"{sys.argv[1]}/{material}.npz", **arrays)
+"""
+SHAPES = ("mooney-rivlin", "neo-hookean")  # hexahedra and tetrahedra
+
+
+def solve_on(ranks, directory):
+    done = run_script(ranks, SCRIPT, directory, *SHAPES)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return [dict(np.load(directory / f"{material}.npz")) for material in SHAPES]
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    return solve_on(1, tmp_path_factory.mktemp("serial"))
+
+
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_ranks_agree_with_one(serial, ranks, tmp_path):
+    for found, expected in zip(solve_on(ranks, tmp_path), serial, strict=True):
+        np.testing.assert_allclose(found["coordinates"], expected["coordinates"], rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(found["cells"], expected["cells"])
+        np.testing.assert_allclose(found["outputs"], expected["outputs"], rtol=1e-9)
+        for name in ("state", "slopes", "tangents", "gradients"):
+            sizes = np.abs(expected[name]).max(axis=-1, keepdims=True)
+            np.testing.assert_allclose(found[name] / sizes, expected[name] / sizes, rtol=0, atol=1e-9, err_msg=name)

@@ -1,0 +1,151 @@
+"""Specifications: what cannot be a body is refused before anything is built, with all mistakes at once."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from forward.hyperelastic import Hyperelastic
+from forward.materials import MATERIALS, constants
+from forward.newton import NewtonSettings
+
+BLOCKS = {
+    "body": {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (2, 2, 2)},
+    "material": {"kind": "neo-hookean", "C1": 1.0, "D1": 1.0},
+    "clamp": ("x-min",),
+    "loads": ({"kind": "gravity", "density": 1.0},),
+    "outputs": ({"kind": "strain-energy", "name": "energy"},),
+}
+TRACTION = {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 1.0}
+MOVED = {"on": "x-max", "x": 0.1}
+
+
+def mistakes(**changes):
+    """The mistakes of a changed specification: place and message."""
+    with pytest.raises(ValidationError) as error:
+        Hyperelastic.model_validate(BLOCKS | changes)
+    return {".".join(map(str, line["loc"])): line["msg"] for line in error.value.errors()}
+
+
+def test_the_specification_without_mistakes_is_accepted():
+    assert Hyperelastic.model_validate(BLOCKS).unknowns == 3 * 5**3
+
+
+@pytest.mark.parametrize(
+    ("changes", "place", "message"),
+    [
+        ({"clamp": ("x-mim",)}, "clamp.0", "did you mean 'x-min'"),
+        ({"loads": (TRACTION | {"on": "top"},)}, "loads.0.on", "unknown boundary"),
+        ({"displacements": (MOVED | {"on": "w-max"},)}, "displacements.0.on", "did you mean"),
+        (
+            {"outputs": ({"kind": "reaction", "name": "r", "on": "q", "component": "x"},)},
+            "outputs.0.on",
+            "unknown boundary",
+        ),
+        ({"loads": (TRACTION, TRACTION)}, "loads", "2 of them are called 'traction'"),
+        ({"outputs": BLOCKS["outputs"] * 2}, "outputs", "2 of them are called 'energy'"),
+        ({"outputs": ()}, "outputs", "at least 1 item"),
+        ({"clamp": ()}, "clamp", "nothing holds the body along x, y, z"),
+        ({"clamp": (), "displacements": (MOVED,)}, "clamp", "nothing holds the body along y, z"),
+        ({"displacements": (MOVED | {"on": "x-min"},)}, "displacements.0.on", "is clamped"),
+        (
+            {"displacements": (MOVED, MOVED | {"name": "again"})},
+            "displacements.1.on",
+            "x prescribed more than once",
+        ),
+        ({"displacements": ({"on": "x-max"},)}, "displacements.0", "prescribes nothing"),
+        (
+            {"outputs": ({"kind": "reaction", "name": "r", "on": "x-max", "component": "x"},)},
+            "outputs.0.on",
+            "nothing holds this boundary",
+        ),
+        (
+            {"outputs": ({"kind": "displacement", "name": "u", "at": (0.5, 0.5, 1.1), "component": "x"},)},
+            "outputs.0.at",
+            "outside the body",
+        ),
+        ({"loads": (TRACTION | {"direction": (0.0, 0.0, 0.0)},)}, "loads.0.traction", "length zero"),
+        ({"loads": ({"kind": "gravity", "density": -1.0},)}, "loads.0.gravity.density", "greater than or equal to 0"),
+        ({"loads": ({"kind": "gravity", "density": "heavy"},)}, "loads.0.gravity.density", "valid number"),
+        ({"loads": ({"kind": "gravity", "denisty": 1.0},)}, "loads.0.gravity.denisty", "did you mean 'density'"),
+        ({"loads": ({"kind": "magnet", "size": 1.0},)}, "loads.0", "gravity"),
+        ({"material": {"kind": "neo-hookean", "C1": 0.0, "D1": 1.0}}, "material.neo-hookean.C1", "greater than 0"),
+        ({"material": {"kind": "neo-hookean", "C1": np.nan, "D1": 1.0}}, "material.neo-hookean.C1", "finite"),
+        ({"material": {"kind": "neo-hookean", "D1": 1.0}}, "material.neo-hookean.C1", "required"),
+        ({"body": BLOCKS["body"] | {"cells": (0, 2, 2)}}, "body.cells.0", "greater than 0"),
+        ({"body": BLOCKS["body"] | {"cells": (2000, 2000, 2000)}}, "body", "at most 60 million"),
+        ({"body": BLOCKS["body"] | {"degree": 3}}, "body.degree", "1 or 2"),
+        ({"body": BLOCKS["body"] | {"quadrature_degree": 3}}, "body", "without energy, expected at least 4"),
+        ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
+        ({"lodas": ()}, "lodas", "did you mean 'loads'"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(changes, place, message):
+    assert message in mistakes(**changes)[place]
+
+
+def test_all_mistakes_are_reported_together():
+    found = mistakes(
+        clamp=("x-mim",),
+        loads=(TRACTION | {"on": "x-mx"},),
+        displacements=({"on": "y-mn", "y": 0.0},),
+        outputs=BLOCKS["outputs"] * 2,
+    )
+    assert set(found) == {"clamp.0", "loads.0.on", "displacements.0.on", "outputs"}
+
+
+@pytest.mark.parametrize(
+    ("boundaries", "held"),
+    [
+        ({"x-min": "x", "y-min": "y", "z-min": "z"}, True),
+        ({"x-min": "xyz"}, True),
+        ({"y-min": "x", "z-min": "y", "x-min": "z"}, True),
+        ({"y-min": "x", "x-min": "y", "z-min": "z"}, False),  # turns about z
+        ({"y-min": "x", "x-min": "y", "z-min": "z", "y-max": "x"}, True),
+    ],
+)
+def test_a_body_on_rollers_must_not_turn(boundaries, held):
+    displacements = tuple({"on": on} | dict.fromkeys(axes, 0.0) for on, axes in boundaries.items())
+    if held:
+        assert Hyperelastic.model_validate(BLOCKS | {"clamp": (), "displacements": displacements})
+    else:
+        found = mistakes(clamp=(), displacements=displacements)
+        assert found == {
+            "displacements": "nothing stops the body from turning, expected a clamp or more prescribed displacements"
+        }
+
+
+def test_a_number_that_is_not_admissible_is_objected_to():
+    spec = Hyperelastic.model_validate(BLOCKS | {"loads": (TRACTION, *BLOCKS["loads"]), "displacements": (MOVED,)})
+    assert set(spec.scalars) == {
+        "material.C1",
+        "material.D1",
+        "loads.traction.size",
+        "loads.gravity.density",
+        "displacements.x-max.x",
+    }
+    assert "greater than 0" in spec.scalars["material.C1"].objection(0.0)
+    assert "greater than or equal to 0" in spec.scalars["loads.gravity.density"].objection(-1.0)
+    for path in spec.scalars:
+        assert spec.scalars[path].objection(2.0) is None
+    for path in ("loads.traction.size", "displacements.x-max.x"):
+        assert spec.scalars[path].objection(-2.0) is None
+
+
+def test_a_specification_cannot_be_changed():
+    spec = Hyperelastic.model_validate(BLOCKS | {"clamp": ["x-min"]})
+    assert spec.clamp == ("x-min",)
+    with pytest.raises(ValidationError, match="frozen"):
+        spec.clamp = ()
+    with pytest.raises(ValidationError, match="frozen"):
+        spec.body.degree = 1
+
+
+@pytest.mark.parametrize("kind", MATERIALS)
+def test_the_constants_of_a_material_are_the_arguments_of_its_energy(kind):
+    values = dict.fromkeys(constants(MATERIALS[kind]), 2.0)
+    spec = Hyperelastic.model_validate(BLOCKS | {"material": {"kind": kind} | values})
+    assert [path for path in spec.scalars if path.startswith("material.")] == [f"material.{name}" for name in values]
+
+
+def test_settings_of_the_solver_have_defaults():
+    assert Hyperelastic.model_validate(BLOCKS).solver == NewtonSettings()

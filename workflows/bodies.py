@@ -1,0 +1,210 @@
+"""Pictures of the deformed body with pyvista, on screen or in a process of its own."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import FloatArray
+from workflows.results import body_grid
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SUBDIVISION = 3  # times that a face of high order is halved
+DRAWING_SECONDS = 600  # what the drawing of all bodies may take
+FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
+
+
+def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
+    """Draw the body, deformed by its mean displacement (the nominal one where there is no mean) and coloured.
+
+    Parameters
+    ----------
+    dataset
+        Results with fields.
+    shown
+        "mean", "std", "mean_error", "std_error", "nominal", or "derivative PARAMETER" (times the standard deviation
+        of that parameter): the field whose magnitude is the colour. With "std", lines show the edges of the body
+        where all components are one standard deviation larger, and smaller, than their mean.
+
+    Returns
+    -------
+    pyvista.Plotter
+        Off-screen: `show()` shows it in a notebook, `screenshot(path)` writes it.
+    """
+    import pyvista
+
+    grid = body_grid(dataset)
+    motion = "mean" if "mean" in grid.point_data else "nominal"
+    parameter = shown.removeprefix("derivative ") if shown.startswith("derivative ") else None
+    factor = 1.0 if parameter is None else float(dataset["parameter_std"].sel(parameter=parameter))
+    grid.point_data["colour"] = factor * grid.point_data[shown]
+
+    # Two panels, so that the scale of the colours never covers the body.
+    plotter: Any = pyvista.Plotter(
+        off_screen=True, window_size=[1200, 860], shape=(2, 1), row_weights=[6, 1], border=False
+    )
+    plotter.set_background("white")
+    plotter.add_mesh(_edges(grid), color=FIRST, line_width=2)
+    if shown == "std":
+        for sign in (-1, 1):
+            edge = grid.point_data[motion] + sign * np.sign(grid.point_data[motion]) * grid.point_data["std"]
+            plotter.add_mesh(_edges(grid, edge), color=SECOND, line_width=2)
+    surface = _surface(grid, grid.point_data[motion])
+    # The magnitude after the subdivision: between the nodes it is that of the interpolated vector, never negative.
+    surface.point_data["magnitude"] = np.linalg.norm(surface.point_data["colour"], axis=1)
+    coloured = plotter.add_mesh(
+        surface,
+        scalars="magnitude",
+        cmap="plasma" if shown == "std" else "viridis",
+        ambient=0.45,
+        diffuse=0.6,
+        smooth_shading=True,
+        split_sharp_edges=True,
+        show_scalar_bar=False,
+    )
+    plotter.add_mesh(_edges(grid, grid.point_data[motion]), color=DARK, line_width=1.5)
+    _show_lengths(plotter, np.concatenate([grid.points, grid.points + grid.point_data[motion]]))
+    _look(plotter, _up(dataset))
+    plotter.subplot(1, 0)
+    _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter))
+    plotter.subplot(0, 0)
+    return plotter
+
+
+def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | None:
+    """Draw bodies as PNG, each as `body` does, in a process of its own; nothing where they cannot be drawn.
+
+    A graphics library that is missing or broken ends a process at once: it must not take a study with it.
+    """
+    needed = dataset[[name for name in dataset.data_vars if "sample" not in dataset[name].dims]]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "workflows.bodies"],
+            input=pickle.dumps((needed, list(shown))),
+            capture_output=True,
+            check=True,
+            timeout=DRAWING_SECONDS,
+            cwd=Path(__file__).resolve().parent.parent,
+        )
+        return dict(pickle.loads(done.stdout))
+    except (OSError, subprocess.SubprocessError, pickle.UnpicklingError, EOFError):
+        return None
+
+
+def _surface(grid: Any, displacement: FloatArray | None = None) -> Any:
+    """Return the (displaced) surface with all fields; curved faces of high order are subdivided until smooth."""
+    moved = grid.copy()
+    if displacement is not None:
+        moved.points = grid.points + displacement
+    return moved.extract_surface(nonlinear_subdivision=SUBDIVISION, algorithm="dataset_surface").clean()
+
+
+def _edges(grid: Any, displacement: FloatArray | None = None) -> Any:
+    """Return the edges of the undeformed body, displaced."""
+    whole = grid.copy()
+    whole.point_data["motion"] = np.zeros_like(grid.points) if displacement is None else displacement
+    edges = _surface(whole).extract_feature_edges(feature_angle=40, manifold_edges=False, non_manifold_edges=False)
+    edges.points = edges.points + edges.point_data["motion"]
+    return edges
+
+
+def _up(dataset: xr.Dataset) -> FloatArray:
+    """Return the axis (3,) that is nearest to up: against gravity, or z where there is none."""
+    up = np.array([0.0, 0.0, 1.0])
+    model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
+    for load in model.get("loads", ()):
+        if load["kind"] == "gravity":
+            down = np.array(load["direction"])
+            axis = int(np.argmax(np.abs(down)))
+            up = -np.sign(down[axis]) * np.eye(3)[axis]
+    return up
+
+
+def _look(plotter: Any, up: FloatArray) -> None:
+    """Look from the front, a little from the right and from above."""
+    right = np.eye(3)[1 if up[0] else 0]
+    front = np.cross(right, up)
+    plotter.show_axes()
+    plotter.view_vector(front + 0.6 * right + 0.4 * up, viewup=up)
+    plotter.reset_camera()
+    plotter.camera.zoom(1.02)
+    plotter.camera.SetWindowCenter(0, -0.06)  # the numbers of the axes are below the body
+
+
+def _show_colours(plotter: Any, mapper: Any, title: str) -> None:
+    """Draw the scale of the colours with what they show below it."""
+    plotter.add_scalar_bar(
+        mapper=mapper,
+        title="",
+        fmt="%.3g",
+        n_labels=5,
+        label_font_size=26,
+        color="black",
+        width=0.8,
+        height=0.35,
+        position_x=0.1,
+        position_y=0.52,
+    )
+    plotter.add_text(title, position=(0.1, 0.14), viewport=True, font_size=14, color="black")
+
+
+def _show_lengths(plotter: Any, points: FloatArray) -> None:
+    """Draw axes around the points (n, 3) that begin, end and have their numbers at multiples of a round length."""
+    extent = float(np.ptp(points, axis=0).max())
+    power = 10 ** np.floor(np.log10(extent / 4))
+    step = power * max(factor for factor in (1, 2, 5) if factor * power <= extent / 4)
+    first = np.floor(points.min(axis=0) / step + 0.1)
+    last = np.maximum(np.ceil(points.max(axis=0) / step - 0.1), first + 1)
+    counts = (last - first + 1).astype(int)
+    plotter.show_bounds(
+        bounds=np.column_stack([first, last]).ravel() * step,
+        location="outer",
+        xtitle="x (m)",
+        ytitle="y (m)",
+        ztitle="z (m)",
+        n_xlabels=counts[0],
+        n_ylabels=counts[1],
+        n_zlabels=counts[2],
+        fmt=f"%.{max(0, -int(np.floor(np.log10(step))))}f",
+        font_size=14,
+        color="#5b6875",
+    )
+
+
+def _colour_title(shown: str, parameter: str | None) -> str:
+    if parameter is not None:
+        parameter = parameter.replace("$", "")  # which VTK would read as the beginning of a formula
+        return f"displacement by one standard deviation of {parameter} (m)"
+    words = {
+        "mean": "magnitude of the mean displacement (m)",
+        "std": "magnitude of the standard deviation of the displacement (m)",
+        "nominal": "displacement at the mean parameters (m)",
+    }
+    return words.get(shown, f"{shown} of the displacement (m)")
+
+
+def _draw_for_parent() -> None:
+    """Read a dataset and what to show from standard input, and write the pictures to standard output."""
+    dataset, shown = pickle.load(sys.stdin.buffer)
+    pickle.dump({name: _png(body(dataset, name)) for name in shown}, sys.stdout.buffer)
+
+
+def _png(plotter: Any) -> bytes:
+    file = io.BytesIO()
+    plotter.screenshot(file)
+    plotter.close()
+    return file.getvalue()
+
+
+if __name__ == "__main__":
+    _draw_for_parent()

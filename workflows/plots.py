@@ -1,0 +1,226 @@
+"""Pictures of results: one function each, from the dataset of `workflows.results.read_dataset` to labelled axes.
+
+Functions that take `ax` draw there, or on a new figure that needs no display: in a notebook,
+``plots.histogram(dataset, "uy_max").figure``. Bodies are drawn by `workflows.bodies`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uq.moments import Coefficient, Moments, estimate, monomials
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+BAND = 1.96  # standard errors on either side of a 95 % confidence band
+FIRST_SHOWN = 8  # estimates from fewer samples say nothing
+BARS = 15  # parameters that a tornado chart shows
+
+PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
+LOW, HIGH = "#0b6bb8", "#d1622b"
+
+
+def running_estimates(
+    dataset: xr.Dataset, output: str, counts: Sequence[int], *, controlled: bool = False
+) -> list[Moments]:
+    """Estimate the moments of an output from the first samples that have an answer, for several numbers of them.
+
+    Parameters
+    ----------
+    dataset
+        Results of a Monte Carlo study.
+    output
+        Name of the output.
+    counts
+        Numbers of samples, each at least 2.
+    controlled
+        With the tangent at the mean parameters as control variate (for the mean; the standard deviation is then not
+        to be used), or plain.
+    """
+    ok = dataset["ok"].to_numpy()
+    nominal = np.asarray(dataset["nominal"].sel(output=output).to_numpy())
+    deviations = dataset["values"].sel(output=output).to_numpy()[ok] - nominal
+    if not controlled:
+        sums = monomials(deviations, None).cumsum(axis=1)
+        return [estimate(sums[:, n - 1], n, nominal) for n in counts]
+    steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
+    sums = monomials(deviations, steps @ dataset["derivative"].sel(output=output).to_numpy()).cumsum(axis=1)
+    coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
+    unused = np.zeros_like(nominal)  # the variance of the control, which the mean does not depend on
+    return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
+
+
+def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
+    ax = ax or _axes()
+    for label, colour, counts, running in _series(dataset, output):
+        mean = np.array([m.mean for m in running])
+        half = BAND * np.array([m.mean_error for m in running])
+        ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
+        ax.plot(counts, mean, color=colour, label=label)
+    _count_axis(ax, int(dataset["ok"].sum()))
+    ax.set_ylabel(f"running mean of {_quantity(dataset, output)}")
+    ax.legend(title="mean, 95 % band")
+    return ax
+
+
+def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the standard error of the mean of an output against the number of samples, plain and controlled."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    ax = ax or _axes()
+    for label, colour, counts, running in _series(dataset, output):
+        error = np.array([m.mean_error for m in running])
+        ax.plot(counts, error, color=colour, label=label)
+        ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
+    ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
+    _count_axis(ax, int(dataset["ok"].sum()))
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.set_ylabel(f"standard error of {_quantity(dataset, output)}")
+    ax.legend()
+    return ax
+
+
+def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the normalised density of the samples of an output, with marks at the mean and at the quantiles."""
+    ax = ax or _axes()
+    values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
+    spread = np.ptp(values) > 1e-12 * np.abs(values).max()
+    ax.hist(values, bins="auto" if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
+    ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
+    for i, probability in enumerate(dataset["quantile"].to_numpy()):
+        place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
+        ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
+        ax.annotate(
+            f"{100 * probability:g} %",
+            (place, 1),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize="small",
+            color=HIGH,
+        )
+    ax.set_xlabel(_quantity(dataset, output))
+    unit = str(dataset["unit"].sel(output=output).item())
+    ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
+    ax.legend()
+    return ax
+
+
+def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw how much an output changes, to first order, with each parameter one standard deviation off its mean."""
+    effects = dataset["derivative_per_std"].sel(output=output).to_numpy()
+    order = np.argsort(np.abs(effects))[-BARS:]
+    ax = ax or _axes(height=1.3 + 0.42 * len(order))
+    for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
+        ax.barh(np.arange(len(order)), sign * effects[order], height=0.6, color=colour, label=label)
+    ax.axvline(0, color=DARK, linewidth=0.8)
+    ax.set_yticks(np.arange(len(order)), [_text(str(name)) for name in dataset["parameter"].to_numpy()[order]])
+    ax.set_ylim(-0.6, len(order) - 0.4)
+    ax.locator_params(axis="x", nbins=6)
+    ax.set_xlabel(f"change of {_quantity(dataset, output)}")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=2, frameon=False, fontsize="small")
+    return ax
+
+
+def comparison(
+    datasets: Mapping[str, xr.Dataset], output: str, estimated: Literal["mean", "std"] = "mean", ax: Axes | None = None
+) -> Axes:
+    """Draw an estimate of several studies, each with its 95 % confidence interval.
+
+    Parameters
+    ----------
+    datasets
+        Results by the name that stands beside them.
+    output
+        Name of the output; studies without an estimate of it are left out.
+    estimated
+        The mean or the standard deviation.
+    ax
+        Where to draw.
+    """
+    shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
+    ax = ax or _axes(height=1.2 + 0.42 * len(shown))
+    places = np.arange(len(shown))[::-1]
+    values = [float(d[estimated]) for d in shown.values()]
+    errors = [BAND * float(d[f"{estimated}_error"]) for d in shown.values()]
+    ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
+    ax.set_yticks(places, [_text(name) for name in shown])
+    ax.set_ylim(-0.6, len(shown) - 0.4)
+    ax.locator_params(axis="x", nbins=6)
+    word = {"mean": "mean", "std": "standard deviation"}[estimated]
+    quantities = {_quantity(datasets[name], output) for name in shown}
+    ax.set_xlabel(f"{word} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
+    return ax
+
+
+def png(ax: Axes) -> bytes:
+    """Return the whole figure of axes as a PNG file."""
+    file = io.BytesIO()
+    whole = ax.get_figure(root=True)
+    assert whole is not None
+    whole.savefig(file, format="png", dpi=130)
+    return file.getvalue()
+
+
+def _axes(height: float = 3.2) -> Axes:
+    """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.4, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    ax: Axes = figure.add_subplot()
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def _quantity(dataset: xr.Dataset, output: str) -> str:
+    """Name and unit of an output."""
+    unit = str(dataset["unit"].sel(output=output).item())
+    return _text(output) + ("" if unit == "1" else f" ({unit})")
+
+
+def _text(name: str) -> str:
+    """Keep matplotlib from reading a name as a formula."""
+    return name.replace("$", r"\$")
+
+
+def _series(dataset: xr.Dataset, output: str) -> list[tuple[str, str, NDArray[np.int64], list[Moments]]]:
+    """Label, colour, numbers of samples and running estimates of each estimator that the study has."""
+    n = int(dataset["ok"].sum())
+    counts = np.unique(np.geomspace(_first(n), n, 160).round().astype(np.int64))
+    kinds = [("plain", PLAIN, False)]
+    if "variance_ratio" in dataset:
+        kinds.append(("with sensitivity derivatives", CONTROLLED, True))
+    return [
+        (label, colour, counts, running_estimates(dataset, output, counts.tolist(), controlled=controlled))
+        for label, colour, controlled in kinds
+    ]
+
+
+def _first(n: int) -> int:
+    """Return the number of samples where running estimates of n samples begin."""
+    return max(2, min(FIRST_SHOWN, n // 2))
+
+
+def _count_axis(ax: Axes, n: int) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    ax.set_xscale("log")
+    ax.set_xlim(_first(n), max(n, 3))
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_xlabel("samples")

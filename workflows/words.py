@@ -1,0 +1,135 @@
+"""Numbers rounded to their errors, and studies in words, for reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, assert_never
+
+from forward.loads import Gravity, Load, Pressure, Traction
+from forward.materials import MATERIALS
+from forward.outputs import Output
+from workflows.config import Study
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+NONE = "–"  # what stands for a number that there is not
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Write a number with some significant digits; powers of ten where it is very small or large."""
+    if value is None or math.isnan(value):
+        return NONE
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    power = _power(float(f"{value:.{digits - 1}e}"))
+    if power:
+        return _scaled(f"{value / 10.0**power:.{digits}g}", power)
+    return f"{float(f'{value:.{digits}g}'):,.10g}".replace("-", "−")
+
+
+def with_error(value: float, error: float) -> str:
+    """Write a value and its standard error, which has two significant digits: 0.12279 ± 0.00015."""
+    if not (math.isfinite(value) and math.isfinite(error) and error > 0):
+        return f"{number(value, 6)} ± {number(error, 2)}"
+    decimals = 1 - math.floor(math.log10(error))
+    power = _power(max(abs(value), error))
+    places = max(decimals + power, 0)
+    rounded = [round(x, decimals) / 10.0**power for x in (value, error)]
+    text = " ± ".join(f"{x:,.{places}f}" for x in rounded)
+    return _scaled(f"({text})", power) if power else text.replace("-", "−")
+
+
+def duration(seconds: float) -> str:
+    """Write a time: 0.23 s, 35 s, 4 min 10 s, 3 h 05 min."""
+    if seconds < 99.5:
+        return f"{seconds:.2g} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 100:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def worth(ratio: float) -> str:
+    """Write how many plain samples a controlled one is worth."""
+    return number(ratio, 3)
+
+
+def unit_of(path: str) -> str:
+    """SI unit of a number of the model, by its path."""
+    if path.endswith(".density"):
+        return "kg/m³"
+    return "m" if path.startswith("displacements.") else "Pa"
+
+
+def per(unit: str, divisor: str) -> str:
+    """Unit of a derivative."""
+    return f"{unit}/({divisor})" if "/" in divisor else f"{unit}/{divisor}"
+
+
+def settings(block: dict[str, Any], *left_out: str) -> str:
+    """Write the settings of a block: a = 2, b = 2."""
+    return ", ".join(f"{key} = {_value(value)}" for key, value in block.items() if key not in left_out)
+
+
+def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
+    """Say what was solved: headings, each with its lines."""
+    model = study.model
+    box = model.body
+    size, cells = (" × ".join(f"{x:g}" for x in numbers) for numbers in (box.size, box.cells))
+    yield "body", [f"{box.kind} of {size} m; {cells} cells ({box.cell}, degree {box.degree})"]
+    yield "unknowns", [f"{model.unknowns:,} displacements"]
+    kind = str(model.material.model_dump()["kind"])
+    constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
+    law = str(MATERIALS[kind].__doc__).partition("\n")[0]
+    yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    held = [f"{boundary} clamped" for boundary in model.clamp] + [
+        f"{item.on}: u{axis} = {_scalar(study, f'displacements.{item.label}.{axis}')}"
+        for item in model.displacements
+        for axis in item.components
+    ]
+    yield "held", held
+    yield "loads", [_load(study, load) for load in model.loads] or ["none"]
+    yield "outputs", [_output(output) for output in model.outputs]
+
+
+def _output(output: Output) -> str:
+    details = settings(output.model_dump(), "kind", "name")
+    unit = "" if output.unit == "1" else f" ({output.unit})"
+    return f"{output.name}: {output.kind}{', ' if details else ''}{details}{unit}"
+
+
+def _load(study: Study, load: Load) -> str:
+    match load:
+        case Gravity():
+            density = _scalar(study, f"loads.{load.label}.density")
+            return f"gravity: density {density} × {load.acceleration:g} m/s² along {_value(load.direction)}"
+        case Traction():
+            size = _scalar(study, f"loads.{load.label}.size")
+            return f"traction on {load.on}: {size} along {_value(load.direction)}"
+        case Pressure():
+            return f"pressure on {load.on}: {_scalar(study, f'loads.{load.label}.size')}"
+        case _:
+            assert_never(load)
+
+
+def _scalar(study: Study, path: str) -> str:
+    """A number of the model with its unit, or that it is random."""
+    if path in study.parameters:
+        return "random"
+    return f"{number(study.model.scalars[path].value, 6)} {unit_of(path)}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return f"({', '.join(_value(item) for item in value)})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _power(value: float) -> int:
+    """Power of ten that is written apart: none for numbers of ordinary size."""
+    power = math.floor(math.log10(abs(value))) if value else 0
+    return 0 if -3 <= power < 6 else power
+
+
+def _scaled(text: str, power: int) -> str:
+    return f"{text} × 10{str(power).translate(_SUPERSCRIPTS)}".replace("-", "−")
