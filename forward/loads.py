@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from annotated_types import Ge
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from forward.geometry import AXES, Axis, Vector
 from forward.settings import Settings
@@ -22,51 +23,42 @@ class _Named(Settings):
         return self.name or str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
 
 
-def _unit_vector(vector: Vector) -> Vector:
-    length = sum(x * x for x in vector) ** 0.5
-    if length == 0:
-        message = "direction has length zero, expected a vector such as [0, -1, 0]"
-        raise ValueError(message)
-    x, y, z = (c / length for c in vector)
-    return x, y, z
+class _Directed(_Named):
+    """A load along a direction, which is normalised."""
+
+    direction: Vector
+
+    @property
+    def unit(self) -> Vector:
+        """The direction, of length one."""
+        x, y, z = self.direction
+        length = math.sqrt(x * x + y * y + z * z)
+        return x / length, y / length, z / length
+
+    @field_validator("direction")
+    @classmethod
+    def _has_length(cls, direction: Vector) -> Vector:
+        if not any(direction):
+            message = "has length zero, expected a vector such as [0, -1, 0]"
+            raise ValueError(message)
+        return direction
 
 
-class Gravity(_Named):
-    """Weight of the body: density (kg/m³) × acceleration (m/s²) along `direction`, which is normalised."""
+class Gravity(_Directed):
+    """Weight of the body: density (kg/m³) × acceleration (m/s²) along `direction`."""
 
     kind: Literal["gravity"] = "gravity"
     direction: Vector = (0.0, 0.0, -1.0)
     density: Annotated[float, Ge(0)]
     acceleration: Annotated[float, Ge(0)] = 9.81
 
-    @property
-    def unit(self) -> Vector:
-        """The direction, of length one."""
-        return _unit_vector(self.direction)
 
-    @model_validator(mode="after")
-    def _check(self) -> Gravity:
-        assert self.unit
-        return self
-
-
-class Traction(_Named):
-    """Dead traction of `size` (Pa, per undeformed area) along `direction`, which is normalised, on a boundary."""
+class Traction(_Directed):
+    """Dead traction of `size` (Pa, per undeformed area) along `direction` on a boundary."""
 
     kind: Literal["traction"] = "traction"
     on: str
-    direction: Vector
     size: float
-
-    @property
-    def unit(self) -> Vector:
-        """The direction, of length one."""
-        return _unit_vector(self.direction)
-
-    @model_validator(mode="after")
-    def _check(self) -> Traction:
-        assert self.unit
-        return self
 
 
 class Pressure(_Named):

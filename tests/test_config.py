@@ -104,7 +104,7 @@ def put(*way):
             lambda d: d["model"]["outputs"].append(d["model"]["outputs"][0]),
             "model.outputs: 2 of them are called 'uy_max'",
         ),
-        (put("model", "loads", 0, "direction", [0, 0, 0]), "model.loads[0]: direction has length zero"),
+        (put("model", "loads", 0, "direction", [0, 0, 0]), "model.loads[0].direction: has length zero"),
     ],
 )
 def test_one_line_for_a_mistake(change, expected):
