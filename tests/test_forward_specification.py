@@ -63,7 +63,7 @@ def test_the_specification_without_mistakes_is_accepted():
             "outputs.0.at",
             "outside the body",
         ),
-        ({"loads": (TRACTION | {"direction": (0.0, 0.0, 0.0)},)}, "loads.0.traction", "length zero"),
+        ({"loads": (TRACTION | {"direction": (0.0, 0.0, 0.0)},)}, "loads.0.traction.direction", "length zero"),
         ({"loads": ({"kind": "gravity", "density": -1.0},)}, "loads.0.gravity.density", "greater than or equal to 0"),
         ({"loads": ({"kind": "gravity", "density": "heavy"},)}, "loads.0.gravity.density", "valid number"),
         ({"loads": ({"kind": "gravity", "denisty": 1.0},)}, "loads.0.gravity.denisty", "did you mean 'density'"),
