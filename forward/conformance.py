@@ -130,9 +130,14 @@ def check_derivatives(
         If the model has no derivatives.
     SolveError
         If the model has no answer within the steps.
+    ValueError
+        If there are too few steps.
     """
     if not model.differentiable:
         raise DerivativeError("the model has no derivatives to check")
+    if len(steps) < WINDOW:
+        message = f"{len(steps)} steps given, expected at least {WINDOW}"
+        raise ValueError(message)
     rng = np.random.default_rng(seed)
     point, unit = np.array(parameters, dtype=float), np.array(scale, dtype=float)
     if directions is None:

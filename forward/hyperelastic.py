@@ -81,7 +81,8 @@ class Hyperelastic(Settings):
     clamp
         Boundaries that do not move.
     displacements
-        Boundaries with components that are moved by a given amount.
+        Boundaries with components that are moved by a given amount. Where boundaries share an edge, clamps come
+        first, then later entries before earlier ones.
     loads
         Gravity, tractions and pressures.
     outputs

@@ -7,6 +7,7 @@ import pytest
 
 from forward.conformance import check_derivatives
 from forward.model import DerivativeError, FunctionModel, FunctionSolution
+from tests.launch import run_script
 
 POINT = np.array([0.7, 1.3])
 SCALE = np.array([0.5, 0.4])
@@ -188,3 +189,15 @@ def test_a_function_model_keeps_nothing_of_its_caller():
     model.solve(x)
     np.testing.assert_array_equal(solution.outputs, outputs)
     np.testing.assert_array_equal(solution.tangent(SCALE), slope)
+
+
+def test_too_few_steps_are_refused():
+    with pytest.raises(ValueError, match="2 steps given, expected at least 3"):
+        check_derivatives(MODEL, POINT, SCALE, steps=(0.1, 0.05))
+
+
+def test_the_check_needs_neither_fenicsx_nor_mpi():
+    script = (
+        "import sys, forward.conformance; sys.exit(bool({'dolfinx', 'petsc4py', 'mpi4py', 'ufl'} & set(sys.modules)))"
+    )
+    assert run_script(None, script).returncode == 0
