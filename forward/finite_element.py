@@ -24,6 +24,7 @@ from forward.materials import MATERIALS
 from forward.model import FloatArray, SolveError, Work
 from forward.newton import Residual, solve
 
+STRETCH = 1e-6  # of the body, to see how stiff it is
 _OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt)
 
 
@@ -81,6 +82,7 @@ class Discretisation:
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding = 0.0
+        self._stretch = STRETCH * fenicsx.node_coordinates(self.space).ravel()
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
@@ -209,9 +211,7 @@ class Discretisation:
         the size of the stiffness: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch of the body.
         """
         self.at_load(0.0)
-        stretch = 1e-6
-        r = self._imbalance(stretch * fenicsx.node_coordinates(self.space).ravel())
-        self._rounding = 4 * float(np.finfo(float).eps) * self.norm(r) / stretch
+        self._rounding = 4 * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
         self.at_load(1.0)
         r = self._imbalance(np.zeros(3 * self.nodes_owned))
         r[self._fixed] = 0

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from workflows.config import Study
 
-# Rough cost of one Newton iteration on one core in seconds, and bytes of the factor, as powers of the unknowns:
-# fitted to a structured box with 3·10³, 10⁴ and 7·10⁴ unknowns on a 2.8 GHz core (python -m benchmarks newton).
-ITERATIONS = 3.0
-
 
 def seconds_per_solve(unknowns: int) -> float:
-    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so."""
-    return float(ITERATIONS * (1.3e-5 * unknowns + 2.2e-8 * unknowns**1.6))
+    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so.
+
+    Fitted to 0.049, 0.222 and 1.277 s at 1 071, 3 375 and 13 209 unknowns (quadratic hexahedra, a 2.8 GHz core;
+    `python -m benchmarks newton`).
+    """
+    return float(6.24e-6 * unknowns**1.29)
 
 
 def bytes_per_model(unknowns: int) -> float:
