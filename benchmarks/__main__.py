@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, newton, throughput, variance
+from benchmarks import bookkeeping, realisation, throughput, variance
 
 ALL = {
-    "newton": newton.main,
+    "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,

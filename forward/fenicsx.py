@@ -209,6 +209,39 @@ def function(space: Any) -> Any:
     return fem.Function(space)
 
 
+class NodalGradients:
+    """Deformation gradients at the nodes: averages over the cells that meet there."""
+
+    def __init__(self, F: Any, space: Any, comm: Any) -> None:
+        kind = basix.cell.string_to_type(space.mesh.ufl_cell().cellname())
+        degree = space.ufl_element().degree()
+        # The nodes in the order of the cells' lists, as `vector_space` places them.
+        family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped  # type: ignore[attr-defined]
+        nodes = basix.create_element(family, kind, degree, variant).points  # type: ignore[attr-defined]
+        self._comm = comm
+        self._expression = compile_expression(F, nodes, comm)
+        self._cells = owned_cells(space)
+        self._count = space.dofmap.index_map.size_local + space.dofmap.index_map.num_ghosts
+        self._nodes = space.dofmap.list.array.reshape(-1, len(nodes))[: len(self._cells)].ravel()
+        self._carrier = fem.Function(space)
+        meeting = np.bincount(self._nodes, minlength=self._count).astype(float)
+        self._meeting = self._owned(np.broadcast_to(meeting, (3, self._count)))[0]
+
+    def _owned(self, rows: FloatArray) -> FloatArray:
+        """Add what other ranks hold of three rows (3, n) at this rank's nodes."""
+        if self._comm.size == 1:
+            return rows
+        self._carrier.x.array[:] = rows.T.ravel()
+        return np.asarray(sum_ghosts(self._carrier).reshape(-1, 3).T)
+
+    def __call__(self) -> FloatArray:
+        """Return F (3, 3, n_owned) at this rank's nodes, for the state that is set."""
+        values = np.asarray(self._expression.eval(self._cells)).reshape(-1, 9).T
+        sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
+        F = np.array([self._owned(rows) for rows in sums.reshape(3, 3, -1)])
+        return np.asarray(F / self._meeting)
+
+
 # --- assembly and linear algebra -------------------------------------------------------------------------------------
 
 
@@ -241,16 +274,27 @@ class ScalarAssembler:
 
 
 class DirectSolver:
-    """The stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
+    """A stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
 
     One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
     communicator is created in a loop.
+
+    Parameters
+    ----------
+    form
+        Compiled bilinear form.
+    constraints
+        Prescribed unknowns; their rows and columns become those of the identity.
+    comm
+        Communicator of the ranks that share the matrix.
+    symmetric
+        Whether the form is.
     """
 
     def __init__(self, form: Any, constraints: list[Any], comm: Any, *, symmetric: bool) -> None:
-        self._form = compile_form(form, comm)
+        self._form = form
         self._constraints = constraints
-        self._matrix = fem.petsc.create_matrix(self._form)
+        self._matrix = fem.petsc.create_matrix(form)
         self._symmetric = symmetric
         if symmetric:
             self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -285,13 +329,26 @@ class DirectSolver:
             raise SolveError(message)
 
     def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
-        """Solve with the factor at hand, or with its transpose."""
-        self._right.array[:] = right
-        if transpose and not self._symmetric:
-            self._ksp.solveTranspose(self._right, self._solution)
-        else:
-            self._ksp.solve(self._right, self._solution)
-        return np.array(self._solution.array_r)
+        """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
+        transpose = transpose and not self._symmetric
+        if right.ndim == 1:
+            self._right.array[:] = right
+            (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
+            return np.array(self._solution.array_r)
+        if transpose or len(right) == 1 or self._ksp.comm.size > 1:
+            return np.array([self.solve(row, transpose=transpose) for row in right]).reshape(right.shape)
+        # The factor is read once for all of them.
+        size = right.shape[::-1]
+        rights = PETSc.Mat().createDense(size, array=np.asfortranarray(right.T), comm=self._ksp.comm)
+        solutions = PETSc.Mat().createDense(size, comm=self._ksp.comm)
+        for matrix in (rights, solutions):
+            matrix.setUp()
+            matrix.assemble()
+        self._ksp.pc.getFactorMatrix().matSolve(rights, solutions)
+        result = np.array(solutions.getDenseArray().T, order="C")
+        rights.destroy()
+        solutions.destroy()
+        return result
 
     def negative_pivots(self) -> int:
         """Number of negative pivots of LDLᵀ, that is of negative eigenvalues; −1 where it is not known."""

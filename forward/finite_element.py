@@ -15,16 +15,20 @@ import numpy as np
 import ufl
 
 from forward import fenicsx, kinematics
+from forward.acceleration import Inverse, block_gcr
 from forward.functionals import functional
 from forward.geometry import AXES
 from forward.hyperelastic import Hyperelastic
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
-from forward.model import FloatArray, SolveError, Work
+from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Residual, solve
+from forward.reference import ReferenceFactor
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
+FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
+ITERATIONS = 20  # of block GCR, before a factor is made after all
 _OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt)
 
 
@@ -69,19 +73,14 @@ class Discretisation:
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
-        self._solver = fenicsx.DirectSolver(
-            ufl.derivative(imbalance, self.u, ufl.TrialFunction(self.space)),
-            self._constraints,
-            comm,
-            symmetric=self._symmetric,
-        )
+        self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self.u, ufl.TrialFunction(self.space)), comm)
+        self._solver = self.new_solver()
         self._factorised_at = np.zeros(3 * self.nodes_owned)
         self._jacobians = fenicsx.compile_expression(
             self.J, fenicsx.quadrature_points(self.space, spec.body.quadrature), comm
         )
         self._compiled: dict[tuple[int, str], Any] = {}
-        self._external = 0.0
-        self._rounding = 0.0
+        self._rounding: float | None = None
         self._stretch = STRETCH * fenicsx.node_coordinates(self.space).ravel()
 
     # --- forms -------------------------------------------------------------------------------------------------------
@@ -166,6 +165,38 @@ class Discretisation:
             return self._stiffness_action
         return self.vector(ufl.derivative(ufl.action(self._imbalance_form(), self._along), self.u, self.test))
 
+    @cached_property
+    def gradients(self) -> fenicsx.NodalGradients:
+        """Deformation gradients at the nodes, at the state that is set."""
+        return fenicsx.NodalGradients(self.F, self.space, self.comm)
+
+    @cached_property
+    def _unit_loads(self) -> dict[str, FloatArray]:
+        """Forces (U_local,) on the undeformed body: those of each load of size one, and ("") those without a size.
+
+        All energies are free of stress there.
+        """
+        paths = [path for path in self._constants if path.startswith("loads.")]
+        forces: dict[str, FloatArray] = {}
+        kept, work = self._load.value.copy(), self.work
+        self._load.value = 1.0
+        self.work = Work()  # the first solution is charged no more than the others
+        for path in ("", *paths):
+            for other in paths:
+                self._constants[other].value = float(other == path)
+            forces[path] = self._imbalance(np.zeros(3 * self.nodes_owned)) - forces.get("", 0.0)
+            forces[path][self.fixed] = 0
+            if path == "" and self.norm(forces[path]) <= self.rounding():
+                forces[path][:] = 0
+        for path in paths:
+            self._constants[path].value = self._values[path]
+        self._load.value, self.work = kept, work
+        return forces
+
+    def new_solver(self) -> fenicsx.DirectSolver:
+        """Return a matrix and a solver of their own for the stiffness."""
+        return fenicsx.DirectSolver(self._stiffness, self._constraints, self.comm, symmetric=self._symmetric)
+
     # --- state and parameters ----------------------------------------------------------------------------------------
 
     def _prescribe(self) -> None:
@@ -184,14 +215,14 @@ class Discretisation:
                 self._constraints.append(fenicsx.constraint(self.space, a, nodes))
                 moved |= {(int(n), a): "" for n in nodes}
         owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
-        self._fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
+        self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
         paths = [path for _, path in owned]
         self._movers = {
             path: np.array([p == path for p in paths], dtype=float)
             for path in self._values
             if path.startswith("displacements.")
         }
-        self._targets = np.zeros(len(self._fixed))
+        self._targets = np.zeros(len(self.fixed))
         self._moves = False
 
     def set_parameters(self, parameters: FloatArray) -> None:
@@ -199,23 +230,17 @@ class Discretisation:
         self._values |= dict(zip(self.parameters, map(float, parameters), strict=True))
         for path, constant in self._constants.items():
             constant.value = self._values[path]
-        self._full_targets = np.zeros(len(self._fixed))
+        self._full_targets = np.zeros(len(self.fixed))
         for path, mover in self._movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
-
-    def measure_loads(self) -> None:
-        """Find the scale of residuals, and what of them is rounding.
-
-        The scale is ‖F(0)‖ at full load (all energies are free of stress at 0). The rounding is that of stresses of
-        the size of the stiffness: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch of the body.
-        """
-        self.at_load(0.0)
-        self._rounding = 4 * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
-        self.at_load(1.0)
-        r = self._imbalance(np.zeros(3 * self.nodes_owned))
-        r[self._fixed] = 0
-        self._external = self.norm(r)
+        self._rounding = None
+        external = np.zeros(3 * self.nodes_owned)
+        with np.errstate(invalid="ignore"):  # a load that is not finite has no finite residual, which the solver says
+            for path, force in self._unit_loads.items():
+                external += self._values.get(path, 1.0) * force
+        self._external = self.norm(external)
+        self._rounding = None
 
     def set_state(self, u: FloatArray) -> None:
         """Give the displacement (U_local,) its values, ghosts included."""
@@ -249,15 +274,33 @@ class Discretisation:
     def residual(self, u: FloatArray) -> Residual:
         """Return the imbalance at u (U_local,)."""
         r = self._imbalance(u)
-        reactions = r[self._fixed]
-        gap = u[self._fixed] - self._targets
-        r[self._fixed] = 0
+        reactions = r[self.fixed]
+        gap = u[self.fixed] - self._targets
+        r[self.fixed] = 0
         free, fixed, apart = fenicsx.total(self.comm, np.array([r @ r, reactions @ reactions, gap @ gap]))
-        r[self._fixed] = gap
+        r[self.fixed] = gap
         scale = float(self._load.value) * self._external
         if self._moves:
             scale = max(scale, float(np.sqrt(fixed)))
-        return Residual(r, float(np.sqrt(free)), scale, self._rounding, float(np.sqrt(apart)))
+        return Residual(r, float(np.sqrt(free)), scale, float(np.sqrt(apart)))
+
+    def rounding(self) -> float:
+        """What the size of a residual cannot be expected to fall below, whatever the loads (N).
+
+        Stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch.
+        """
+        if self._rounding is None:
+            load = self._load.value.copy()
+            self._load.value = 0.0
+            self._rounding = 4 * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
+            self._load.value = load
+        return self._rounding
+
+    def on_target(self, u: FloatArray) -> FloatArray:
+        """Return u (U_local,) with the prescribed unknowns at their targets."""
+        v = np.array(u)
+        v[self.fixed] = self._targets
+        return v
 
     def factorise(self, u: FloatArray) -> None:
         """Assemble and factorise the stiffness at u (U_local,)."""
@@ -270,18 +313,18 @@ class Discretisation:
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right; rows of prescribed unknowns give their values."""
         if self._moves or self._movers:
-            known = right[self._fixed]
+            known = right[self.fixed]
             if fenicsx.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
                 w = np.zeros_like(right)
-                w[self._fixed] = known
+                w[self.fixed] = known
                 self.set_state(self._factorised_at)
                 right = right - self.stiffness_times(w)
-                right[self._fixed] = known
+                right[self.fixed] = known
         return self.back_substitute(right)
 
     def back_substitute(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
-        """Solve with K, or with Kᵀ, whose prescribed rows and columns are those of the identity."""
-        self.work.back_substitutions += 1
+        """Solve with K, or with Kᵀ, whose prescribed rows and columns are those of the identity; (n,) or (k, n)."""
+        self.work.back_substitutions += 1 if right.ndim == 1 else len(right)
         return self._solver.solve(right, transpose=transpose)
 
     def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
@@ -290,6 +333,22 @@ class Discretisation:
         self._along.x.scatter_forward()
         self.work.residuals += 1
         return (self._transposed_action if transpose else self._stiffness_action)()
+
+    def free_stiffness_times(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Product (k, n) of the matrix that `back_substitute` inverts, at the state that is set, with rows x (k, n)."""
+        w = np.array(x)
+        w[:, self.fixed] = 0
+        y = np.array([self.stiffness_times(row, transpose=transpose) for row in w])
+        y[:, self.fixed] = x[:, self.fixed]
+        return y
+
+    def total(self, values: FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+        return fenicsx.total(self.comm, values)
+
+    def norms(self, rows: FloatArray) -> FloatArray:
+        """Euclidean norms of rows (k, U_local) over all ranks."""
+        return np.asarray(np.sqrt(self.total(np.einsum("kn,kn->k", rows, rows))))
 
     def norm(self, x: FloatArray) -> float:
         """Euclidean norm over all ranks."""
@@ -327,12 +386,12 @@ class Discretisation:
         """Right-hand sides (d, U_local) of the tangents at the state that is set: K du/dω_i = b_i."""
         right = -self.parameter_forces()
         for i, path in enumerate(self.parameters):
-            right[i, self._fixed] = 0
+            right[i, self.fixed] = 0
             if path in self._movers:
                 w = np.zeros(right.shape[1])
-                w[self._fixed] = self._movers[path]
+                w[self.fixed] = self._movers[path]
                 right[i] -= self.stiffness_times(w)
-                right[i, self._fixed] = self._movers[path]
+                right[i, self.fixed] = self._movers[path]
         return right
 
 
@@ -367,10 +426,24 @@ class HyperelasticModel:
         self.differentiable = True
         self._functionals = [functional(output, self.body) for output in spec.outputs]
         self._visited: object = None  # the solution whose state is set
-        self._factorised: object = None  # the solution at whose state the stiffness is factorised
+        self._factorised: object = None  # the solution that owns the factor at hand
 
-    def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> FiniteElementSolution:
-        """Find the equilibrium at `parameters` (d,), from the state `start` (U_local,) if given; collective.
+    @cached_property
+    def _reference(self) -> ReferenceFactor:
+        return ReferenceFactor(self.body)
+
+    def solve(
+        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+    ) -> FiniteElementSolution:
+        """Find the equilibrium at `parameters` (d,); collective.
+
+        Parameters
+        ----------
+        start
+            Prediction of the state (U_local,).
+        reference
+            A solution elsewhere, whose factor corrects the prediction. It is factorised when it is first given; the
+            factor is kept until another is.
 
         Raises
         ------
@@ -379,16 +452,22 @@ class HyperelasticModel:
         """
         body = self.body
         self._visited = self._factorised = None
-        body.work = Work()
         for path, value in zip(self.parameters, parameters, strict=True):
             objection = self.spec.scalars[path].objection(float(value))
             if objection is not None:
                 message = f"{path} = {value:.6g} is not admissible: {objection}"
                 raise SolveError(message)
+        if self.spec.solver.kind == "newton" or start is None:
+            reference = None
+        if reference is not None:
+            self._reference.prepare(reference)
+        body.work = Work()
         body.set_parameters(parameters)
-        body.measure_loads()
-        u = solve(body, self.spec.solver, np.zeros(3 * body.nodes_owned), start)
-        return FiniteElementSolution(self, parameters, u, body.work)
+        near = self._reference.near if reference is not None else None
+        u = solve(body, self.spec.solver, np.zeros(3 * body.nodes_owned), start, near)
+        # Where Newton had to take over, the reference is too far away for the derivatives too.
+        corrected = body.work.factorisations == 0
+        return FiniteElementSolution(self, parameters, u, body.work, reference if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -417,17 +496,36 @@ class HyperelasticModel:
             self._factorised = solution
         return body
 
+    def near_reference(self, solution: FiniteElementSolution, reference: Reference, *, transpose: bool) -> Inverse:
+        """Return the approximate inverse of the stiffness at a solution that its reference gives."""
+        self._visited = None
+        self._reference.prepare(reference)
+        self.visit(solution)
+        return self._reference.near(solution.state, transpose=transpose)
+
 
 class FiniteElementSolution:
-    """An equilibrium with its linearisation: k derivatives cost one factorisation and k back-substitutions."""
+    """An equilibrium with its linearisation.
 
-    def __init__(self, model: HyperelasticModel, parameters: FloatArray, state: FloatArray, work: Work) -> None:
+    k derivatives cost one factorisation and k back-substitutions. Few derivatives of a solution that was found with a
+    reference are instead solved for with the factor of the reference, to the tolerance of the solver.
+    """
+
+    def __init__(
+        self,
+        model: HyperelasticModel,
+        parameters: FloatArray,
+        state: FloatArray,
+        work: Work,
+        reference: Reference | None,
+    ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
         self.state = np.array(state)
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
+        self._reference = reference
         model.visit(self)
         self.outputs = np.array([f.value() for f in model._functionals])
         self.outputs.flags.writeable = False
@@ -448,20 +546,38 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
+    def _solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local)."""
+        model = self._model
+        if self._reference is not None and len(right) <= FEW:
+            inverse = model.near_reference(self, self._reference, transpose=transpose)
+            body = model.visit(self)
+            found = block_gcr(
+                lambda x: body.free_stiffness_times(x, transpose=transpose),
+                inverse,
+                right,
+                body.total,
+                body.norms,
+                model.spec.solver.tolerance,
+                ITERATIONS,
+            )
+            if found is not None:
+                return found
+        return model.linearise(self).back_substitute(right, transpose=transpose)
+
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return du (U_local,) along a `direction` (d,) of the parameters; collective."""
-        right = np.asarray(direction) @ self._right_sides
-        return self._model.linearise(self).back_substitute(right)
+        """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
+        directions = np.atleast_2d(direction)
+        du = self._solve(directions @ self._right_sides)
+        return du.reshape(*np.shape(direction)[:-1], -1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,) of the parameters; collective."""
+        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
         du = self.state_tangent(direction)
-        body = self._model.body
-        return fenicsx.total(body.comm, self._gradients @ du) + self._partials @ direction
+        return self._model.body.total(du @ self._gradients.T) + direction @ self._partials.T
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,); collective."""
-        load = np.asarray(weights) @ self._gradients
-        body = self._model.linearise(self)
-        multiplier = body.back_substitute(load, transpose=True)
-        return fenicsx.total(body.comm, self._right_sides @ multiplier) + weights @ self._partials
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
+        loads = np.atleast_2d(weights) @ self._gradients
+        multipliers = self._solve(loads, transpose=True).reshape(*np.shape(weights)[:-1], -1)
+        return self._model.body.total(multipliers @ self._right_sides.T) + weights @ self._partials

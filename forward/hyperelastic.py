@@ -8,13 +8,13 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError, create_model, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.geometry import AXES, Box
 from forward.loads import LOAD_SIZES, Displacement, Load
 from forward.materials import MATERIALS, constants
-from forward.newton import NewtonSettings
+from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
 from forward.settings import Settings, nearest
 
@@ -88,7 +88,7 @@ class Hyperelastic(Settings):
     outputs
         What is computed from the deformed body.
     solver
-        Tolerance and limits of the solver.
+        Path, tolerance and limits of the solver; its kind alone may be given as a word, `solver = "newton"`.
     """
 
     kind: Literal["hyperelastic"] = "hyperelastic"
@@ -98,7 +98,12 @@ class Hyperelastic(Settings):
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
     outputs: tuple[Output, ...] = Field(min_length=1)
-    solver: NewtonSettings = NewtonSettings()
+    solver: SolverSettings = SolverSettings()
+
+    @field_validator("solver", mode="before")
+    @classmethod
+    def _kind_alone(cls, given: Any) -> Any:
+        return {"kind": given} if isinstance(given, str) else given
 
     @property
     def scalars(self) -> dict[str, Scalar]:

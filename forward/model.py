@@ -58,10 +58,33 @@ class DerivativeError(Exception):
     """A derivative was asked for that the model or the output does not have."""
 
 
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A solution that was found before, whose linearisation may serve the solves near it.
+
+    Attributes
+    ----------
+    parameters
+        Where (d,).
+    state
+        This rank's part (U_local,) of the state there.
+    """
+
+    parameters: FloatArray
+    state: FloatArray
+
+    def same(self, other: Reference) -> bool:
+        """Whether both are at the same place."""
+        return self is other or (
+            np.array_equal(self.parameters, other.parameters) and np.array_equal(self.state, other.state)
+        )
+
+
 class Solution(Protocol):
     """The answer of a model at one parameter vector, with its linearisation there.
 
     With d parameters, m outputs and a state of U unknowns (of which a rank of a distributed model holds its part).
+    Directions and weights may be stacked as k rows; then so are the results, which costs less than one at a time.
     """
 
     @property
@@ -77,13 +100,13 @@ class Solution(Protocol):
         """What this solution has cost so far."""
 
     def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along a `direction` (d,) of the parameters."""
+        """Return the derivative of the outputs (m,) along a `direction` (d,) of the parameters; (k, m) for (k, d)."""
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) with respect to the parameters of the outputs weighted by `weights` (m,)."""
+        """Return the gradient (d,) with respect to the parameters of the outputs weighted by `weights` (m,); (k, d)."""
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the state (U_local,) along a `direction` (d,) of the parameters."""
+        """Return the derivative of the state (U_local,) along a `direction` (d,) of the parameters; (k, U_local)."""
 
 
 class ForwardModel(Protocol):
@@ -105,10 +128,12 @@ class ForwardModel(Protocol):
     def differentiable(self) -> bool:
         """Whether solutions have tangents and adjoints."""
 
-    def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> Solution:
-        """Solve at `parameters` (d,), from the state `start` (U_local,) if one is given.
+    def solve(
+        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+    ) -> Solution:
+        """Solve at `parameters` (d,), from the state `start` (U_local,) with the help of a `reference`, if given.
 
-        The start may change the cost, never the answer beyond the solver's tolerance.
+        Both may change the cost, never the answer beyond the solver's tolerance.
 
         Raises
         ------
@@ -147,7 +172,9 @@ class FunctionModel:
         """Whether a jacobian was given."""
         return self.jacobian is not None
 
-    def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> FunctionSolution:
+    def solve(
+        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+    ) -> FunctionSolution:
         """Evaluate the function at `parameters` (d,); there is no state to `start` from."""
         # Copies: neither the caller nor the function can change a solution afterwards.
         point = np.array(parameters, dtype=float)
@@ -189,16 +216,16 @@ class FunctionSolution:
         return Work()
 
     def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (m,) along `direction` (d,)."""
-        return self._jacobian() @ direction
+        """Return the derivative of the outputs (m,) along `direction` (d,), or (k, m) for k of them."""
+        return np.asarray(direction) @ self._jacobian().T
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (m,)."""
-        return weights @ self._jacobian()
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
+        return np.asarray(weights) @ self._jacobian()
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """No state: an empty array."""
-        return np.empty(0)
+        """No state: empty."""
+        return np.empty((*np.shape(direction)[:-1], 0))
 
     def _jacobian(self) -> FloatArray:
         if self.model.jacobian is None:

@@ -1,4 +1,8 @@
-"""Newton's method with a step guard, and adaptive load steps, for a discretised body.
+"""Finding the equilibrium of a discretised body: predict and correct with a reference factor, Newton, load steps.
+
+From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
+stiffness; where that is slow it goes on with Newton's method, then with adaptive load steps. All of them stop at the
+same test of the residual.
 
 Whole Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
 what stops the iteration are steps that grow. A line search on the residual or on the energy, or the natural
@@ -9,40 +13,57 @@ iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from pydantic import Field
 
+from forward.acceleration import AndersonMixing, Inverse
 from forward.model import FloatArray, SolveError, Work
 from forward.settings import Settings
 
 
-class NewtonSettings(Settings):
-    """Tolerance and limits of the solver.
+class SolverSettings(Settings):
+    """Path, tolerance and limits of the solver.
 
     Parameters
     ----------
+    kind
+        "predict-correct" uses a prediction and a reference factor where the method has them, and the last factor for
+        more than one correction; "newton" is the textbook: from zero, a new factor for every step.
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
         prescribed).
     iterations
         Newton iterations allowed in one load step.
+    corrections
+        Corrections with a reference factor that are allowed before Newton takes over.
     minimum_damping
         Shortest fraction of a Newton step that is tried where the whole step is not admissible.
     minimum_load_step
         Smallest load step, as a fraction of the load, before the solver gives up.
+    accept_unstable
+        Whether an equilibrium counts where the stiffness is known to have negative eigenvalues (the body has buckled).
     """
 
+    kind: Literal["predict-correct", "newton"] = "predict-correct"
     tolerance: Annotated[float, Field(gt=0, le=1e-2)] = 1e-8
     iterations: Annotated[int, Field(ge=1)] = 25
+    corrections: Annotated[int, Field(ge=1)] = 40
     minimum_damping: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 512
+    accept_unstable: bool = False
 
 
 QUICK = 5  # a load step that needs no more iterations than this lets the next one be twice as long
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
+WINDOW = 8  # differences that Anderson mixing keeps
+PATIENCE = 10  # corrections without a smaller residual before they are given up
+NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
+POLISH = 8  # corrections with the factor of a Newton step
+STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
 
 
 @dataclass(frozen=True)
@@ -57,8 +78,6 @@ class Residual:
         Euclidean norm over the free unknowns, of all ranks (N).
     scale
         What `size` is compared with (N).
-    rounding
-        What `size` cannot be expected to fall below, whatever the loads (N).
     gap
         Largest distance of a prescribed unknown from its target (m).
     """
@@ -66,17 +85,12 @@ class Residual:
     vector: FloatArray
     size: float
     scale: float
-    rounding: float
     gap: float
 
     @property
     def relative(self) -> float:
         """The residual relative to the loads."""
         return self.size / self.scale if self.scale > 0 else self.size
-
-    def converged(self, tolerance: float) -> bool:
-        """Whether the state is an equilibrium to `tolerance`, or to rounding."""
-        return self.gap == 0 and self.size <= max(tolerance * self.scale, self.rounding)
 
 
 class System(Protocol):
@@ -90,8 +104,14 @@ class System(Protocol):
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
 
+    def on_target(self, u: FloatArray) -> FloatArray:
+        """Return u with the prescribed unknowns at their targets."""
+
     def residual(self, u: FloatArray) -> Residual:
         """Return the imbalance at u."""
+
+    def rounding(self) -> float:
+        """What the size of a residual cannot be expected to fall below, whatever the loads (N)."""
 
     def factorise(self, u: FloatArray) -> None:
         """Assemble and factorise the stiffness at u.
@@ -105,6 +125,9 @@ class System(Protocol):
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right with the factor at hand; prescribed rows are identities."""
 
+    def total(self, values: FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+
     def norm(self, x: FloatArray) -> float:
         """Euclidean norm over all ranks."""
 
@@ -116,10 +139,20 @@ class System(Protocol):
 
 
 class _Diverged(Exception):  # noqa: N818 - control flow inside this file
-    """An attempt at one load failed, for the reason given."""
+    """An attempt at one load failed, for the reason given; `best` is where it came nearest, if that is of use."""
+
+    def __init__(self, reason: str, best: FloatArray | None = None) -> None:
+        super().__init__(reason)
+        self.best = best
 
 
-def solve(system: System, settings: NewtonSettings, zero: FloatArray, start: FloatArray | None = None) -> FloatArray:
+def solve(
+    system: System,
+    settings: SolverSettings,
+    zero: FloatArray,
+    start: FloatArray | None = None,
+    reference: Callable[[FloatArray], Inverse] | None = None,
+) -> FloatArray:
     """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
 
     Parameters
@@ -127,11 +160,13 @@ def solve(system: System, settings: NewtonSettings, zero: FloatArray, start: Flo
     system
         The body; its `work` counts what is spent.
     settings
-        Tolerance and limits.
+        Path, tolerance and limits.
     zero
         The undeformed state (U_local,).
     start
         A prediction of the state at full load (U_local,).
+    reference
+        Gives, for a predicted state, an approximate inverse of the stiffness there.
 
     Returns
     -------
@@ -144,16 +179,90 @@ def solve(system: System, settings: NewtonSettings, zero: FloatArray, start: Flo
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
     history: list[str] = []
-    for guess in (start, zero):
-        if guess is not None:
-            try:
-                return _newton(system, settings, guess, history, 1.0)[0]
-            except _Diverged:
-                continue
+    guesses = [zero] if start is None or settings.kind == "newton" else [start, zero]
+    if reference is not None and len(guesses) == 2:
+        try:
+            return _predict_correct(system, settings, guesses[0], reference, history)
+        except _Diverged as stop:
+            if stop.best is not None:
+                guesses[0] = stop.best
+    for guess in guesses:
+        try:
+            return _newton(system, settings, guess, history, 1.0)[0]
+        except _Diverged:
+            continue
     return _load_steps(system, settings, zero, history)
 
 
-def _load_steps(system: System, settings: NewtonSettings, zero: FloatArray, history: list[str]) -> FloatArray:
+def _predict_correct(
+    system: System,
+    settings: SolverSettings,
+    start: FloatArray,
+    reference: Callable[[FloatArray], Inverse],
+    history: list[str],
+) -> FloatArray:
+    """Correct a prediction with a reference factor, or raise `_Diverged`."""
+    system.at_load(1.0)
+    u = system.on_target(start)
+    residual = system.residual(u)
+    if not np.isfinite(residual.size):
+        message = "the predicted state has no finite residual"
+        history.append(f"prediction: {message}")
+        raise _Diverged(message)
+    best, reached = _mix(system, settings, u, residual, reference(u), settings.corrections, history)
+    if reached:
+        return best
+    message = "the reference is too far away"
+    history.append(f"corrections: {message}")
+    raise _Diverged(message, best)
+
+
+def _mix(
+    system: System,
+    settings: SolverSettings,
+    u: FloatArray,
+    residual: Residual,
+    inverse: Inverse,
+    limit: int,
+    history: list[str],
+) -> tuple[FloatArray, bool]:
+    """Correct u with one factor; return the best state, and whether it is an equilibrium."""
+    mixing = AndersonMixing(inverse, WINDOW, len(u), system.total)
+    best, smallest, since = u, residual, 0
+    last: tuple[FloatArray, Residual] | None = None
+    for iteration in range(limit + 1):
+        history.append(f"correction {iteration}: relative residual {residual.relative:.3e}")
+        if _converged(system, settings, residual, last[1] if last else None):
+            # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
+            convex = last is None or float(system.total((u - last[0]) @ (residual.vector - last[1].vector))) >= 0
+            return u, convex and system.smallest_jacobian(u) > 0
+        if iteration > 0 and residual.size < smallest.size:
+            best, smallest, since = u, residual, 0
+        else:
+            since += 1
+        if iteration == limit or since > PATIENCE:
+            break
+        last = (u, residual)
+        u = mixing.next(u, residual.vector)
+        residual = system.residual(u)
+        if not np.isfinite(residual.size):
+            history.append("correction: the state has no finite residual")
+            break
+    return best, False
+
+
+def _converged(system: System, settings: SolverSettings, residual: Residual, previous: Residual | None) -> bool:
+    """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding."""
+    if residual.gap != 0:
+        return False
+    if residual.size <= settings.tolerance * residual.scale:
+        return True
+    unloaded = residual.scale == 0
+    stalled = previous is not None and previous.gap == 0 and residual.size > STALLED * previous.size
+    return (unloaded or stalled) and residual.size <= system.rounding()
+
+
+def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> FloatArray:
     """Raise the load from zero; halve the step where Newton fails, double it where it is quick."""
     reached, step = 0.0, 0.5
     u, slope = zero, np.zeros_like(zero)
@@ -161,7 +270,7 @@ def _load_steps(system: System, settings: NewtonSettings, zero: FloatArray, hist
         load = min(1.0, reached + step)
         try:
             # The secant through the last two states predicts the next one.
-            solution, iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
+            found, iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
         except _Diverged as stop:
             step /= 2
             slope = np.zeros_like(zero)
@@ -169,8 +278,8 @@ def _load_steps(system: System, settings: NewtonSettings, zero: FloatArray, hist
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
                 raise SolveError(message, history, system.work) from None
             continue
-        slope = (solution - u) / (load - reached)
-        u, reached = solution, load
+        slope = (found - u) / (load - reached)
+        u, reached = found, load
         system.work.load_steps += 1
         if iterations <= QUICK:
             step *= 2
@@ -178,7 +287,7 @@ def _load_steps(system: System, settings: NewtonSettings, zero: FloatArray, hist
 
 
 def _newton(
-    system: System, settings: NewtonSettings, u: FloatArray, history: list[str], load: float
+    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
 ) -> tuple[FloatArray, int]:
     """Iterate at one load; return the state and the number of iterations, or raise `_Diverged`."""
     system.at_load(load)
@@ -190,39 +299,61 @@ def _newton(
 
 
 def _iterate(
-    system: System, settings: NewtonSettings, u: FloatArray, history: list[str], load: float
+    system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
 ) -> tuple[FloatArray, int]:
     residual = system.residual(u)
-    longest = 0.0
+    previous: Residual | None = None
+    longest, length = 0.0, np.inf
     if not np.isfinite(residual.size):
         message = "the starting state has no finite residual"
         raise _Diverged(message)
     for iteration in range(settings.iterations + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
-        if residual.converged(settings.tolerance):
-            jacobian = system.smallest_jacobian(u)
-            if not jacobian > 0:
-                message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
-                raise _Diverged(message)
-            return u, iteration
+        if _converged(system, settings, residual, previous):
+            return _accepted(system, settings, u, factorised=iteration > 0), iteration
         if iteration == settings.iterations:
             break
-        try:
-            system.factorise(u)
-        except SolveError as error:
-            raise _Diverged(error.reason) from None
+        _factorise(system, u)
         step = system.solve(-residual.vector)
-        length = system.norm(step)
+        before, length = length, system.norm(step)
         if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest):
             raise _Diverged("the Newton steps grow" + _instability(system))
         longest = max(longest, length)
+        previous = residual
         u, residual = _admissible_step(system, settings, u, step)
+        if settings.kind != "newton" and length < NEAR * before < np.inf:
+            u, reached = _mix(system, settings, u, residual, system.solve, POLISH, history)
+            if reached:
+                return _accepted(system, settings, u, factorised=True), iteration + 1
+            previous, residual = residual, system.residual(u)
     message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
     raise _Diverged(message + _instability(system))
 
 
+def _factorise(system: System, u: FloatArray) -> None:
+    try:
+        system.factorise(u)
+    except SolveError as error:
+        raise _Diverged(error.reason) from None
+
+
+def _accepted(system: System, settings: SolverSettings, u: FloatArray, *, factorised: bool) -> FloatArray:
+    """Return an equilibrium if no cell is turned inside out and it is not known to be unstable."""
+    jacobian = system.smallest_jacobian(u)
+    if not jacobian > 0:
+        message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
+        raise _Diverged(message)
+    if factorised and not settings.accept_unstable and system.negative_pivots() > 0:
+        _factorise(system, u)  # the factor at hand is that of a state nearby
+        negative = system.negative_pivots()
+        if negative > 0:
+            message = f"the equilibrium is unstable (its stiffness has {_counted(negative)}): the body buckles"
+            raise _Diverged(message)
+    return u
+
+
 def _admissible_step(
-    system: System, settings: NewtonSettings, u: FloatArray, step: FloatArray
+    system: System, settings: SolverSettings, u: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, Residual]:
     """Go the whole step, or halve it until the energy is defined and J > 0 at every quadrature point."""
     fraction = 1.0
@@ -241,5 +372,8 @@ def _instability(system: System) -> str:
     negative = system.negative_pivots()
     if negative <= 0:
         return ""
-    plural = "" if negative == 1 else "s"
-    return f"; the last stiffness has {negative} negative eigenvalue{plural} (unstable, or far from equilibrium)"
+    return f"; the last stiffness has {_counted(negative)} (unstable, or far from equilibrium)"
+
+
+def _counted(negative: int) -> str:
+    return f"{negative} negative eigenvalue{'' if negative == 1 else 's'}"

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials import MATERIALS, constants
-from forward.newton import NewtonSettings
+from forward.newton import SolverSettings
 
 BLOCKS = {
     "body": {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (2, 2, 2)},
@@ -148,4 +148,4 @@ def test_the_constants_of_a_material_are_the_arguments_of_its_energy(kind):
 
 
 def test_settings_of_the_solver_have_defaults():
-    assert Hyperelastic.model_validate(BLOCKS).solver == NewtonSettings()
+    assert Hyperelastic.model_validate(BLOCKS).solver == SolverSettings()

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import WORK, FloatArray, ForwardModel, Solution, SolveError
+from forward.model import WORK, FloatArray, ForwardModel, Reference, Solution, SolveError
 
 BLOCKS = 128  # an evaluation is cut into at most this many blocks
 
@@ -76,7 +76,7 @@ class FieldSum(Protocol):
 
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state: start of the solver at every point.
+    """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
 
     Attributes
     ----------
@@ -92,10 +92,10 @@ class Prediction:
     state: FloatArray
     slopes: FloatArray
 
-    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
-        """Return the function parameters (d,) → predicted state (U_local,) for one group's model."""
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
-        return lambda parameters: state + (parameters - self.point) @ slopes
+        return lambda parameters: state + (parameters - self.point) @ slopes, Reference(self.point, state)
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,10 @@ class BlockSolver:
         self._model = model
         self._tangents = request.tangents
         self._row = request.fields.on(model) if request.fields is not None else None
-        self._start = request.start.on(model) if request.start is not None else None
+        self._predict: Callable[[FloatArray], FloatArray] | None = None
+        self._reference: Reference | None = None
+        if request.start is not None:
+            self._predict, self._reference = request.start.on(model)
 
     def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
         """Solve at points (n, d); the fields are complete on the group's first rank only."""
@@ -190,10 +193,11 @@ class BlockSolver:
         for i, point in enumerate(points):
             begin = time.process_time()
             try:
-                solution = model.solve(point, self._start(point) if self._start is not None else None)
+                start = self._predict(point) if self._predict is not None else None
+                solution = model.solve(point, start, self._reference)
                 row = self._row(solution, point) if self._row is not None else None
                 if tangents is not None:
-                    tangents[i] = np.transpose([solution.tangent(e) for e in np.eye(d)])
+                    tangents[i] = solution.tangent(np.eye(d)).T
             except SolveError as error:
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
                 work[i] = error.work.as_array()

@@ -54,8 +54,10 @@ class _StateAndSlopes:
     derivatives: bool
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        directions = np.eye(len(model.parameters)) if self.derivatives else ()
-        return lambda solution, _: np.array([solution.state, *(solution.state_tangent(e) for e in directions)])
+        if not self.derivatives:
+            return lambda solution, _: solution.state[None, :]
+        directions = np.eye(len(model.parameters))
+        return lambda solution, _: np.vstack([solution.state, solution.state_tangent(directions)])
 
 
 def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
