@@ -429,7 +429,8 @@ class HyperelasticModel:
         self._factorised: object = None  # the solution that owns the factor at hand
 
     @cached_property
-    def _reference(self) -> ReferenceFactor:
+    def reference(self) -> ReferenceFactor:
+        """The factor of the last reference that was given."""
         return ReferenceFactor(self.body)
 
     def solve(
@@ -460,11 +461,11 @@ class HyperelasticModel:
         if self.spec.solver.kind == "newton" or start is None:
             reference = None
         if reference is not None:
-            self._reference.prepare(reference)
+            self.reference.prepare(reference)
         body.work = Work()
         body.set_parameters(parameters)
-        near = self._reference.near if reference is not None else None
-        u = solve(body, self.spec.solver, np.zeros(3 * body.nodes_owned), start, near)
+        way = None if reference is None else _Way(self, reference, parameters)
+        u = solve(body, self.spec.solver, np.zeros(3 * body.nodes_owned), start, way)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         corrected = body.work.factorisations == 0
         return FiniteElementSolution(self, parameters, u, body.work, reference if corrected else None)
@@ -499,9 +500,23 @@ class HyperelasticModel:
     def near_reference(self, solution: FiniteElementSolution, reference: Reference, *, transpose: bool) -> Inverse:
         """Return the approximate inverse of the stiffness at a solution that its reference gives."""
         self._visited = None
-        self._reference.prepare(reference)
+        self.reference.prepare(reference)
         self.visit(solution)
-        return self._reference.near(solution.state, transpose=transpose)
+        return self.reference.near(solution.state, transpose=transpose)
+
+
+class _Way:
+    """The straight line in parameters from a reference."""
+
+    def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray) -> None:
+        self._body = model.body
+        self._from, self._to = reference.parameters, parameters
+        self.state = reference.state
+        self.inverse = model.reference.near
+
+    def at(self, fraction: float) -> None:
+        self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
+        self._body.at_load(1.0)
 
 
 class FiniteElementSolution:

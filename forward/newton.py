@@ -13,7 +13,6 @@ iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -60,7 +59,9 @@ class SolverSettings(Settings):
 QUICK = 5  # a load step that needs no more iterations than this lets the next one be twice as long
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
 WINDOW = 8  # differences that Anderson mixing keeps
-PATIENCE = 10  # corrections without a smaller residual before they are given up
+PATIENCE = 6  # corrections without a smaller residual before they are given up
+ROUGH = 1e-2  # relative residual of a state that only serves to predict the next
+SHORTEST = 1 / 8  # part of the way from the reference that is not divided any more
 NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
@@ -138,12 +139,22 @@ class System(Protocol):
         """Number of negative eigenvalues of the factorised stiffness (0 for a stable state); −1 if unknown."""
 
 
-class _Diverged(Exception):  # noqa: N818 - control flow inside this file
-    """An attempt at one load failed, for the reason given; `best` is where it came nearest, if that is of use."""
+class Way(Protocol):
+    """The way in parameters from a reference state, whose factor is at hand, to the values that are asked for."""
 
-    def __init__(self, reason: str, best: FloatArray | None = None) -> None:
-        super().__init__(reason)
-        self.best = best
+    @property
+    def state(self) -> FloatArray:
+        """The state (U_local,) of the reference."""
+
+    def at(self, fraction: float) -> None:
+        """Give the system the parameters after a part of the way."""
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        """Return an approximate inverse of the stiffness at u."""
+
+
+class _Diverged(Exception):  # noqa: N818 - control flow inside this file
+    """An attempt at one load failed, for the reason given."""
 
 
 def solve(
@@ -151,7 +162,7 @@ def solve(
     settings: SolverSettings,
     zero: FloatArray,
     start: FloatArray | None = None,
-    reference: Callable[[FloatArray], Inverse] | None = None,
+    way: Way | None = None,
 ) -> FloatArray:
     """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
 
@@ -165,8 +176,8 @@ def solve(
         The undeformed state (U_local,).
     start
         A prediction of the state at full load (U_local,).
-    reference
-        Gives, for a predicted state, an approximate inverse of the stiffness there.
+    way
+        Where the prediction comes from.
 
     Returns
     -------
@@ -180,12 +191,12 @@ def solve(
     """
     history: list[str] = []
     guesses = [zero] if start is None or settings.kind == "newton" else [start, zero]
-    if reference is not None and len(guesses) == 2:
+    if way is not None and len(guesses) == 2:
+        system.at_load(1.0)
         try:
-            return _predict_correct(system, settings, guesses[0], reference, history)
-        except _Diverged as stop:
-            if stop.best is not None:
-                guesses[0] = stop.best
+            return _predict_correct(system, settings, guesses[0], way, history)
+        except _Diverged:
+            pass
     for guess in guesses:
         try:
             return _newton(system, settings, guess, history, 1.0)[0]
@@ -195,31 +206,54 @@ def solve(
 
 
 def _predict_correct(
-    system: System,
-    settings: SolverSettings,
-    start: FloatArray,
-    reference: Callable[[FloatArray], Inverse],
-    history: list[str],
+    system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]
 ) -> FloatArray:
-    """Correct a prediction with a reference factor, or raise `_Diverged`."""
-    system.at_load(1.0)
-    u = system.on_target(start)
-    residual = system.residual(u)
-    if not np.isfinite(residual.size):
-        message = "the predicted state has no finite residual"
-        history.append(f"prediction: {message}")
-        raise _Diverged(message)
-    best, reached = _mix(system, settings, u, residual, reference(u), settings.corrections, history)
-    if reached:
-        return best
-    message = "the reference is too far away"
-    history.append(f"corrections: {message}")
-    raise _Diverged(message, best)
+    """Correct a prediction with a reference factor, in steps along the way where one is too long; or raise `_Diverged`.
+
+    With s the slope of the prediction, the state after a part t of the way is ū + t s + t² q(t). The first step takes
+    q = 0; each state that is found gives a value of q, through the last two of which the next is predicted.
+    """
+    slope = start - way.state
+    known: list[tuple[float, FloatArray]] = []
+    reached, target = 0.0, 1.0
+    while True:
+        way.at(target)
+        guess = way.state + target * slope + target**2 * _line(known, target)
+        tolerance = settings.tolerance if target == 1 else ROUGH
+        history.append(f"prediction at {target:.6g} of the way from the reference")
+        u = system.on_target(guess)
+        residual = system.residual(u)
+        close = np.isfinite(residual.size)
+        if close:
+            u, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
+        if close and target == 1:
+            return u
+        if close:
+            known.append((target, ((u - way.state) / target - slope) / target))
+            reached, target = target, 1.0
+        elif target - reached > SHORTEST:
+            target = (reached + target) / 2
+        else:
+            way.at(1.0)
+            message = "the reference is too far away"
+            history.append(message)
+            raise _Diverged(message)
+
+
+def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:
+    """Value at t of the line through the last two of the points known, of the constant through one, or zero."""
+    if not known:
+        return 0.0
+    (b, q) = known[-1]
+    if len(known) == 1:
+        return q
+    (a, p) = known[-2]
+    return np.asarray(p + (t - a) / (b - a) * (q - p))
 
 
 def _mix(
     system: System,
-    settings: SolverSettings,
+    tolerance: float,
     u: FloatArray,
     residual: Residual,
     inverse: Inverse,
@@ -232,7 +266,7 @@ def _mix(
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(limit + 1):
         history.append(f"correction {iteration}: relative residual {residual.relative:.3e}")
-        if _converged(system, settings, residual, last[1] if last else None):
+        if _converged(system, tolerance, residual, last[1] if last else None):
             # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
             convex = last is None or float(system.total((u - last[0]) @ (residual.vector - last[1].vector))) >= 0
             return u, convex and system.smallest_jacobian(u) > 0
@@ -251,11 +285,11 @@ def _mix(
     return best, False
 
 
-def _converged(system: System, settings: SolverSettings, residual: Residual, previous: Residual | None) -> bool:
+def _converged(system: System, tolerance: float, residual: Residual, previous: Residual | None) -> bool:
     """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding."""
     if residual.gap != 0:
         return False
-    if residual.size <= settings.tolerance * residual.scale:
+    if residual.size <= tolerance * residual.scale:
         return True
     unloaded = residual.scale == 0
     stalled = previous is not None and previous.gap == 0 and residual.size > STALLED * previous.size
@@ -309,7 +343,7 @@ def _iterate(
         raise _Diverged(message)
     for iteration in range(settings.iterations + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
-        if _converged(system, settings, residual, previous):
+        if _converged(system, settings.tolerance, residual, previous):
             return _accepted(system, settings, u, factorised=iteration > 0), iteration
         if iteration == settings.iterations:
             break
@@ -322,7 +356,7 @@ def _iterate(
         previous = residual
         u, residual = _admissible_step(system, settings, u, step)
         if settings.kind != "newton" and length < NEAR * before < np.inf:
-            u, reached = _mix(system, settings, u, residual, system.solve, POLISH, history)
+            u, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
                 return _accepted(system, settings, u, factorised=True), iteration + 1
             previous, residual = residual, system.residual(u)
