@@ -220,7 +220,7 @@ def test_the_published_beam():
 )
 def test_nodes_are_counted_and_numbered_by_place(cell, degree):
     spec = unloaded_body("mooney-rivlin", body={"cells": (3, 2, 4), "cell": cell, "degree": degree})
-    space = fenicsx.vector_space(fenicsx.box_mesh(MPI.COMM_SELF, spec.body), degree)
+    space = fenicsx.vector_space(fenicsx.mesh_body(MPI.COMM_SELF, spec.body)[0], degree)
     layout = Layout(space, MPI.COMM_SELF)
     assert layout.coordinates.size == spec.unknowns == 3 * (3 * degree + 1) * (2 * degree + 1) * (4 * degree + 1)
     axes = [np.linspace(0, length, degree * n + 1) for length, n in zip(SIZE, (3, 2, 4), strict=True)]
@@ -240,7 +240,7 @@ def test_nodes_are_counted_and_numbered_by_place(cell, degree):
 def test_places_are_told_apart_on_fine_meshes():
     # Nodes at multiples of 1/1024 fall on the ends of intervals that divide the length by powers of ten.
     spec = unloaded_body("mooney-rivlin", body={"size": (1.0, 0.01, 0.01), "cells": (1024, 1, 1)}, outputs=OUTPUTS[:1])
-    layout = Layout(fenicsx.vector_space(fenicsx.box_mesh(MPI.COMM_SELF, spec.body), 1), MPI.COMM_SELF)
+    layout = Layout(fenicsx.vector_space(fenicsx.mesh_body(MPI.COMM_SELF, spec.body)[0], 1), MPI.COMM_SELF)
     columns = layout.coordinates.reshape(-1, 2, 2, 3)
     np.testing.assert_allclose(columns[:, 0, :, 1], 0, atol=1e-15)
     np.testing.assert_allclose(columns[:, :, 1, 2], 0.01)
@@ -250,7 +250,7 @@ def test_compiling_a_form_changes_no_other(tmp_path, monkeypatch):
     # Else forms would be compiled again in the next run.
     monkeypatch.setattr(fenicsx, "_CACHE", tmp_path)
     monkeypatch.setitem(fenicsx._JIT, "cache_dir", str(tmp_path))
-    msh = fenicsx.box_mesh(MPI.COMM_SELF, unloaded_body("mooney-rivlin").body)
+    msh = fenicsx.mesh_body(MPI.COMM_SELF, unloaded_body("mooney-rivlin").body)[0]
     u = fenicsx.function(fenicsx.vector_space(msh, 1))
     forms = [k * ufl.inner(u, u) * ufl.dx(domain=msh, metadata={"quadrature_degree": 1}) for k in (2, 2, 3)]
     before = forms[0].signature()

@@ -85,9 +85,9 @@ def settings(block: dict[str, Any], *left_out: str) -> str:
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     """Say what was solved: headings, each with its lines."""
     model = study.model
-    box = model.body
-    size, cells = (" × ".join(f"{x:g}" for x in numbers) for numbers in (box.size, box.cells))
-    yield "body", [f"{box.kind} of {size} m; {cells} cells ({box.cell}, degree {box.degree})"]
+    body = model.body
+    cells = " × ".join(f"{n}" for n in body.cells)
+    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree})"]
     yield "unknowns", [f"{model.unknowns:,} displacements"]
     kind = str(model.material.model_dump()["kind"])
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
