@@ -12,7 +12,8 @@ from forward.geometry import Block, Box
 from forward.hyperelastic import Hyperelastic
 from forward.newton import solve
 from tests.bodies import MATERIALS, OUTPUTS, loaded_body
-from tests.launch import run_script
+from tests.launch import ROOT, run_script
+from workflows.config import load
 
 CUBE = np.array([(x, y, z) for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 SHEAR = np.array([[1.0, 0.2, 0.1], [-0.3, 0.8, 0.2], [0.1, 0.0, 0.9]])
@@ -180,3 +181,21 @@ def test_ranks_that_share_a_block_agree_with_one(tmp_path):
     np.testing.assert_allclose(two["coordinates"], one["coordinates"], rtol=0, atol=1e-14)
     np.testing.assert_allclose(two["outputs"], one["outputs"], rtol=1e-9)
     np.testing.assert_allclose(two["state"], one["state"], rtol=0, atol=1e-9 * np.abs(one["state"]).max())
+
+
+def rise_of_cooks_membrane(cells):
+    spec = load(ROOT / "configs" / "cook.toml", [f"model.body.cells=[{cells}, {cells}, 1]"]).model
+    return spec.build(MPI.COMM_SELF, ()).solve(np.empty(0)).outputs[0]
+
+
+@pytest.mark.fem
+def test_cooks_membrane_rises_less_than_published_on_a_coarse_mesh():
+    assert 6.4e-3 < rise_of_cooks_membrane(8) < 6.9e-3
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+def test_cooks_membrane_converges_to_the_published_rise():
+    coarse, middle, fine = (rise_of_cooks_membrane(cells) for cells in (4, 8, 16))
+    limit = fine + (fine - middle) ** 2 / (2 * middle - coarse - fine)
+    assert limit == pytest.approx(6.9e-3, rel=1e-2)

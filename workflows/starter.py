@@ -11,6 +11,7 @@ _MODEL = """\
 [model]
 kind = "hyperelastic"
 # A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+# kind = "block" has corners = [...] instead: the images of the corners of a cube, x goes first, then y, then z.
 # cell = "hexahedron" | "tetrahedron", degree = 1 | 2
 body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
 # In Pa, but for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1), "yeoh" (C10, C20, C30, D1),
