@@ -22,7 +22,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from forward.geometry import AXES, Box
+from forward.geometry import AXES, Body
 from forward.model import FloatArray, SolveError
 
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
@@ -88,22 +88,24 @@ def compile_expression(expression: Any, points: FloatArray, comm: Any) -> Any:
 # --- meshes and spaces -----------------------------------------------------------------------------------------------
 
 
-def box_mesh(comm: Any, box: Box) -> Any:
-    """Mesh a box; collective over `comm`."""
-    msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(box.size)], list(box.cells), cell_type=_CELLS[box.cell])
+def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
+    """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
+    msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     # FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name
     # from the start, a form that was compiled in one run is found by the next.
     domain = msh.ufl_domain()
     plain = domain.ufl_coordinate_element()
     named = ufl.FiniteElement(plain.family(), plain.cell(), plain.degree(), variant="equispaced")
     domain._ufl_coordinate_element = ufl.VectorElement(named)
-    return msh
+    # Facets are found while boundaries are planes across an axis.
+    facets = _box_facets(msh, body.meshed)
+    msh.geometry.x[:] = body.place(msh.geometry.x)
+    return msh, facets
 
 
-def box_facets(msh: Any, box: Box) -> dict[str, NDArray[np.int32]]:
-    """Return this rank's facets on each named boundary of a box."""
+def _box_facets(msh: Any, size: tuple[float, float, float]) -> dict[str, NDArray[np.int32]]:
     facets = {}
-    for axis, (_, length) in enumerate(zip(AXES, box.size, strict=True)):
+    for axis, (_, length) in enumerate(zip(AXES, size, strict=True)):
         for end, position in (("min", 0.0), ("max", length)):
 
             def on_boundary(x: FloatArray, axis: int = axis, position: float = position, length: float = length) -> Any:

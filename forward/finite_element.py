@@ -44,11 +44,10 @@ class Discretisation:
         self.comm = comm
         self.parameters = parameters
         self.work = Work()
-        self.mesh = fenicsx.box_mesh(comm, spec.body)
+        self.mesh, self.facets = fenicsx.mesh_body(comm, spec.body)
         self.space = fenicsx.vector_space(self.mesh, spec.body.degree)
         self.layout = Layout(self.space, comm)
         self.nodes_owned = fenicsx.owned_nodes(self.space)
-        self.facets = fenicsx.box_facets(self.mesh, spec.body)
         self.dx = ufl.dx(domain=self.mesh, metadata={"quadrature_degree": spec.body.quadrature})
         self._ds, self._tags = fenicsx.facet_measure(self.mesh, self.facets, spec.body.quadrature)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from abc import abstractmethod
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from annotated_types import Gt
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from forward.model import FloatArray
 from forward.settings import Settings
 
 Axis = Literal["x", "y", "z"]
@@ -16,13 +19,11 @@ Count = Annotated[int, Gt(0)]
 Vector = tuple[float, float, float]
 
 
-class Box(Settings):
-    """A box [0, size] with a structured mesh; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+class _SixSided(Settings):
+    """The image of a box that has a structured mesh: x-min, x-max, y-min … are the images of the faces of that box.
 
     Parameters
     ----------
-    size
-        Edge lengths in m.
     cells
         Number of cells along each edge (a cell is six tetrahedra where `cell` is "tetrahedron").
     cell
@@ -34,12 +35,34 @@ class Box(Settings):
         (quadratic tetrahedra, linear hexahedra) or 4 (quadratic hexahedra) leaves deformations without energy.
     """
 
-    kind: Literal["box"] = "box"
-    size: tuple[Length, Length, Length]
+    kind: str
     cells: tuple[Count, Count, Count]
     cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
     degree: Literal[1, 2] = 2
     quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
+
+    @property
+    @abstractmethod
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the box that is meshed."""
+
+    @property
+    @abstractmethod
+    def vertices(self) -> tuple[Vector, ...]:
+        """The images (m) of the corners of that box: x goes first, then y, then z."""
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """The shape in words."""
+
+    @abstractmethod
+    def place(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the box that is meshed into the body (m)."""
+
+    @abstractmethod
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
 
     @property
     def boundaries(self) -> tuple[str, ...]:
@@ -59,24 +82,18 @@ class Box(Settings):
         return self.quadrature_degree or default[self.cell, self.degree]
 
     @property
-    def volume(self) -> float:
-        """Volume in m³."""
-        a, b, c = self.size
-        return a * b * c
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest coordinate (m) along each axis."""
+        return tuple((min(along), max(along)) for along in zip(*self.vertices, strict=True))
 
-    def corners(self, boundary: str) -> list[Vector]:
-        """Corners of a boundary, in units of the edge lengths."""
+    def corners_of(self, boundary: str) -> list[Vector]:
+        """The four corners (m) of a boundary."""
         axis, end = boundary.split("-")
-        place = {"min": 0.0, "max": 1.0}[end]
-        corners = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)]
-        return [corner for corner in corners if corner["xyz".index(axis)] == place]
-
-    def contains(self, point: Vector) -> bool:
-        """Whether a point (m) lies in the undeformed body."""
-        return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
+        bit = 1 << "xyz".index(axis)
+        return [corner for k, corner in enumerate(self.vertices) if bool(k & bit) == (end == "max")]
 
     @model_validator(mode="after")
-    def _check(self) -> Box:
+    def _check_mesh(self) -> _SixSided:
         if self.nodes > 20_000_000:
             message = f"cells = {list(self.cells)} gives {3 * self.nodes:,} unknowns, expected at most 60 million"
             raise ValueError(message)
@@ -89,3 +106,127 @@ class Box(Settings):
             )
             raise ValueError(message)
         return self
+
+
+class Box(_SixSided):
+    """A box [0, size]; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+
+    Parameters
+    ----------
+    size
+        Edge lengths in m.
+    cells, cell, degree, quadrature_degree
+        The mesh, as of every body with six sides.
+    """
+
+    kind: Literal["box"] = "box"
+    size: tuple[Length, Length, Length]
+
+    @property
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the box that is meshed."""
+        return self.size
+
+    @property
+    def vertices(self) -> tuple[Vector, ...]:
+        """The corners (m): x goes first, then y, then z."""
+        a, b, c = self.size
+        return tuple((x, y, z) for z in (0.0, c) for y in (0.0, b) for x in (0.0, a))
+
+    @property
+    def description(self) -> str:
+        """The shape in words."""
+        return f"box of {' × '.join(f'{x:g}' for x in self.size)} m"
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Leave points (n, 3) where they are."""
+        return points
+
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
+        return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
+
+
+class Block(_SixSided):
+    """A block with eight given corners: the trilinear image of a cube.
+
+    Its boundaries x-min, x-max, y-min, y-max, z-min and z-max are the images of the faces of the cube, whatever their
+    direction in space. Linear tetrahedra cut faces that are not plane.
+
+    Parameters
+    ----------
+    corners
+        The images (m) of the corners of the cube, in the order (0,0,0), (1,0,0), (0,1,0), (1,1,0), (0,0,1), (1,0,1),
+        (0,1,1), (1,1,1): x goes first, then y, then z.
+    cells, cell, degree, quadrature_degree
+        The mesh, as of every body with six sides.
+    """
+
+    kind: Literal["block"] = "block"
+    corners: tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector, Vector]
+
+    @property
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the cube."""
+        return 1.0, 1.0, 1.0
+
+    @property
+    def vertices(self) -> tuple[Vector, ...]:
+        """The corners (m): x goes first, then y, then z."""
+        return self.corners
+
+    @property
+    def description(self) -> str:
+        """The shape in words."""
+        return f"block with the corners {', '.join('(' + ', '.join(f'{x:g}' for x in c) + ')' for c in self.corners)} m"
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the cube into the body (m)."""
+        return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
+
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
+        steps = np.linspace(0, 1, 5)
+        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        gaps = np.asarray(point) - self.place(guesses)
+        # Newton's method from the nearest guess, kept near the cube: the map is not invertible everywhere outside.
+        x = guesses[[np.linalg.norm(gaps, axis=1).argmin()]]
+        for _ in range(30):
+            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.place(x)[0], rcond=None)[0]
+            x = np.clip(x + step, -0.1, 1.1)
+        gap = np.abs(np.asarray(point) - self.place(x)[0]).max()
+        extent = max(high - low for low, high in self.bounds)
+        return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
+
+    def _trilinear(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
+        """Sum the corners with weights (n, 2) of the two ends along each axis."""
+        corners = np.reshape(self.corners, (2, 2, 2, 3))
+        return np.asarray(np.einsum("ni,nj,nk,kjia->na", x, y, z, corners))
+
+    def _slopes(self, points: FloatArray) -> FloatArray:
+        """Derivative (n, 3, 3) of the map: the last axis is that of the cube."""
+        ends = [np.stack([1 - x, x], axis=-1) for x in points.T]
+        slope = np.broadcast_to([-1.0, 1.0], (len(points), 2))
+        columns = [self._trilinear(*(slope if a == axis else ends[a] for a in range(3))) for axis in range(3)]
+        return np.stack(columns, axis=-1)
+
+    @model_validator(mode="after")
+    def _check_corners(self) -> Block:
+        steps = (0.0, 0.5, 1.0)
+        slopes = self._slopes(np.array([(x, y, z) for z in steps for y in steps for x in steps]))
+        # Volume relative to that of a right-angled cell with the same edges.
+        edges = np.linalg.norm(slopes, axis=1).prod(axis=1)
+        if not (np.linalg.det(slopes) > 1e-9 * edges).all():
+            message = (
+                "the corners enclose no volume or turn the block inside out, expected the images of (0,0,0), (1,0,0), "
+                "(0,1,0), (1,1,0), (0,0,1), (1,0,1), (0,1,1), (1,1,1) of a cube, in this order"
+            )
+            raise ValueError(message)
+        return self
+
+
+def _box_by_default(value: Any) -> Any:
+    return {"kind": "box"} | value if isinstance(value, dict) else value
+
+
+Body = Annotated[Box | Block, Field(discriminator="kind"), BeforeValidator(_box_by_default)]

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.geometry import AXES, Box
+from forward.geometry import AXES, Body
 from forward.loads import LOAD_SIZES, Displacement, Load
 from forward.materials import MATERIALS, constants
 from forward.newton import SolverSettings
@@ -92,7 +92,7 @@ class Hyperelastic(Settings):
     """
 
     kind: Literal["hyperelastic"] = "hyperelastic"
-    body: Box
+    body: Body
     material: Material
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
@@ -196,7 +196,8 @@ class Hyperelastic(Settings):
                     output.on,
                 )
             if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
-                yield ("outputs", i, "at"), f"outside the body [0, {list(self.body.size)}]", list(output.at)
+                bounds = " × ".join(f"[{low:g}, {high:g}]" for low, high in self.body.bounds)
+                yield ("outputs", i, "at"), f"outside the body, which lies in {bounds} m", list(output.at)
 
     def _contradictions(self) -> Iterator[Mistake]:
         """Boundaries that are both clamped and moved, and components that are prescribed twice."""
@@ -213,10 +214,11 @@ class Hyperelastic(Settings):
         """Whether none of the 6 small rigid motions t + r × x leaves all that is clamped or prescribed in place."""
         held = [(on, axis) for on in self.clamp for axis in AXES]
         held += [(item.on, axis) for item in self.displacements for axis in item.components]
+        extent = np.ptp(self.body.vertices, axis=0).max()
         rows = [
-            np.concatenate([unit, np.cross(corner, unit)])  # the component of t + r × x: t·e + r·(x × e)
+            np.concatenate([unit, np.cross(corner, unit) / extent])  # the component of t + r × x: t·e + r·(x × e)
             for on, axis in held
             for unit in [np.eye(3)[AXES.index(axis)]]
-            for corner in self.body.corners(on)
+            for corner in np.subtract(self.body.corners_of(on), np.mean(self.body.vertices, axis=0))
         ]
         return int(np.linalg.matrix_rank(rows)) == 6

@@ -3,19 +3,27 @@
 A function takes the operators `ops` (``ln``, ``exp``, ``sqrt``), the invariants I1, I2 of C = FᵀF and J = det F, and
 its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The names of the
 keyword-only arguments *are* the names of the parameters in studies and results, and their annotations are the
-admissible values. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
+admissible values and their units. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
+
+An energy that splits into an isochoric and a volumetric part has a constant called D1, and its volumetric part is
+exactly D1(J−1)²: with D1 = 0 it is the isochoric part W(Ī1, Ī2), of Ī1 = J^(−2/3) I1 and Ī2 = J^(−4/3) I2. No other
+energy may call a constant D1.
 """
 
 from __future__ import annotations
 
+import cmath
 import inspect
-from collections.abc import Callable
-from typing import Annotated, Any, get_type_hints
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Annotated, Any, get_args, get_type_hints
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Unit
 
-NonNegative = Annotated[Any, Ge(0)]
-Positive = Annotated[Any, Gt(0)]
+Number = Annotated[Any, Unit("Pa")]
+NonNegative = Annotated[Any, Ge(0), Unit("Pa")]
+Positive = Annotated[Any, Gt(0), Unit("Pa")]
+PositiveRatio = Annotated[Any, Gt(0), Unit("1")]
 
 
 def mooney_rivlin(ops: Any, I1: Any, I2: Any, J: Any, *, C1: NonNegative, C2: NonNegative, D1: Positive) -> Any:
@@ -44,17 +52,127 @@ def neo_hookean_coupled(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, lmb
     return mu / 2 * (I1 - 3) - mu * ops.ln(J) + lmbda / 2 * ops.ln(J) ** 2
 
 
+def yeoh(ops: Any, I1: Any, I2: Any, J: Any, *, C10: Positive, C20: Number, C30: NonNegative, D1: Positive) -> Any:
+    """Yeoh: W = C10(Ī1−3) + C20(Ī1−3)² + C30(Ī1−3)³ + D1(J−1)².
+
+    C10, C20, C30, D1 in Pa; C20 is negative for materials that soften before they stiffen. Small strain: μ = 2 C10,
+    κ = 2 D1.
+    Source: O. H. Yeoh, Rubber Chem. Technol. 66 (1993) 754–771.
+    """
+    shear = J ** (-2 / 3) * I1 - 3
+    return C10 * shear + C20 * shear**2 + C30 * shear**3 + D1 * (J - 1) ** 2
+
+
+def gent(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, Jm: PositiveRatio, D1: Positive) -> Any:
+    """Gent: W = −(μ Jm/2) ln(1 − (Ī1−3)/Jm) + D1(J−1)².
+
+    mu, D1 in Pa; Jm is what Ī1−3 stays below: there the chains are stretched out, and beyond there is no energy (finite
+    elements find NaN). Small strain: μ = mu, κ = 2 D1.
+    Source: A. N. Gent, Rubber Chem. Technol. 69 (1996) 59–61.
+    """
+    # Half the logarithm of x is that of √x, whose derivatives too are no numbers where x < 0; those of ln x are finite.
+    left = ops.sqrt(1 - (J ** (-2 / 3) * I1 - 3) / Jm)
+    return -mu * Jm * ops.ln(left) + D1 * (J - 1) ** 2
+
+
+def demiray(ops: Any, I1: Any, I2: Any, J: Any, *, a: Positive, b: PositiveRatio, D1: Positive) -> Any:
+    """Demiray (isotropic Fung): W = a/(2b) (exp(b(Ī1−3)) − 1) + D1(J−1)².
+
+    a, D1 in Pa; b is dimensionless. Small strain: μ = a, κ = 2 D1.
+    Source: H. Demiray, J. Biomech. 5 (1972) 309–311.
+    """
+    return a / (2 * b) * (ops.exp(b * (J ** (-2 / 3) * I1 - 3)) - 1) + D1 * (J - 1) ** 2
+
+
+def saint_venant_kirchhoff(ops: Any, I1: Any, I2: Any, J: Any, *, lmbda: NonNegative, mu: Positive) -> Any:
+    """Saint Venant–Kirchhoff: W = λ/2 (tr E)² + μ E:E with E = (C − I)/2.
+
+    lmbda, mu: the Lamé constants in Pa. tr E = (I1−3)/2 and E:E = (tr C² − 2 tr C + 3)/4 with tr C² = I1² − 2 I2.
+    For large rotations with small strains: under compression it softens until it collapses without resistance.
+    Source: G. A. Holzapfel, Nonlinear Solid Mechanics (2000), section 6.5.
+    """
+    return lmbda / 8 * (I1 - 3) ** 2 + mu / 4 * (I1**2 - 2 * I2 - 2 * I1 + 3)
+
+
+def blatz_ko(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive) -> Any:
+    """Blatz–Ko foam: W = μ/2 (I2/J² + 2J − 5).
+
+    mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4.
+    Source: P. J. Blatz, W. L. Ko, Trans. Soc. Rheol. 6 (1962) 223–251.
+    """
+    return mu / 2 * (I2 / J**2 + 2 * J - 5)
+
+
 Energy = Callable[..., Any]
 
 MATERIALS: dict[str, Energy] = {
     "mooney-rivlin": mooney_rivlin,
     "neo-hookean": neo_hookean,
     "neo-hookean-coupled": neo_hookean_coupled,
+    "yeoh": yeoh,
+    "gent": gent,
+    "demiray": demiray,
+    "saint-venant-kirchhoff": saint_venant_kirchhoff,
+    "blatz-ko": blatz_ko,
 }
 
 
+_COMPLEX = SimpleNamespace(ln=cmath.log, exp=cmath.exp, sqrt=cmath.sqrt)
+
+
 def constants(energy: Energy) -> dict[str, Any]:
-    """Return the names of the constants of an energy, each with its annotation (the admissible values)."""
+    """Return the names of the constants of an energy, each with its annotation (admissible values and unit)."""
     hints = get_type_hints(energy, include_extras=True)
     keyword_only = inspect.Parameter.KEYWORD_ONLY
     return {name: hints[name] for name, p in inspect.signature(energy).parameters.items() if p.kind is keyword_only}
+
+
+def units(energy: Energy) -> dict[str, str]:
+    """Return the names of the constants of an energy, each with its SI unit ("1" for ratios)."""
+    return {
+        name: item.unit for name, hint in constants(energy).items() for item in get_args(hint) if isinstance(item, Unit)
+    }
+
+
+def splits(energy: str | Energy) -> bool:
+    """Whether an energy, or that of a kind of material, is an isochoric part and D1(J−1)²."""
+    return "D1" in constants(_energy_of(energy))
+
+
+def small_strain_moduli(energy: str | Energy, values: Mapping[str, float]) -> tuple[float, float]:
+    """Shear and bulk modulus of the undeformed body.
+
+    A simple shear γ has I1 = I2 = 3 + γ², J = 1 and W = μγ²/2 + …, so that μ = 2 dW/ds along I1 = I2 = 3 + s, J = 1.
+    A dilation F = λI has I1 = 3λ², I2 = 3λ⁴, J = λ³ and W = κ(3(λ−1))²/2 + …, so that κ = W''(λ)/9 at λ = 1. First
+    derivatives are complex steps, which are exact to rounding; the second one adds a central difference of order 4.
+
+    Parameters
+    ----------
+    energy
+        An energy, or a kind of material.
+    values
+        Its constants.
+
+    Returns
+    -------
+    tuple of float
+        μ and κ in Pa, to ten digits.
+    """
+    W = _energy_of(energy)
+    tiny = 1e-30
+
+    def along_dilation(stretch: float) -> float:
+        x = complex(stretch, tiny)
+        return float(complex(W(_COMPLEX, 3 * x**2, 3 * x**4, x**3, **values)).imag / tiny)
+
+    s = complex(3, tiny)
+    h = 1e-3
+    shear = complex(W(_COMPLEX, s, s, 1.0, **values)).imag / tiny
+    second = (
+        8 * (along_dilation(1 + h) - along_dilation(1 - h)) - along_dilation(1 + 2 * h) + along_dilation(1 - 2 * h)
+    ) / (12 * h)
+    return 2 * shear, second / 9
+
+
+def _energy_of(energy: str | Energy) -> Energy:
+    return MATERIALS[energy] if isinstance(energy, str) else energy

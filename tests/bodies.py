@@ -6,12 +6,21 @@ MATERIALS = {
     "mooney-rivlin": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 2e4, "D1": 2e5},
     "neo-hookean": {"kind": "neo-hookean", "C1": 1e4, "D1": 3e5},
     "neo-hookean-coupled": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 2e5},
+    "demiray": {"kind": "demiray", "a": 4e4, "b": 1.5, "D1": 2e5},
+}
+# Of these, what differs from the ones above is the energy: it is compared with closed forms.
+MORE_MATERIALS = {
+    "yeoh": {"kind": "yeoh", "C10": 2e4, "C20": -2e3, "C30": 1e3, "D1": 2e5},
+    "gent": {"kind": "gent", "mu": 4e4, "Jm": 3.0, "D1": 2e5},
+    "saint-venant-kirchhoff": {"kind": "saint-venant-kirchhoff", "lmbda": 1e5, "mu": 4e4},
+    "blatz-ko": {"kind": "blatz-ko", "mu": 5e4},
 }
 CELLS = {
     "mooney-rivlin": ("hexahedron", 1),
     "neo-hookean": ("tetrahedron", 2),
     "neo-hookean-coupled": ("hexahedron", 1),
-}
+    "demiray": ("tetrahedron", 1),
+} | dict.fromkeys(MORE_MATERIALS, ("tetrahedron", 1))
 OUTPUTS = (
     {"kind": "max-displacement", "name": "largest"},
     {"kind": "max-displacement", "name": "largest-z", "component": "z"},
@@ -31,7 +40,7 @@ def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **change
     body = {"size": (1.0, 0.7, 0.8), "cells": (2, 1, 1), "cell": cell, "degree": degree} | changes.pop("body", {})
     blocks = {
         "body": body,
-        "material": MATERIALS[material],
+        "material": (MATERIALS | MORE_MATERIALS)[material],
         "clamp": ("x-min",),
         "displacements": ({"on": "y-max", "y": 0.05},),
         "loads": (

@@ -15,6 +15,13 @@ BLOCKS = {
     "loads": ({"kind": "gravity", "density": 1.0},),
     "outputs": ({"kind": "strain-energy", "name": "energy"},),
 }
+BLOCK = {
+    "kind": "block",
+    "corners": tuple((x * (1 + y), y, z) for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)),
+    "cells": (1, 1, 1),
+}
+MIRRORED = tuple((-x, y, z) for x, y, z in BLOCK["corners"])
+FLAT = tuple((x, y, x + y) for x, y, z in BLOCK["corners"])
 TRACTION = {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 1.0}
 MOVED = {"on": "x-max", "x": 0.1}
 
@@ -71,10 +78,16 @@ def test_the_specification_without_mistakes_is_accepted():
         ({"material": {"kind": "neo-hookean", "C1": 0.0, "D1": 1.0}}, "material.neo-hookean.C1", "greater than 0"),
         ({"material": {"kind": "neo-hookean", "C1": np.nan, "D1": 1.0}}, "material.neo-hookean.C1", "finite"),
         ({"material": {"kind": "neo-hookean", "D1": 1.0}}, "material.neo-hookean.C1", "required"),
-        ({"body": BLOCKS["body"] | {"cells": (0, 2, 2)}}, "body.cells.0", "greater than 0"),
-        ({"body": BLOCKS["body"] | {"cells": (2000, 2000, 2000)}}, "body", "at most 60 million"),
-        ({"body": BLOCKS["body"] | {"degree": 3}}, "body.degree", "1 or 2"),
-        ({"body": BLOCKS["body"] | {"quadrature_degree": 3}}, "body", "without energy, expected at least 4"),
+        ({"body": BLOCKS["body"] | {"cells": (0, 2, 2)}}, "body.box.cells.0", "greater than 0"),
+        ({"body": BLOCKS["body"] | {"cells": (2000, 2000, 2000)}}, "body.box", "at most 60 million"),
+        ({"body": BLOCKS["body"] | {"degree": 3}}, "body.box.degree", "1 or 2"),
+        ({"body": BLOCKS["body"] | {"quadrature_degree": 3}}, "body.box", "without energy, expected at least 4"),
+        ({"body": {"kind": "bock"}}, "body", "'box', 'block'"),
+        ({"body": BLOCK | {"corners": BLOCK["corners"][:7]}}, "body.block.corners.7", "required"),
+        ({"body": BLOCK | {"corners": MIRRORED}}, "body.block", "inside out"),
+        ({"body": BLOCK | {"corners": FLAT}}, "body.block", "no volume"),
+        ({"body": BLOCK | {"cells": (2000, 2000, 2000)}}, "body.block", "at most 60 million"),
+        ({"body": BLOCK, "clamp": ("left",)}, "clamp.0", "unknown boundary"),
         ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
         ({"lodas": ()}, "lodas", "did you mean 'loads'"),
     ],

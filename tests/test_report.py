@@ -336,3 +336,20 @@ def test_report_imports_nothing_that_draws():
     code = f"import sys, workflows.report; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"
+
+
+@pytest.mark.parametrize(
+    ("path", "unit", "of_a_length", "number"),
+    [
+        ("material.D1", "Pa", "m/Pa", "2 Pa"),
+        ("material.Jm", "1", "m", "2"),
+        ("material.b", "1", "m", "2"),
+        ("loads.gravity.density", "kg/m³", "m/(kg/m³)", "2 kg/m³"),
+        ("loads.traction.size", "Pa", "m/Pa", "2 Pa"),
+        ("displacements.x-max.y", "m", "m/m", "2 m"),
+    ],
+)
+def test_units_of_parameters(path, unit, of_a_length, number):
+    assert words.unit_of(path) == unit
+    assert words.per("m", unit) == of_a_length
+    assert words.with_unit(words.number(2.0), unit) == number

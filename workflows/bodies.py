@@ -119,8 +119,9 @@ def _edges(grid: Any, displacement: FloatArray | None = None) -> Any:
 
 
 def _up(dataset: xr.Dataset) -> FloatArray:
-    """Return the axis (3,) that is nearest to up: against gravity, or z where there is none."""
-    up = np.array([0.0, 0.0, 1.0])
+    """Return the axis (3,) that is nearest to up: against gravity, or else z (y where the body is a sheet across z)."""
+    extents = np.ptp(dataset["node_position"].to_numpy(), axis=0)
+    up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
     model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
     for load in model.get("loads", ()):
         if load["kind"] == "gravity":

@@ -256,10 +256,10 @@ def _kinds() -> set[str]:
     """Return the kinds of blocks, which pydantic puts into the places of errors."""
     from typing import get_args
 
-    from forward import loads, outputs
+    from forward import geometry, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (loads.Load, outputs.Output, Distribution, Method)
+    unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
 

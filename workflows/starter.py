@@ -11,9 +11,12 @@ _MODEL = """\
 [model]
 kind = "hyperelastic"
 # A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+# kind = "block" has corners = [...] instead: the images of the corners of a cube, x goes first, then y, then z.
 # cell = "hexahedron" | "tetrahedron", degree = 1 | 2
 body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
-# "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1) or "neo-hookean-coupled" (mu, lmbda), in Pa.
+# In Pa, but for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1), "yeoh" (C10, C20, C30, D1),
+# "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda), "saint-venant-kirchhoff" (lmbda, mu),
+# "blatz-ko" (mu).
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 clamp = ["x-min"]
 # Boundaries that are moved by a given amount (m), component by component:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, assert_never
 
 from forward.loads import Gravity, Load, Pressure, Traction
-from forward.materials import MATERIALS
+from forward.materials import MATERIALS, units
 from forward.outputs import Output
 from workflows.config import Study
 
@@ -55,14 +55,25 @@ def worth(ratio: float) -> str:
 
 
 def unit_of(path: str) -> str:
-    """SI unit of a number of the model, by its path."""
+    """SI unit of a number of the model, by its path; "1" for ratios."""
+    block, _, name = path.partition(".")
+    if block == "material":
+        # A name has the same unit in every material.
+        return next(of[name] for of in map(units, MATERIALS.values()) if name in of)
     if path.endswith(".density"):
         return "kg/m³"
-    return "m" if path.startswith("displacements.") else "Pa"
+    return "m" if block == "displacements" else "Pa"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Write the unit after a number, if it has one."""
+    return text if unit == "1" or text == NONE else f"{text} {unit}"
 
 
 def per(unit: str, divisor: str) -> str:
     """Unit of a derivative."""
+    if divisor == "1":
+        return unit
     return f"{unit}/({divisor})" if "/" in divisor else f"{unit}/{divisor}"
 
 
@@ -74,9 +85,9 @@ def settings(block: dict[str, Any], *left_out: str) -> str:
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     """Say what was solved: headings, each with its lines."""
     model = study.model
-    box = model.body
-    size, cells = (" × ".join(f"{x:g}" for x in numbers) for numbers in (box.size, box.cells))
-    yield "body", [f"{box.kind} of {size} m; {cells} cells ({box.cell}, degree {box.degree})"]
+    body = model.body
+    cells = " × ".join(f"{n}" for n in body.cells)
+    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree})"]
     yield "unknowns", [f"{model.unknowns:,} displacements"]
     kind = str(model.material.model_dump()["kind"])
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
@@ -116,7 +127,7 @@ def _scalar(study: Study, path: str) -> str:
     """A number of the model with its unit, or that it is random."""
     if path in study.parameters:
         return "random"
-    return f"{number(study.model.scalars[path].value, 6)} {unit_of(path)}"
+    return with_unit(number(study.model.scalars[path].value, 6), unit_of(path))
 
 
 def _value(value: Any) -> str:
