@@ -70,7 +70,10 @@ class Solution(Protocol):
 
     @property
     def state(self) -> FloatArray:
-        """This rank's part of the state (U_local,), interleaved by component; empty where there is none."""
+        """This rank's part of the state (U_local,); empty where there is none.
+
+        Displacements, interleaved by component, come first.
+        """
 
     @property
     def work(self) -> Work:
@@ -104,6 +107,13 @@ class ForwardModel(Protocol):
     @property
     def differentiable(self) -> bool:
         """Whether solutions have tangents and adjoints."""
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements, interleaved by component, with which a state (U,) in canonical order begins.
+
+        What follows (pressures) is needed to predict states, and is no displacement field; 0 where there is no state.
+        """
 
     def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> Solution:
         """Solve at `parameters` (d,), from the state `start` (U_local,) if one is given.
@@ -146,6 +156,11 @@ class FunctionModel:
     def differentiable(self) -> bool:
         """Whether a jacobian was given."""
         return self.jacobian is not None
+
+    @property
+    def displacements(self) -> int:
+        """No state, so none."""
+        return 0
 
     def solve(self, parameters: FloatArray, start: FloatArray | None = None) -> FunctionSolution:
         """Evaluate the function at `parameters` (d,); there is no state to `start` from."""

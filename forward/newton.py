@@ -26,7 +26,7 @@ class NewtonSettings(Settings):
     ----------
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
-        prescribed).
+        prescribed); in the mixed form, also of the volumes, as the force of the pressure that they lack.
     iterations
         Newton iterations allowed in one load step.
     minimum_damping
@@ -52,15 +52,19 @@ class Residual:
     Attributes
     ----------
     vector
-        This rank's part: forces on the free unknowns, distance from the target on the prescribed ones.
+        This rank's part: forces on the free displacements, distance from the target on the prescribed ones, volumes
+        on the pressures.
     size
-        Euclidean norm over the free unknowns, of all ranks (N).
+        Euclidean norm over the free displacements, of all ranks (N).
     scale
         What `size` is compared with (N).
     rounding
         What `size` cannot be expected to fall below, whatever the loads (N).
     gap
         Largest distance of a prescribed unknown from its target (m).
+    volume
+        Norm of the volumes out of balance, of all ranks, as a force (N); 0 where they are rounding, and where
+        pressures are no unknowns.
     """
 
     vector: FloatArray
@@ -68,15 +72,17 @@ class Residual:
     scale: float
     rounding: float
     gap: float
+    volume: float = 0.0
 
     @property
     def relative(self) -> float:
         """The residual relative to the loads."""
-        return self.size / self.scale if self.scale > 0 else self.size
+        largest = max(self.size, self.volume)
+        return largest / self.scale if self.scale > 0 else largest
 
     def converged(self, tolerance: float) -> bool:
         """Whether the state is an equilibrium to `tolerance`, or to rounding."""
-        return self.gap == 0 and self.size <= max(tolerance * self.scale, self.rounding)
+        return self.gap == 0 and max(self.size, self.volume) <= max(tolerance * self.scale, self.rounding)
 
 
 class System(Protocol):
@@ -106,13 +112,16 @@ class System(Protocol):
         """Solve K x = right with the factor at hand; prescribed rows are identities."""
 
     def norm(self, x: FloatArray) -> float:
-        """Euclidean norm over all ranks."""
+        """Euclidean norm over the displacements of all ranks (pressures, in another unit, follow them)."""
 
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J = det F over the quadrature points of all ranks."""
 
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the factorised stiffness (0 for a stable state); −1 if unknown."""
+        """Number of negative eigenvalues of the factorised stiffness of displacements; −1 if unknown.
+
+        A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
+        """
 
 
 class _Diverged(Exception):  # noqa: N818 - control flow inside this file

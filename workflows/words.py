@@ -77,7 +77,8 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     box = model.body
     size, cells = (" × ".join(f"{x:g}" for x in numbers) for numbers in (box.size, box.cells))
     yield "body", [f"{box.kind} of {size} m; {cells} cells ({box.cell}, degree {box.degree})"]
-    yield "unknowns", [f"{model.unknowns:,} displacements"]
+    pressures = " and pressures (mixed form)" if model.mixed else ""
+    yield "unknowns", [f"{model.unknowns:,} displacements{pressures}"]
     kind = str(model.material.model_dump()["kind"])
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
