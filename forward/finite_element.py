@@ -72,7 +72,7 @@ class Discretisation:
         self.test, _ = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
-        self.stored_energy, self._potential = self._energies()
+        self.stored_energy, self._potential, self.dilation = self._energies()
         self._potentials, self._followers = self._loads()
         self._symmetric = not self._followers
         imbalance = self._imbalance_form()
@@ -105,13 +105,18 @@ class Discretisation:
             values["D1"] = 0
         return energy(_OPS, *kinematics.invariants(ufl, F), **values)
 
-    def _energies(self) -> tuple[Any, Any]:
-        """Density of the stored energy, and the integrand of the potential of which the imbalance is the derivative."""
+    def _energies(self) -> tuple[Any, Any, Any]:
+        """Densities of the stored energy, of the potential whose derivative is the imbalance, and of the volume change.
+
+        In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
+        keeps its digits however small it is.
+        """
         energy = self.energy_of(self.F)
         if self.p is None:
-            return energy, energy
-        of_pressure = self.p**2 / (4 * self._variables["material.D1"])  # p²/(2κ), κ = 2 D1
-        return energy + of_pressure, energy + self.p * (self.J - 1) - of_pressure
+            return energy, energy, self.J - 1
+        bulk = 2 * self._variables["material.D1"]
+        of_pressure = self.p**2 / (2 * bulk)
+        return energy + of_pressure, energy + self.p * (self.J - 1) - of_pressure, self.p / bulk
 
     def derivative(self, form: Any) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns."""

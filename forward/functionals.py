@@ -56,7 +56,7 @@ def functional(output: Output, body: Discretisation) -> Functional:
         case StrainEnergy():
             return _Integral(body, body.stored_energy, 1.0)
         case VolumeChange():
-            return _Integral(body, body.J - 1, body.spec.body.volume)
+            return _Integral(body, body.dilation, body.spec.body.volume)
         case MaxVonMises():
             return _MaxVonMises(body)
         case _:

@@ -16,6 +16,7 @@ BLOCKS = {
     "outputs": ({"kind": "strain-energy", "name": "energy"},),
 }
 TRACTION = {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 1.0}
+COUPLED = {"kind": "neo-hookean-coupled", "mu": 1.0, "lmbda": 1e6}
 MOVED = {"on": "x-max", "x": 0.1}
 
 
@@ -76,6 +77,9 @@ def test_the_specification_without_mistakes_is_accepted():
         ({"body": BLOCKS["body"] | {"degree": 3}}, "body.degree", "1 or 2"),
         ({"body": BLOCKS["body"] | {"quadrature_degree": 3}}, "body", "without energy, expected at least 4"),
         ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
+        ({"formulation": "mixd"}, "formulation", "'displacement', 'mixed' or 'auto'"),
+        ({"formulation": "mixed", "body": BLOCKS["body"] | {"degree": 1}}, "formulation", "expected body.degree = 2"),
+        ({"formulation": "mixed", "material": COUPLED}, "formulation", "has no part of the volume alone"),
         ({"lodas": ()}, "lodas", "did you mean 'loads'"),
     ],
 )
@@ -145,6 +149,31 @@ def test_the_constants_of_a_material_are_the_arguments_of_its_energy(kind):
     values = dict.fromkeys(constants(MATERIALS[kind]), 2.0)
     spec = Hyperelastic.model_validate(BLOCKS | {"material": {"kind": kind} | values})
     assert [path for path in spec.scalars if path.startswith("material.")] == [f"material.{name}" for name in values]
+
+
+@pytest.mark.parametrize(
+    ("bulk", "degree", "formulation", "mixed"),
+    [
+        (1.0, 2, "auto", False),
+        (49.0, 2, "auto", False),
+        (51.0, 2, "auto", True),
+        (1e6, 2, "auto", True),
+        (1e6, 1, "auto", False),
+        (1e6, 2, "displacement", False),
+        (1.0, 2, "mixed", True),
+    ],
+)
+@pytest.mark.parametrize("constants_", [{"kind": "neo-hookean", "C1": 3.0}, {"C1": 1.0, "C2": 2.0}])
+def test_the_mixed_form_is_chosen_for_nearly_incompressible_bodies(constants_, bulk, degree, formulation, mixed):
+    material = {"kind": "mooney-rivlin", "D1": 3.0 * bulk} | constants_  # μ = 6, κ = 6 bulk
+    body = BLOCKS["body"] | {"degree": degree}
+    spec = Hyperelastic.model_validate(BLOCKS | {"material": material, "body": body, "formulation": formulation})
+    assert spec.mixed == mixed
+    assert spec.unknowns == 3 * (2 * degree + 1) ** 3 + 27 * mixed
+
+
+def test_an_energy_that_does_not_split_keeps_the_displacement_form():
+    assert not Hyperelastic.model_validate(BLOCKS | {"material": COUPLED}).mixed
 
 
 def test_settings_of_the_solver_have_defaults():
