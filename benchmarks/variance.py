@@ -22,6 +22,7 @@ class Remembered:
         self.parameters = evaluate.parameters
         self.outputs = evaluate.outputs
         self.differentiable = evaluate.differentiable
+        self.displacements = evaluate.displacements
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate, or remember."""

@@ -33,10 +33,15 @@ class AndersonMixing:
         Length n of this rank's part of the vectors.
     total
         Sum over the ranks.
+    weights
+        What makes the entries (n,) of f comparable in the Euclidean norm.
     """
 
-    def __init__(self, inverse: Inverse, window: int, size: int, total: Total) -> None:
+    def __init__(
+        self, inverse: Inverse, window: int, size: int, total: Total, weights: FloatArray | float = 1.0
+    ) -> None:
         self._inverse = inverse
+        self._weights = weights
         self._window = window
         self._total = total
         self._changes = np.empty((window, size))
@@ -48,12 +53,13 @@ class AndersonMixing:
     def next(self, u: FloatArray, f: FloatArray) -> FloatArray:
         """Return the next iterate (n,) from the last one and its residual f."""
         target = u - self._inverse(f)
+        f = self._weights * f
         if self._last is not None:
             slot = self._count % self._window
             self._changes[slot] = f - self._last[0]
             self._misses[slot] = target - self._last[1]
             self._count += 1
-        self._last = (np.array(f), target)
+        self._last = (f, target)
         kept = min(self._count, self._window)
         if kept == 0:
             return target

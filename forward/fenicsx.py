@@ -130,6 +130,83 @@ def vector_space(msh: Any, degree: int) -> Any:
     return fem.VectorFunctionSpace(msh, ("Lagrange", degree))
 
 
+class Unknowns:
+    """The unknowns of a body: displacements and, in the mixed form, pressures; as spaces and as vectors.
+
+    A vector (U_local,) holds the displacements of the nodes that this rank owns, interleaved, and then the pressures of
+    the vertices that it owns. DOLFINx numbers the unknowns of its mixed space in another order, which ends here.
+
+    Attributes
+    ----------
+    whole
+        The space of all unknowns.
+    displacement
+        The space of displacements.
+    pressure
+        The space of pressures, continuous and one degree lower (P. Hood, C. Taylor, Navier–Stokes equations using mixed
+        interpolation, 1974); nothing in the displacement form.
+    size
+        Number of unknowns that this rank owns.
+    pressures
+        Number of pressures on all ranks.
+    """
+
+    def __init__(self, msh: Any, degree: int, *, mixed: bool) -> None:
+        self._numbers: NDArray[np.int32] | None = None  # of displacements, ghosts included, in the mixed space
+        self._order: NDArray[np.int32] | None = None
+        self.pressure = None
+        self.pressures = 0
+        if not mixed:
+            self.whole = self.displacement = vector_space(msh, degree)
+            self.size = 3 * owned_nodes(self.displacement)
+            return
+        cell = msh.ufl_cell()
+        elements = ufl.VectorElement("Lagrange", cell, degree), ufl.FiniteElement("Lagrange", cell, degree - 1)
+        self.whole = fem.FunctionSpace(msh, ufl.MixedElement(*elements))
+        self.displacement, displacements = self.whole.sub(0).collapse()
+        self.pressure, pressures = self.whole.sub(1).collapse()
+        self.pressures = int(self.pressure.dofmap.index_map.size_global)
+        self._numbers = np.array(displacements, dtype=np.int32)
+        owned = self._numbers[: 3 * owned_nodes(self.displacement)]
+        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32)[: owned_nodes(self.pressure)]])
+        self.size = len(self._order)
+
+    def split(self, all_of_them: Any) -> tuple[Any, Any]:
+        """Displacement and pressure of a UFL argument or function of the whole space; no pressure if there is none."""
+        return tuple(ufl.split(all_of_them)) if self.pressure is not None else (all_of_them, None)
+
+    def constraint(self, axis: int, nodes: NDArray[np.int32]) -> Any:
+        """Mark a component of nodes as prescribed, for the assembly of matrices."""
+        numbers, space = 3 * nodes + axis, self.whole
+        if self._numbers is not None:
+            numbers, space = self._numbers[numbers], space.sub(0)
+        return fem.dirichletbc(fem.Constant(space.mesh, PETSc.ScalarType(0)), numbers, space.sub(axis))
+
+    def give(self, function: Any, values: FloatArray) -> None:
+        """Set a function of the whole space to a vector (U_local,), ghosts included; collective."""
+        if self._order is None:
+            function.x.array[: self.size] = values
+        else:
+            function.x.array[self._order] = values
+        function.x.scatter_forward()
+
+    def take(self, values: FloatArray) -> FloatArray:
+        """Copy what DOLFINx or PETSc holds of the whole space into a vector (U_local,), or into rows (k, U_local)."""
+        return np.array(values[..., : self.size]) if self._order is None else np.asarray(values[..., self._order])
+
+    def reorder(self, rows: FloatArray) -> FloatArray:
+        """Return rows (k, U_local) in PETSc's order."""
+        if self._order is None:
+            return rows
+        reordered = np.empty_like(rows)
+        reordered[:, self._order] = rows
+        return reordered
+
+    def put(self, vector: Any, values: FloatArray) -> None:
+        """Copy a vector (U_local,) into PETSc's."""
+        vector.array[slice(None) if self._order is None else self._order] = values
+
+
 def quadrature_space(msh: Any, degree: int) -> Any:
     """Scalars at the quadrature points."""
     return fem.FunctionSpace(msh, ufl.FiniteElement("Quadrature", msh.ufl_cell(), degree, quad_scheme="default"))
@@ -155,11 +232,6 @@ def global_node_numbers(space: Any) -> NDArray[np.int64]:
 def boundary_nodes(space: Any, facets: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return this rank's nodes (ghosts included) on facets; collective."""
     return np.asarray(fem.locate_dofs_topological(space, 2, facets))
-
-
-def constraint(space: Any, axis: int, nodes: NDArray[np.int32]) -> Any:
-    """Mark a component of nodes as prescribed, for the assembly of matrices."""
-    return fem.dirichletbc(fem.Constant(space.mesh, PETSc.ScalarType(0)), 3 * nodes + axis, space.sub(axis))
 
 
 def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
@@ -250,8 +322,9 @@ class NodalGradients:
 class VectorAssembler:
     """A compiled linear form with its vector, used again for every assembly."""
 
-    def __init__(self, form: Any, comm: Any) -> None:
+    def __init__(self, form: Any, unknowns: Unknowns, comm: Any) -> None:
         self._form = compile_form(form, comm)
+        self._unknowns = unknowns
         self._vector = fem.petsc.create_vector(self._form)
 
     def __call__(self) -> FloatArray:
@@ -260,7 +333,7 @@ class VectorAssembler:
             local.set(0.0)
         fem.petsc.assemble_vector(self._vector, self._form)
         self._vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-        return np.array(self._vector.array_r)
+        return self._unknowns.take(self._vector.array_r)
 
 
 class ScalarAssembler:
@@ -287,14 +360,17 @@ class DirectSolver:
         Compiled bilinear form.
     constraints
         Prescribed unknowns; their rows and columns become those of the identity.
+    unknowns
+        Knows the order of vectors.
     comm
         Communicator of the ranks that share the matrix.
     symmetric
         Whether the form is.
     """
 
-    def __init__(self, form: Any, constraints: list[Any], comm: Any, *, symmetric: bool) -> None:
+    def __init__(self, form: Any, constraints: list[Any], unknowns: Unknowns, comm: Any, *, symmetric: bool) -> None:
         self._form = form
+        self._unknowns = unknowns
         self._constraints = constraints
         self._matrix = fem.petsc.create_matrix(form)
         self._symmetric = symmetric
@@ -334,20 +410,20 @@ class DirectSolver:
         """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
         transpose = transpose and not self._symmetric
         if right.ndim == 1:
-            self._right.array[:] = right
+            self._unknowns.put(self._right, right)
             (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
-            return np.array(self._solution.array_r)
+            return self._unknowns.take(self._solution.array_r)
         if transpose or len(right) == 1 or self._ksp.comm.size > 1:
             return np.array([self.solve(row, transpose=transpose) for row in right]).reshape(right.shape)
         # The factor is read once for all of them.
-        size = right.shape[::-1]
-        rights = PETSc.Mat().createDense(size, array=np.asfortranarray(right.T), comm=self._ksp.comm)
-        solutions = PETSc.Mat().createDense(size, comm=self._ksp.comm)
+        ordered = np.asfortranarray(self._unknowns.reorder(right).T)
+        rights = PETSc.Mat().createDense(ordered.shape, array=ordered, comm=self._ksp.comm)
+        solutions = PETSc.Mat().createDense(ordered.shape, comm=self._ksp.comm)
         for matrix in (rights, solutions):
             matrix.setUp()
             matrix.assemble()
         self._ksp.pc.getFactorMatrix().matSolve(rights, solutions)
-        result = np.array(solutions.getDenseArray().T, order="C")
+        result = self._unknowns.take(np.array(solutions.getDenseArray().T, order="C"))
         rights.destroy()
         solutions.destroy()
         return result

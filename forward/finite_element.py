@@ -2,6 +2,10 @@
 
 F(u, ω) = 0 with F = ∂Π/∂u (plus follower pressures) on the free unknowns and u = target on the prescribed ones.
 K = ∂F/∂u. Tangent: K du = −∂F/∂ω dω. Adjoint: Kᵀλ = ∂ψ/∂u, dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
+
+Displacement form: Π = ∫ W dX − loads. Mixed form: u holds displacements and then pressures p (tension is positive), and
+Π = ∫ W_iso + p (J−1) − p²/(2κ) dX − loads, the perturbed Lagrangian of W = W_iso + κ/2 (J−1)². K is then symmetric and
+indefinite. Forces (N) and volumes (m³), metres and pascals share vectors, so norms are of one kind only.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ from forward.reference import ReferenceFactor
 STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of block GCR, before a factor is made after all
+VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
 _OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt)
 
 
@@ -45,8 +50,10 @@ class Discretisation:
         self.parameters = parameters
         self.work = Work()
         self.mesh, self.facets = fenicsx.mesh_body(comm, spec.body)
-        self.space = fenicsx.vector_space(self.mesh, spec.body.degree)
-        self.layout = Layout(self.space, comm)
+        self.unknowns = fenicsx.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
+        self.size = self.unknowns.size
+        self.space = self.unknowns.displacement
+        self.layout = Layout(self.space, comm, self.unknowns.pressure)
         self.nodes_owned = fenicsx.owned_nodes(self.space)
         self.dx = ufl.dx(domain=self.mesh, metadata={"quadrature_degree": spec.body.quadrature})
         self._ds, self._tags = fenicsx.facet_measure(self.mesh, self.facets, spec.body.quadrature)
@@ -61,34 +68,57 @@ class Discretisation:
         self._directions = {path: fenicsx.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
         self._load = fenicsx.constant(self.mesh, 1.0)
 
-        self.u = fenicsx.function(self.space)
-        self._along = fenicsx.function(self.space)
-        self.test = ufl.TestFunction(self.space)
+        self._state = fenicsx.function(self.unknowns.whole)
+        self._along = fenicsx.function(self.unknowns.whole)
+        self._variation = ufl.TestFunction(self.unknowns.whole)
+        self.u, self.p = self.unknowns.split(self._state)
+        self.test, _ = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
-        self.energy_density = self.energy_of(self.F)
+        self.stored_energy, self._potential, self.dilation = self._energies()
         self._potentials, self._followers = self._loads()
         self._symmetric = not self._followers
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
-        self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self.u, ufl.TrialFunction(self.space)), comm)
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
         self._solver = self.new_solver()
-        self._factorised_at = np.zeros(3 * self.nodes_owned)
+        self._factorised_at = np.zeros(self.size)
         self._jacobians = fenicsx.compile_expression(
             self.J, fenicsx.quadrature_points(self.space, spec.body.quadrature), comm
         )
         self._compiled: dict[tuple[int, str], Any] = {}
+        self._external = 0.0
         self._rounding: float | None = None
-        self._stretch = STRETCH * fenicsx.node_coordinates(self.space).ravel()
+        self._stretch = self._small_stretch()
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
     def energy_of(self, F: Any) -> Any:
-        """Strain energy density as a UFL expression of a deformation gradient."""
+        """Energy density of a deformation gradient, as UFL; in the mixed form, without that of the change of volume."""
         energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
         values = {path.split(".")[1]: v for path, v in self._variables.items() if path.startswith("material.")}
+        if self.p is not None:
+            values["D1"] = 0
         return energy(_OPS, *kinematics.invariants(ufl, F), **values)
+
+    def _energies(self) -> tuple[Any, Any, Any]:
+        """Densities of the stored energy, of the potential whose derivative is the imbalance, and of the volume change.
+
+        In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
+        keeps its digits however small it is.
+        """
+        energy = self.energy_of(self.F)
+        if self.p is None:
+            return energy, energy, self.J - 1
+        bulk = 2 * self._variables["material.D1"]
+        of_pressure = self.p**2 / (2 * bulk)
+        return energy + of_pressure, energy + self.p * (self.J - 1) - of_pressure, self.p / bulk
+
+    def derivative(self, form: Any) -> Any:
+        """Gâteaux derivative of a functional with respect to all unknowns."""
+        return ufl.derivative(form, self._state, self._variation)
 
     def surface(self, boundary: str) -> Any:
         """Measure of a named boundary."""
@@ -96,11 +126,11 @@ class Discretisation:
 
     def vector(self, form: Any) -> fenicsx.VectorAssembler:
         """Compile a linear form."""
-        return fenicsx.VectorAssembler(form, self.comm)
+        return fenicsx.VectorAssembler(form, self.unknowns, self.comm)
 
     def _loads(self) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
         """Potentials (integrand, measure) of energy and dead loads; virtual work of loads that follow the surface."""
-        potentials = [(self.energy_density, self.dx)]
+        potentials = [(self._potential, self.dx)]
         followers = []
         for load in self.spec.loads:
             size = self._load * self._variables[f"loads.{load.label}.{LOAD_SIZES[load.kind]}"]
@@ -123,7 +153,7 @@ class Discretisation:
         for integrand, measure in self._potentials:
             changed = change(integrand)
             if changed is not None:
-                term = ufl.derivative(changed * measure, self.u, self.test)
+                term = self.derivative(changed * measure)
                 form = term if form is None else form + term
         for integrand, measure in self._followers:
             changed = change(integrand)
@@ -156,13 +186,13 @@ class Discretisation:
 
     @cached_property
     def _stiffness_action(self) -> fenicsx.VectorAssembler:
-        return self.vector(ufl.derivative(self._imbalance_form(), self.u, self._along))
+        return self.vector(ufl.derivative(self._imbalance_form(), self._state, self._along))
 
     @cached_property
     def _transposed_action(self) -> fenicsx.VectorAssembler:
         if self._symmetric:
             return self._stiffness_action
-        return self.vector(ufl.derivative(ufl.action(self._imbalance_form(), self._along), self.u, self.test))
+        return self.vector(self.derivative(ufl.action(self._imbalance_form(), self._along)))
 
     @cached_property
     def gradients(self) -> fenicsx.NodalGradients:
@@ -183,7 +213,7 @@ class Discretisation:
         for path in ("", *paths):
             for other in paths:
                 self._constants[other].value = float(other == path)
-            forces[path] = self._imbalance(np.zeros(3 * self.nodes_owned)) - forces.get("", 0.0)
+            forces[path] = self._imbalance(np.zeros(self.size)) - forces.get("", 0.0)
             forces[path][self.fixed] = 0
             if path == "" and self.norm(forces[path]) <= self.rounding():
                 forces[path][:] = 0
@@ -194,7 +224,9 @@ class Discretisation:
 
     def new_solver(self) -> fenicsx.DirectSolver:
         """Return a matrix and a solver of their own for the stiffness."""
-        return fenicsx.DirectSolver(self._stiffness, self._constraints, self.comm, symmetric=self._symmetric)
+        return fenicsx.DirectSolver(
+            self._stiffness, self._constraints, self.unknowns, self.comm, symmetric=self._symmetric
+        )
 
     # --- state and parameters ----------------------------------------------------------------------------------------
 
@@ -206,12 +238,12 @@ class Discretisation:
             nodes = fenicsx.boundary_nodes(self.space, self.facets[displacement.on])
             for axis in displacement.components:
                 a = AXES.index(axis)
-                self._constraints.append(fenicsx.constraint(self.space, a, nodes))
+                self._constraints.append(self.unknowns.constraint(a, nodes))
                 moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
         for boundary in self.spec.clamp:
             nodes = fenicsx.boundary_nodes(self.space, self.facets[boundary])
             for a in range(3):
-                self._constraints.append(fenicsx.constraint(self.space, a, nodes))
+                self._constraints.append(self.unknowns.constraint(a, nodes))
                 moved |= {(int(n), a): "" for n in nodes}
         owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
         self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
@@ -234,21 +266,67 @@ class Discretisation:
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
         self._rounding = None
-        external = np.zeros(3 * self.nodes_owned)
+        external = np.zeros(self.size)
         with np.errstate(invalid="ignore"):  # a load that is not finite has no finite residual, which the solver says
             for path, force in self._unit_loads.items():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
         self._rounding = None
 
+    def _small_stretch(self) -> FloatArray:
+        """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
+        places = STRETCH * fenicsx.node_coordinates(self.space)
+        if self.p is not None:
+            places[:, 1:] = 0
+        return self.with_pressures(places.ravel())
+
+    @cached_property
+    def _volumes(self) -> FloatArray:
+        """Volumes ∫q dX (m³) of the test functions q of this rank's pressures."""
+        kept = self.state()
+        self.set_state(self._stretch)
+        volumes = self._residual()[3 * self.nodes_owned :] / STRETCH
+        self.set_state(kept)
+        return volumes
+
+    @cached_property
+    def _volumes_size(self) -> float:
+        return float(np.sqrt(self.dot(self._volumes, self._volumes)))
+
+    @cached_property
+    def _distance(self) -> float:
+        """Edge (m) of a cube that is the part of the body for each pressure."""
+        return float((self.total(np.array([self._volumes.sum()]))[0] / self.unknowns.pressures) ** (1 / 3))
+
+    def _force_per_volume(self) -> float:
+        """What turns volumes v (m³) that are out of balance into forces (N): κ v/h³ is the pressure that they cost.
+
+        It acts on an area h². A body whose boundary is held altogether is so far from its pressure; others are nearer.
+        """
+        return float(2 * self._values["material.D1"] / self._distance)
+
+    def weights(self) -> FloatArray:
+        """What turns an imbalance (U_local,) into forces (N): one on displacements."""
+        weights = np.ones(self.size)
+        if self.p is not None:
+            weights[3 * self.nodes_owned :] = self._force_per_volume()
+        return weights
+
     def set_state(self, u: FloatArray) -> None:
-        """Give the displacement (U_local,) its values, ghosts included."""
-        self.u.x.array[: len(u)] = u
-        self.u.x.scatter_forward()
+        """Give the unknowns (U_local,) their values, ghosts included."""
+        self.unknowns.give(self._state, u)
 
     def state(self) -> FloatArray:
-        """This rank's part (U_local,) of the displacement that is set."""
-        return np.asarray(self.u.x.array[: 3 * self.nodes_owned])
+        """This rank's part (U_local,) of the state that is set."""
+        return self.unknowns.take(self._state.x.array)
+
+    def displacements(self) -> FloatArray:
+        """Displacements (nodes_owned, 3) of the state that is set."""
+        return self.state()[: 3 * self.nodes_owned].reshape(-1, 3)
+
+    def with_pressures(self, displacements: FloatArray) -> FloatArray:
+        """Extend this rank's part (3 nodes_owned,) of a vector by zeros for the pressures, where they are unknowns."""
+        return np.append(displacements, np.zeros(self.size - len(displacements)))
 
     def dot(self, x: FloatArray, y: FloatArray) -> float:
         """Inner product over all ranks."""
@@ -267,7 +345,7 @@ class Discretisation:
         return self._residual()
 
     def imbalance(self) -> FloatArray:
-        """Forces out of balance (U_local,) at the state that is set; on prescribed unknowns, the reactions."""
+        """Imbalance (U_local,) at the state that is set; on prescribed unknowns, the reactions."""
         return self._residual()
 
     def residual(self, u: FloatArray) -> Residual:
@@ -276,22 +354,32 @@ class Discretisation:
         reactions = r[self.fixed]
         gap = u[self.fixed] - self._targets
         r[self.fixed] = 0
-        free, fixed, apart = fenicsx.total(self.comm, np.array([r @ r, reactions @ reactions, gap @ gap]))
+        forces, volumes = r[: 3 * self.nodes_owned], r[3 * self.nodes_owned :]
+        squares = [forces @ forces, reactions @ reactions, gap @ gap, volumes @ volumes]
+        free, fixed, apart, lacking = np.sqrt(self.total(np.array(squares))).tolist()
         r[self.fixed] = gap
         scale = float(self._load.value) * self._external
         if self._moves:
-            scale = max(scale, float(np.sqrt(fixed)))
-        return Residual(r, float(np.sqrt(free)), scale, float(np.sqrt(apart)))
+            scale = max(scale, fixed)
+        return Residual(r, free, scale, apart, self._force_of(lacking))
+
+    def _force_of(self, lacking: float) -> float:
+        """Force (N) of volumes (m³) that are out of balance; volumes that are rounding have none."""
+        if self.p is None or lacking <= VOLUME_ROUNDING * self._volumes_size:
+            return 0.0
+        return lacking * self._force_per_volume()
 
     def rounding(self) -> float:
         """What the size of a residual cannot be expected to fall below, whatever the loads (N).
 
-        Stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch.
+        Stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch (more
+        of them where it is along one axis only).
         """
         if self._rounding is None:
             load = self._load.value.copy()
             self._load.value = 0.0
-            self._rounding = 4 * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
+            few = 4 if self.p is None else 16
+            self._rounding = few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
             self._load.value = load
         return self._rounding
 
@@ -328,8 +416,7 @@ class Discretisation:
 
     def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Product of the stiffness of all unknowns (or its transpose) with w (U_local,), at the state that is set."""
-        self._along.x.array[: len(w)] = w
-        self._along.x.scatter_forward()
+        self.unknowns.give(self._along, w)
         self.work.residuals += 1
         return (self._transposed_action if transpose else self._stiffness_action)()
 
@@ -346,12 +433,14 @@ class Discretisation:
         return fenicsx.total(self.comm, values)
 
     def norms(self, rows: FloatArray) -> FloatArray:
-        """Euclidean norms of rows (k, U_local) over all ranks."""
-        return np.asarray(np.sqrt(self.total(np.einsum("kn,kn->k", rows, rows))))
+        """Euclidean norms over the displacements of rows (k, U_local), of all ranks."""
+        displacements = rows[:, : 3 * self.nodes_owned]
+        return np.asarray(np.sqrt(self.total(np.einsum("kn,kn->k", displacements, displacements))))
 
     def norm(self, x: FloatArray) -> float:
-        """Euclidean norm over all ranks."""
-        return float(np.sqrt(self.dot(x, x)))
+        """Euclidean norm over the displacements (or their forces) of all ranks."""
+        displacements = x[: 3 * self.nodes_owned]
+        return float(np.sqrt(self.dot(displacements, displacements)))
 
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J over the quadrature points of all ranks."""
@@ -360,8 +449,9 @@ class Discretisation:
         return fenicsx.smallest(self.comm, float(values.min(initial=np.inf)))
 
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the factorised stiffness."""
-        return self._solver.negative_pivots()
+        """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; −1 if unknown."""
+        found = self._solver.negative_pivots()
+        return found - self.unknowns.pressures if found >= 0 else found
 
     # --- derivatives with respect to the parameters ------------------------------------------------------------------
 
@@ -374,7 +464,7 @@ class Discretisation:
 
     def parameter_forces(self) -> FloatArray:
         """∂F/∂ω (d, U_local) over all unknowns, at the state that is set."""
-        forces = np.zeros((len(self.parameters), 3 * self.nodes_owned))
+        forces = np.zeros((len(self.parameters), self.size))
         for i, path in enumerate(self.unit_directions()):
             if path in self._directions and self._parameter_force is not None:
                 self.work.residuals += 1
@@ -422,6 +512,7 @@ class HyperelasticModel:
         self.outputs = tuple(output.name for output in spec.outputs)
         self.body = Discretisation(spec, comm, parameters)
         self.layout = self.body.layout
+        self.displacements = self.layout.coordinates.size
         self.differentiable = True
         self._functionals = [functional(output, self.body) for output in spec.outputs]
         self._visited: object = None  # the solution whose state is set
@@ -464,7 +555,7 @@ class HyperelasticModel:
         body.work = Work()
         body.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters)
-        u = solve(body, self.spec.solver, np.zeros(3 * body.nodes_owned), start, way)
+        u = solve(body, self.spec.solver, np.zeros(body.size), start, way)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         corrected = body.work.factorisations == 0
         return FiniteElementSolution(self, parameters, u, body.work, reference if corrected else None)
@@ -566,10 +657,11 @@ class FiniteElementSolution:
         if self._reference is not None and len(right) <= FEW:
             inverse = model.near_reference(self, self._reference, transpose=transpose)
             body = model.visit(self)
+            weights = body.weights()
             found = block_gcr(
-                lambda x: body.free_stiffness_times(x, transpose=transpose),
-                inverse,
-                right,
+                lambda x: weights * body.free_stiffness_times(x, transpose=transpose),
+                lambda r: inverse(r / weights),
+                weights * right,
                 body.total,
                 body.norms,
                 model.spec.solver.tolerance,

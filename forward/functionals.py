@@ -1,7 +1,7 @@
 """Evaluation of the outputs of a finite-element solution, with their derivatives.
 
-Each functional has a value ψ(u, ω), its gradient ∂ψ/∂u over all displacement unknowns, and its explicit partial
-derivative ∂ψ/∂ω. They read the state and the parameters that the discretisation is currently set to.
+Each functional has a value ψ(u, ω), its gradient ∂ψ/∂u over all unknowns (in the mixed form, pressures too), and its
+explicit partial derivative ∂ψ/∂ω. They read the state and the parameters that the discretisation is currently set to.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def functional(output: Output, body: Discretisation) -> Functional:
         case Reaction():
             return _Reaction(body, output)
         case StrainEnergy():
-            return _Integral(body, body.energy_density, 1.0)
+            return _Integral(body, body.stored_energy, 1.0)
         case VolumeChange():
-            return _Integral(body, body.J - 1, _volume(body))
+            return _Integral(body, body.dilation, _volume(body))
         case MaxVonMises():
             return _MaxVonMises(body)
         case _:
@@ -91,13 +91,13 @@ def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
         nodes, weights = found
         probe.x.array[3 * nodes + AXES.index(output.component)] = weights
     # Weights of ghost nodes travel to the ranks that own them.
-    return _Linear(body, fenicsx.sum_ghosts(probe))
+    return _Linear(body, body.with_pressures(fenicsx.sum_ghosts(probe)))
 
 
 def _mean_over_boundary(body: Discretisation, output: MeanDisplacement) -> _Linear:
     axis = fenicsx.constant(body.mesh, np.eye(3)[AXES.index(output.component)])
     surface = body.surface(output.on)
-    weights = fenicsx.VectorAssembler(ufl.inner(axis, body.test) * surface, body.comm)()
+    weights = body.vector(ufl.inner(axis, body.test) * surface)()
     area = body.dot(weights, np.ones_like(weights))
     return _Linear(body, weights / area)
 
@@ -115,7 +115,7 @@ class _Extreme:
         self._axis = axis
 
     def _candidates(self) -> FloatArray:
-        u = self._body.state().reshape(-1, 3)
+        u = self._body.displacements()
         return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
 
     def value(self) -> float:
@@ -129,12 +129,12 @@ class _Extreme:
         g = np.zeros((len(candidates), 3))
         if top > 0:
             for node in ties[position == first]:
-                u = self._body.state().reshape(-1, 3)[node]
+                u = self._body.displacements()[node]
                 if self._axis is None:
                     g[node] = u / np.linalg.norm(u)
                 else:
                     g[node, self._axis] = np.sign(u[self._axis])
-        return g.ravel()
+        return self._body.with_pressures(g.ravel())
 
     def partial(self) -> FloatArray:
         return np.zeros(len(self._body.parameters))
@@ -154,9 +154,7 @@ class _Integral:
 
     def gradient(self) -> FloatArray:
         body = self._body
-        form = body.compiled(
-            self, "gradient", lambda: body.vector(ufl.derivative(self._density * body.dx, body.u, body.test))
-        )
+        form = body.compiled(self, "gradient", lambda: body.vector(body.derivative(self._density * body.dx)))
         return np.asarray(form()) / self.size
 
     def partial(self) -> FloatArray:
@@ -175,7 +173,7 @@ class _Reaction:
         self._body = body
         nodes = fenicsx.boundary_nodes(body.space, body.facets[output.on])
         owned = nodes[nodes < body.nodes_owned]
-        self._w = np.zeros(3 * body.nodes_owned)
+        self._w = np.zeros(body.size)
         self._w[3 * owned + AXES.index(output.component)] = 1
 
     def value(self) -> float:
@@ -198,6 +196,7 @@ class _MaxVonMises:
     def __init__(self, body: Discretisation) -> None:
         self._body = body
         F = ufl.variable(body.F)
+        # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
         cauchy = ufl.diff(body.energy_of(F), F) * F.T / ufl.det(F)
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature

@@ -1,4 +1,8 @@
-"""The canonical order of nodes: sorted by place, so that fields look the same on any number of ranks."""
+"""The canonical order of nodes: sorted by place, so that fields look the same on any number of ranks.
+
+A state (U,) in canonical order holds the displacements of the nodes, interleaved by component, and then, in the mixed
+form, the pressures of the vertices.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,16 @@ from forward.model import FloatArray
 
 
 class Layout:
-    """Where this rank's nodes stand in the canonical order (by x, then y, then z).
+    """Where this rank's nodes and unknowns stand in the canonical order (by x, then y, then z).
+
+    Parameters
+    ----------
+    space
+        The space of displacements.
+    comm
+        Communicator of the ranks that share the mesh.
+    pressure
+        The space of pressures, if they are unknowns.
 
     Attributes
     ----------
@@ -22,22 +35,16 @@ class Layout:
         Coordinates (N, 3) of all nodes in canonical order, in m, on every rank.
     """
 
-    def __init__(self, space: Any, comm: Any) -> None:
+    def __init__(self, space: Any, comm: Any, pressure: Any | None = None) -> None:
         self._space = space
         self._comm = comm
-        parts = comm.allgather(fenicsx.node_coordinates(space))
-        everywhere = np.concatenate(parts)
-        # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
-        # simple fractions of the largest extent, off the ends of the intervals.
-        step = 1e-9 * np.ptp(everywhere, axis=0).max()
-        keys = np.floor(everywhere / step + 1 / np.pi).astype(np.int64)
-        order = np.lexsort(keys.T[::-1])
-        self.coordinates: FloatArray = everywhere[order]
-        self._canonical = np.empty(len(order), dtype=np.int64)  # by global number
-        self._canonical[order] = np.arange(len(order))
-        before = sum(len(part) for part in parts[: comm.rank])
-        self.positions: NDArray[np.int64] = self._canonical[before : before + len(parts[comm.rank])]
+        self.coordinates, self._canonical, self.positions = _sorted_by_place(space, comm)
+        self._size = self.coordinates.size
         self._unknowns = (3 * self.positions[:, None] + np.arange(3)).ravel()
+        if pressure is not None:
+            vertices, _, positions = _sorted_by_place(pressure, comm)
+            self._unknowns = np.concatenate([self._unknowns, self._size + positions])
+            self._size += len(vertices)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -48,7 +55,7 @@ class Layout:
         parts = self._comm.gather((self._unknowns, rows))
         if parts is None:
             return None
-        whole = np.empty((len(rows), self.coordinates.size))
+        whole = np.empty((len(rows), self._size))
         for unknowns, part in parts:
             whole[:, unknowns] = part
         return whole
@@ -63,3 +70,18 @@ class Layout:
         numbers = self._canonical[fenicsx.global_node_numbers(self._space)]
         cells = np.concatenate(self._comm.allgather(numbers[local]))
         return cells[np.lexsort(cells.T[::-1])], kind
+
+
+def _sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the sorted places (N, 3) of all nodes of a space, and canonical numbers: by global number, and of ours."""
+    parts = comm.allgather(fenicsx.node_coordinates(space))
+    everywhere = np.concatenate(parts)
+    # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
+    # simple fractions of the largest extent, off the ends of the intervals.
+    step = 1e-9 * np.ptp(everywhere, axis=0).max()
+    keys = np.floor(everywhere / step + 1 / np.pi).astype(np.int64)
+    order = np.lexsort(keys.T[::-1])
+    canonical = np.empty(len(order), dtype=np.int64)
+    canonical[order] = np.arange(len(order))
+    before = sum(len(part) for part in parts[: comm.rank])
+    return everywhere[order], canonical, canonical[before : before + len(parts[comm.rank])]

@@ -93,7 +93,10 @@ class Solution(Protocol):
 
     @property
     def state(self) -> FloatArray:
-        """This rank's part of the state (U_local,), interleaved by component; empty where there is none."""
+        """This rank's part of the state (U_local,); empty where there is none.
+
+        Displacements, interleaved by component, come first.
+        """
 
     @property
     def work(self) -> Work:
@@ -127,6 +130,13 @@ class ForwardModel(Protocol):
     @property
     def differentiable(self) -> bool:
         """Whether solutions have tangents and adjoints."""
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements, interleaved by component, with which a state (U,) in canonical order begins.
+
+        What follows (pressures) is needed to predict states, and is no displacement field; 0 where there is no state.
+        """
 
     def solve(
         self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
@@ -171,6 +181,11 @@ class FunctionModel:
     def differentiable(self) -> bool:
         """Whether a jacobian was given."""
         return self.jacobian is not None
+
+    @property
+    def displacements(self) -> int:
+        """No state, so none."""
+        return 0
 
     def solve(
         self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None

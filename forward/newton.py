@@ -34,7 +34,7 @@ class SolverSettings(Settings):
         more than one correction; "newton" is the textbook: from zero, a new factor for every step.
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
-        prescribed).
+        prescribed); in the mixed form, also of the volumes, as the force of the pressure that they lack.
     iterations
         Newton iterations allowed in one load step.
     corrections
@@ -74,24 +74,30 @@ class Residual:
     Attributes
     ----------
     vector
-        This rank's part: forces on the free unknowns, distance from the target on the prescribed ones.
+        This rank's part: forces on the free displacements, distance from the target on the prescribed ones, volumes
+        on the pressures.
     size
-        Euclidean norm over the free unknowns, of all ranks (N).
+        Euclidean norm over the free displacements, of all ranks (N).
     scale
         What `size` is compared with (N).
     gap
         Largest distance of a prescribed unknown from its target (m).
+    volume
+        Norm of the volumes out of balance, of all ranks, as a force (N); 0 where they are rounding, and where
+        pressures are no unknowns.
     """
 
     vector: FloatArray
     size: float
     scale: float
     gap: float
+    volume: float = 0.0
 
     @property
     def relative(self) -> float:
         """The residual relative to the loads."""
-        return self.size / self.scale if self.scale > 0 else self.size
+        largest = max(self.size, self.volume)
+        return largest / self.scale if self.scale > 0 else largest
 
 
 class System(Protocol):
@@ -129,14 +135,20 @@ class System(Protocol):
     def total(self, values: FloatArray) -> FloatArray:
         """Sum over all ranks."""
 
+    def weights(self) -> FloatArray:
+        """What turns a residual's vector into forces (N)."""
+
     def norm(self, x: FloatArray) -> float:
-        """Euclidean norm over all ranks."""
+        """Euclidean norm over the displacements of all ranks (pressures, in another unit, follow them)."""
 
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J = det F over the quadrature points of all ranks."""
 
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the factorised stiffness (0 for a stable state); −1 if unknown."""
+        """Number of negative eigenvalues of the factorised stiffness of displacements; −1 if unknown.
+
+        A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
+        """
 
 
 class Way(Protocol):
@@ -261,7 +273,7 @@ def _mix(
     history: list[str],
 ) -> tuple[FloatArray, bool]:
     """Correct u with one factor; return the best state, and whether it is an equilibrium."""
-    mixing = AndersonMixing(inverse, WINDOW, len(u), system.total)
+    mixing = AndersonMixing(inverse, WINDOW, len(u), system.total, system.weights())
     best, smallest, since = u, residual, 0
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(limit + 1):
@@ -289,11 +301,12 @@ def _converged(system: System, tolerance: float, residual: Residual, previous: R
     """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding."""
     if residual.gap != 0:
         return False
-    if residual.size <= tolerance * residual.scale:
+    size = max(residual.size, residual.volume)
+    if size <= tolerance * residual.scale:
         return True
     unloaded = residual.scale == 0
-    stalled = previous is not None and previous.gap == 0 and residual.size > STALLED * previous.size
-    return (unloaded or stalled) and residual.size <= system.rounding()
+    stalled = previous is not None and previous.gap == 0 and size > STALLED * max(previous.size, previous.volume)
+    return (unloaded or stalled) and size <= system.rounding()
 
 
 def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> FloatArray:

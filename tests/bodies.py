@@ -21,6 +21,8 @@ CELLS = {
     "neo-hookean-coupled": ("hexahedron", 1),
     "demiray": ("tetrahedron", 1),
 } | dict.fromkeys(MORE_MATERIALS, ("tetrahedron", 1))
+MIXED = ("neo-hookean mixed", "mooney-rivlin mixed")  # quadratic tetrahedra, quadratic hexahedra
+FORMS = (*MATERIALS, *MIXED)
 OUTPUTS = (
     {"kind": "max-displacement", "name": "largest"},
     {"kind": "max-displacement", "name": "largest-z", "component": "z"},
@@ -35,11 +37,16 @@ OUTPUTS = (
 
 
 def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **changes):
-    """A block under every kind of load; loads of size zero keep its compiled forms the same."""
+    """A block under every kind of load; loads of size zero keep its compiled forms the same.
+
+    It is made of a material, in its displacement form or in one of the forms `MIXED`.
+    """
+    material, _, mixed = material.partition(" ")
     cell, degree = CELLS[material]
-    body = {"size": (1.0, 0.7, 0.8), "cells": (2, 1, 1), "cell": cell, "degree": degree} | changes.pop("body", {})
+    body = {"size": (1.0, 0.7, 0.8), "cells": (2, 1, 1), "cell": cell, "degree": 2 if mixed else degree}
     blocks = {
-        "body": body,
+        "formulation": mixed or "displacement",
+        "body": body | changes.pop("body", {}),
         "material": (MATERIALS | MORE_MATERIALS)[material],
         "clamp": ("x-min",),
         "displacements": ({"on": "y-max", "y": 0.05},),

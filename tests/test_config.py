@@ -12,6 +12,7 @@ from forward.outputs import MaxDisplacement
 from uq.distributions import Normal, Uniform
 from uq.monte_carlo import MonteCarlo
 from workflows.config import Study, StudyError, differences, document, dump, load, parse
+from workflows.plan import plan
 from workflows.starter import starter
 
 CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.toml"))
@@ -127,6 +128,13 @@ def test_all_mistakes_are_reported_together():
         "parameters.material.D1",
         "method.sampels",
     ]
+
+
+def test_the_plan_says_the_form():
+    assert all(not load(path).model.mixed for path in CONFIGS)
+    plain, mixed = (plan(parse(blocks(), [f"model.material.D1={bulk}"])) for bulk in (3e5, 3e8))
+    assert "displacement form" in plain[1]
+    assert "mixed form: displacements and pressures" in mixed[1]
 
 
 def test_overrides():

@@ -14,7 +14,7 @@ NOISE = 1e-13  # Newton's last step goes to rounding
 LOADS = ("loads.gravity.density", "loads.traction.size", "loads.pressure.size", "displacements.y-max.y")
 
 
-@pytest.fixture(scope="module", params=MATERIALS)
+@pytest.fixture(scope="module", params=(*MATERIALS, "neo-hookean mixed"))
 def conformance(request):
     spec = loaded_body(request.param)
     parameters = tuple(spec.scalars)

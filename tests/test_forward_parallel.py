@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.bodies import MIXED
 from tests.launch import run_script
 
 pytestmark = [pytest.mark.fem, pytest.mark.mpi]
@@ -47,7 +48,7 @@ def solve(material):
     assert np.array_equal(model.scatter(whole)[0], solution.state)
     assert model.solve(values, model.scatter(whole)[0]).work.factorisations == 0
 
-    steps = 1 / 16, 1 / 32, 1 / 64
+    steps = 1 / 32, 1 / 64, 1 / 128
     directions = np.ones((1, len(values)))
     check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, noise=1e-12).require()
     cells, _ = model.layout.cells()
@@ -66,7 +67,7 @@ for material in sys.argv[2:]:
     if comm.rank == 0:
         np.savez(f"{sys.argv[1]}/{material}.npz", **arrays)
 """
-SHAPES = ("mooney-rivlin", "neo-hookean")  # hexahedra and tetrahedra
+SHAPES = ("mooney-rivlin", "neo-hookean", *MIXED)  # hexahedra and tetrahedra
 
 
 def solve_on(ranks, directory):

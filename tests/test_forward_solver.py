@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 from forward import fenicsx
 from forward.model import SolveError
-from tests.bodies import MATERIALS, OUTPUTS, loaded_body, unloaded_body
+from tests.bodies import FORMS, OUTPUTS, loaded_body, unloaded_body
 
 pytestmark = pytest.mark.fem
 INTEGRALS = OUTPUTS[6:]
@@ -111,7 +111,7 @@ def test_a_failure_leaves_no_trace(model):
         np.testing.assert_array_equal(after.tangent(POINT), before.tangent(POINT))
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("material", FORMS)
 def test_a_solution_does_not_depend_on_what_was_solved_before(material):
     spec = loaded_body(material)
     parameters = tuple(spec.scalars)
@@ -178,7 +178,7 @@ def test_a_factorisation_that_fails_leaves_no_factor(model, monkeypatch):
     np.testing.assert_array_equal(first.tangent(POINT), expected)
 
 
-@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("material", FORMS)
 def test_without_loads_nothing_moves(material):
     spec = unloaded_body(material, displacements=({"on": "y-max", "y": 0.0},))
     model = spec.build(MPI.COMM_SELF, (TRACTION, "displacements.y-max.y"))

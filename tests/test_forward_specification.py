@@ -23,6 +23,7 @@ BLOCK = {
 MIRRORED = tuple((-x, y, z) for x, y, z in BLOCK["corners"])
 FLAT = tuple((x, y, x + y) for x, y, z in BLOCK["corners"])
 TRACTION = {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 1.0}
+COUPLED = {"kind": "neo-hookean-coupled", "mu": 1.0, "lmbda": 1e6}
 MOVED = {"on": "x-max", "x": 0.1}
 
 
@@ -89,6 +90,9 @@ def test_the_specification_without_mistakes_is_accepted():
         ({"body": BLOCK | {"cells": (2000, 2000, 2000)}}, "body.block", "at most 60 million"),
         ({"body": BLOCK, "clamp": ("left",)}, "clamp.0", "unknown boundary"),
         ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
+        ({"formulation": "mixd"}, "formulation", "'displacement', 'mixed' or 'auto'"),
+        ({"formulation": "mixed", "body": BLOCKS["body"] | {"degree": 1}}, "formulation", "expected body.degree = 2"),
+        ({"formulation": "mixed", "material": COUPLED}, "formulation", "has no part of the volume alone"),
         ({"lodas": ()}, "lodas", "did you mean 'loads'"),
     ],
 )
@@ -158,6 +162,31 @@ def test_the_constants_of_a_material_are_the_arguments_of_its_energy(kind):
     values = dict.fromkeys(constants(MATERIALS[kind]), 2.0)
     spec = Hyperelastic.model_validate(BLOCKS | {"material": {"kind": kind} | values})
     assert [path for path in spec.scalars if path.startswith("material.")] == [f"material.{name}" for name in values]
+
+
+@pytest.mark.parametrize(
+    ("bulk", "degree", "formulation", "mixed"),
+    [
+        (1.0, 2, "auto", False),
+        (49.0, 2, "auto", False),
+        (51.0, 2, "auto", True),
+        (1e6, 2, "auto", True),
+        (1e6, 1, "auto", False),
+        (1e6, 2, "displacement", False),
+        (1.0, 2, "mixed", True),
+    ],
+)
+@pytest.mark.parametrize("constants_", [{"kind": "neo-hookean", "C1": 3.0}, {"C1": 1.0, "C2": 2.0}])
+def test_the_mixed_form_is_chosen_for_nearly_incompressible_bodies(constants_, bulk, degree, formulation, mixed):
+    material = {"kind": "mooney-rivlin", "D1": 3.0 * bulk} | constants_  # μ = 6, κ = 6 bulk
+    body = BLOCKS["body"] | {"degree": degree}
+    spec = Hyperelastic.model_validate(BLOCKS | {"material": material, "body": body, "formulation": formulation})
+    assert spec.mixed == mixed
+    assert spec.unknowns == 3 * (2 * degree + 1) ** 3 + 27 * mixed
+
+
+def test_an_energy_that_does_not_split_keeps_the_displacement_form():
+    assert not Hyperelastic.model_validate(BLOCKS | {"material": COUPLED}).mixed
 
 
 def test_settings_of_the_solver_have_defaults():

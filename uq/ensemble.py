@@ -92,7 +92,11 @@ class Ensemble:
                     worker.work(order)
                 return None
             try:
-                return task(EnsembleEvaluate(worker, model.parameters, model.outputs, model.differentiable, progress))
+                return task(
+                    EnsembleEvaluate(
+                        worker, model.parameters, model.outputs, model.differentiable, model.displacements, progress
+                    )
+                )
             finally:
                 self.world.bcast(None)
 
@@ -114,6 +118,7 @@ class EnsembleEvaluate:
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
     differentiable: bool
+    displacements: int
     progress: Callable[[int, int], None]
 
     def __call__(self, request: Request) -> Evaluations:

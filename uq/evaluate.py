@@ -128,6 +128,10 @@ class Evaluate(Protocol):
     def differentiable(self) -> bool:
         """Whether solutions have derivatives."""
 
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state, see `ForwardModel.displacements`."""
+
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
 
@@ -161,6 +165,11 @@ class SerialEvaluate:
     def differentiable(self) -> bool:
         """Whether solutions have derivatives."""
         return self.model.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.model.displacements
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""

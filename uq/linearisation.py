@@ -129,12 +129,14 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
         "parameter": list(evaluate.parameters),
     }
     if fields and centre.state.size:
+        count = evaluate.displacements
         coordinates["component"] = ["x", "y", "z"]
-        data["field_nominal"] = (("node", "component"), centre.state.reshape(-1, 3))
+        data["field_nominal"] = (("node", "component"), centre.state[:count].reshape(-1, 3))
         if len(centre.slopes):
-            shape = (len(centre.slopes), -1, 3)
-            norms = np.linalg.norm(centre.slopes, axis=1)
-            data["field_derivative"] = (("parameter", "node", "component"), centre.slopes.reshape(shape))
+            slopes = centre.slopes[:, :count]
+            shape = (len(slopes), -1, 3)
+            norms = np.linalg.norm(slopes, axis=1)
+            data["field_derivative"] = (("parameter", "node", "component"), slopes.reshape(shape))
             data["field_derivative_norm"] = (("parameter",), norms)
             data["field_derivative_norm_per_range"] = (("parameter",), norms * ranges)
     return xr.Dataset(data, coords=coordinates)

@@ -233,7 +233,8 @@ def _dataset(
         )
     if evaluations.fields.size:
         field = _field_moments(evaluations, inputs, centre, control)
-        fields = {f"field_{name}": getattr(field, name).reshape(-1, 3) for name in ESTIMATES}
+        count = evaluate.displacements
+        fields = {f"field_{name}": getattr(field, name)[:count].reshape(-1, 3) for name in ESTIMATES}
         dataset = dataset.assign({name: (("node", "component"), values) for name, values in fields.items()})
     dataset.attrs["stopped"] = stopped
     failed = int((~ok).sum())

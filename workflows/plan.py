@@ -26,10 +26,11 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     seconds = solves * seconds_per_solve(unknowns) / groups
     body = study.model.body
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
+    form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
     up_to = "up to " if getattr(study.method, "tolerance", None) is not None else ""
     return [
         f"method      {study.method.kind}",
-        f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree})",
+        f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
         f"parameters  {', '.join(study.parameters)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
         f"solves      {up_to}{solves:,}",

@@ -18,6 +18,7 @@ body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexa
 # "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda), "saint-venant-kirchhoff" (lmbda, mu),
 # "blatz-ko" (mu).
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
+# formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 clamp = ["x-min"]
 # Boundaries that are moved by a given amount (m), component by component:
 # displacements = [{ on = "x-max", x = 0.01 }]

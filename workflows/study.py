@@ -144,6 +144,10 @@ class _Recorded:
     def differentiable(self) -> bool:
         return self.evaluate.differentiable
 
+    @property
+    def displacements(self) -> int:
+        return self.evaluate.displacements
+
     def __call__(self, request: Request) -> Evaluations:
         evaluations = self.evaluate(request)
         self.log.evaluations.append(evaluations)
