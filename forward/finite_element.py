@@ -18,6 +18,7 @@ from forward import fenicsx, kinematics
 from forward.functionals import functional
 from forward.geometry import AXES
 from forward.hyperelastic import Hyperelastic
+from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
@@ -25,7 +26,7 @@ from forward.model import FloatArray, SolveError, Work
 from forward.newton import Residual, solve
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
-_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt)
+_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh)
 
 
 class Discretisation:
@@ -89,8 +90,22 @@ class Discretisation:
     def energy_of(self, F: Any) -> Any:
         """Strain energy density as a UFL expression of a deformation gradient."""
         energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
-        values = {path.split(".")[1]: v for path, v in self._variables.items() if path.startswith("material.")}
-        return energy(_OPS, *kinematics.invariants(ufl, F), **values)
+        return self.stiffness_factor * energy(_OPS, *kinematics.invariants(ufl, F), **self._numbers("material"))
+
+    @cached_property
+    def stiffness_factor(self) -> Any:
+        """What the inclusions multiply every modulus by, as a UFL expression of the place; 1 without inclusions."""
+        factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        X = ufl.SpatialCoordinate(self.mesh)
+        for inclusion in self.spec.inclusions:
+            numbers = self._numbers(f"inclusions.{inclusion.label}")
+            factor *= stiffness_factor(_OPS, X, inclusion.kind, **numbers)
+        return factor
+
+    def _numbers(self, block: str) -> dict[str, Any]:
+        """Return the numbers of a block of the model, by their names, as variables of forms."""
+        paths = (path.rpartition(".") for path in self._variables)
+        return {name: self._variables[f"{block}.{name}"] for place, _, name in paths if place == block}
 
     def surface(self, boundary: str) -> Any:
         """Measure of a named boundary."""

@@ -8,10 +8,12 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 import numpy as np
+from annotated_types import Ge, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.geometry import AXES, Box
+from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Load
 from forward.materials import MATERIALS, constants
 from forward.newton import NewtonSettings
@@ -53,20 +55,20 @@ class Scalar(NamedTuple):
     value: float
     block: type[Settings]
     field: str
+    limits: tuple[Any, ...] = ()  # beyond those of the field
 
     def objection(self, value: float) -> str | None:
         """Say why the number cannot be `value`, or nothing if it can."""
         try:
-            _admissible(self.block, self.field).validate_python(value)
+            _admissible(self.block, self.field, self.limits).validate_python(value)
         except ValidationError as error:
             return str(error.errors()[0]["msg"]).lower()
         return None
 
 
 @cache
-def _admissible(block: type[Settings], field: str) -> TypeAdapter[float]:
-    limits = block.model_fields[field].metadata
-    return TypeAdapter(Annotated[(float, Field(), *limits)])
+def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> TypeAdapter[float]:
+    return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
 
 
 class Hyperelastic(Settings):
@@ -78,6 +80,8 @@ class Hyperelastic(Settings):
         Geometry and mesh.
     material
         Strain energy and its constants.
+    inclusions
+        Regions that are stiffer or softer: their factors multiply the energy density.
     clamp
         Boundaries that do not move.
     displacements
@@ -94,6 +98,7 @@ class Hyperelastic(Settings):
     kind: Literal["hyperelastic"] = "hyperelastic"
     body: Box
     material: Material
+    inclusions: tuple[Inclusion, ...] = ()
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
@@ -107,6 +112,12 @@ class Hyperelastic(Settings):
         for name in type(self.material).model_fields:
             if name != "kind":
                 found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for inclusion in self.inclusions:
+            for name in type(inclusion).model_fields:
+                if name not in {"kind", "name"}:
+                    within = (Ge(0), Le(self.body.size[AXES.index(name)])) if name in AXES else ()
+                    value = getattr(inclusion, name)
+                    found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         for load in self.loads:
             size = LOAD_SIZES[load.kind]
             found[f"loads.{load.label}.{size}"] = Scalar(getattr(load, size), type(load), size)
@@ -162,11 +173,21 @@ class Hyperelastic(Settings):
         unknown = [(place, on) for place, on in places if on not in boundaries]
         for place, on in unknown:
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
-        for block, label in (("displacements", "label"), ("loads", "label"), ("outputs", "name")):
+        for block, label in (
+            ("inclusions", "label"),
+            ("displacements", "label"),
+            ("loads", "label"),
+            ("outputs", "name"),
+        ):
             names = Counter(getattr(item, label) for item in getattr(self, block))
             for name, count in names.items():
                 if count > 1:
                     yield (block,), f"{count} of them are called '{name}', expected different names", name
+        for i, inclusion in enumerate(self.inclusions):
+            centre = (inclusion.x, inclusion.y, inclusion.z)
+            if not self.body.contains(centre):
+                message = f"its centre lies outside the body [0, {list(self.body.size)}]"
+                yield ("inclusions", i), message, list(centre)
         yield from self._mistakes_of_outputs()
         yield from self._contradictions()
         moved = {axis for item in self.displacements for axis in item.components}

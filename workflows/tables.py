@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from workflows.config import Study
-from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, worth
+from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,7 +46,7 @@ class Results:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
         text = with_error(float(of_output[name]), float(of_output[f"{name}_error"]))
-        return _with_unit(text, self.unit(output))
+        return with_unit(text, self.unit(output))
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""
@@ -72,7 +72,7 @@ def parameters(results: Results) -> Table:
 def nominal(results: Results) -> Table:
     """Outputs at the mean parameters."""
     values = results.dataset["nominal"].to_numpy()
-    rows = [(o, _with_unit(number(v, 6), results.unit(o))) for o, v in zip(results.outputs, values, strict=True)]
+    rows = [(o, with_unit(number(v, 6), results.unit(o))) for o, v in zip(results.outputs, values, strict=True)]
     return Table(("output", "value"), rows)
 
 
@@ -119,7 +119,7 @@ def quantiles(results: Results) -> Table:
     for output in results.outputs:
         of_output = results.dataset.sel(output=output)
         pairs = zip(of_output["quantiles"].to_numpy(), of_output["quantiles_error"].to_numpy(), strict=True)
-        rows.append((output, *(_with_unit(with_error(float(q), float(e)), results.unit(output)) for q, e in pairs)))
+        rows.append((output, *(with_unit(with_error(float(q), float(e)), results.unit(output)) for q, e in pairs)))
     return Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 
@@ -129,9 +129,9 @@ def sensitivities(results: Results, output: str) -> Table:
     rows = []
     for name in results.parameters:
         of_parameter = slopes.sel(parameter=name)
-        slope = _with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
+        slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
-        rows.append((name, slope, *(_with_unit(number(value), unit) for value in scaled)))
+        rows.append((name, slope, *(with_unit(number(value), unit) for value in scaled)))
     return Table(("parameter", "derivative", "× standard deviation", "× range"), rows)
 
 
@@ -144,7 +144,7 @@ def field_norms(results: Results) -> Table:
         norm, std = float(of_parameter["field_derivative_norm"]), float(of_parameter["parameter_std"])
         over_range = float(of_parameter["field_derivative_norm_per_range"])
         slope = f"{number(norm, 5)} {per('m', unit_of(name))}"
-        rows.append((name, slope, _with_unit(number(norm * std), "m"), _with_unit(number(over_range), "m")))
+        rows.append((name, slope, with_unit(number(norm * std), "m"), with_unit(number(over_range), "m")))
     return Table(("parameter", "norm of the derivative", "× standard deviation", "× range"), rows)
 
 
@@ -152,7 +152,7 @@ def failures(results: Results) -> Table:
     """The solves that failed: parameters and reason."""
     names = results.parameters
     rows = [
-        (*(f"{number(f['parameters'][name], 6)} {unit_of(name)}" for name in names), f["reason"])
+        (*(with_unit(number(f["parameters"][name], 6), unit_of(name)) for name in names), f["reason"])
         for f in results.summary["failures"]
     ]
     last = frozenset({len(names)})
@@ -213,14 +213,10 @@ def estimates(studies: dict[str, Results], output: str) -> Table:
             continue
         central = number(float(results.dataset["nominal"].sel(output=output)), 6)
         shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
-        rows.append((name, *shown, _with_unit(central, results.unit(output))))
+        rows.append((name, *shown, with_unit(central, results.unit(output))))
     return Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)
 
 
 def solves(summary: dict[str, Any]) -> str:
     """The number of solves."""
     return "1 solve" if summary["evaluations"] == 1 else f"{summary['evaluations']:,} solves"
-
-
-def _with_unit(text: str, unit: str) -> str:
-    return text if unit == "1" or text == NONE else f"{text} {unit}"

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, assert_never
 
+from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
 from forward.materials import MATERIALS
 from forward.outputs import Output
@@ -55,15 +56,24 @@ def worth(ratio: float) -> str:
 
 
 def unit_of(path: str) -> str:
-    """SI unit of a number of the model, by its path."""
+    """SI unit of a number of the model, by its path; "1" of a ratio."""
     if path.endswith(".density"):
         return "kg/m³"
+    if path.startswith("inclusions."):
+        return "1" if path.endswith(".contrast") else "m"
     return "m" if path.startswith("displacements.") else "Pa"
 
 
 def per(unit: str, divisor: str) -> str:
     """Unit of a derivative."""
+    if divisor == "1":
+        return unit
     return f"{unit}/({divisor})" if "/" in divisor else f"{unit}/{divisor}"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Write a number with its unit, if it has one."""
+    return text if unit == "1" or text == NONE else f"{text} {unit}"
 
 
 def settings(block: dict[str, Any], *left_out: str) -> str:
@@ -82,6 +92,8 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    if model.inclusions:
+        yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     held = [f"{boundary} clamped" for boundary in model.clamp] + [
         f"{item.on}: u{axis} = {_scalar(study, f'displacements.{item.label}.{axis}')}"
         for item in model.displacements
@@ -96,6 +108,16 @@ def _output(output: Output) -> str:
     details = settings(output.model_dump(), "kind", "name")
     unit = "" if output.unit == "1" else f" ({output.unit})"
     return f"{output.name}: {output.kind}{', ' if details else ''}{details}{unit}"
+
+
+def _inclusion(study: Study, inclusion: Inclusion) -> str:
+    numbers = [
+        f"{name} = {_scalar(study, f'inclusions.{inclusion.label}.{name}')}"
+        for name in type(inclusion).model_fields
+        if name not in {"kind", "name"}
+    ]
+    named = f"{inclusion.name} ({inclusion.kind})" if inclusion.name else inclusion.kind
+    return f"{named}: {', '.join(numbers)}"
 
 
 def _load(study: Study, load: Load) -> str:
@@ -116,7 +138,7 @@ def _scalar(study: Study, path: str) -> str:
     """A number of the model with its unit, or that it is random."""
     if path in study.parameters:
         return "random"
-    return f"{number(study.model.scalars[path].value, 6)} {unit_of(path)}"
+    return with_unit(number(study.model.scalars[path].value, 6), unit_of(path))
 
 
 def _value(value: Any) -> str:
