@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, newton, throughput, variance
+from benchmarks import bookkeeping, newton, stability, throughput, variance
 
 ALL = {
     "newton": newton.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,
+    "stability": stability.main,
 }
 
 
