@@ -41,7 +41,7 @@ SAME = 1e-6  # states, relative to their size, that count as one
 EQUILIBRIUM = 1e-6  # relative residual that counts as none, as does what is rounding
 LIMIT = 60  # seconds after which a solve counts as hanging
 PATH = 12  # small load steps that check an answer, or more,
-PATIENCE = 3  # but no longer than so many seconds
+PATIENCE = 2  # but no longer than so many seconds
 EXPLAINED = re.compile(r"^stopped at [\d.e+-]+ % of the load: \w+")
 REFERENCE_UNKNOWNS = 3000  # what a finer mesh may have to be cheap
 LIMIT_RATIO = 1e3  # κ/μ of the finer mesh at most: beyond it, it locks, and bending changes by less than 1e-3
@@ -141,9 +141,9 @@ def inclusions() -> Iterator[Case]:
 def studies() -> Iterator[Case]:
     """The shipped studies, with every parameter at an end of its distribution."""
     seen = []
-    for path in sorted(CONFIG.parent.glob("*.toml")):
+    for path in sorted(CONFIG.parent.glob("*.toml"), key=lambda path: (len(path.stem), path)):
         study = load(path)
-        if (study.model, study.parameters) in seen:
+        if (study.model, study.parameters) in seen:  # by another method
             continue
         seen.append((study.model, study.parameters))
         ends = {name: [d.at(p) for p in (1e-6, 1 - 1e-6)] for name, d in study.parameters.items()}
@@ -185,11 +185,12 @@ def cells() -> Iterator[Case]:
 def collapse() -> Iterator[Case]:
     """The published beam under multiples of its weight."""
     model = load(CONFIG.with_name("tiny.toml")).model
-    for name, n in {"4 × 1 × 2": [4, 1, 2], "8 × 1 × 3": [8, 1, 3]}.items():
+    for name, n in {"4 × 1 × 2": [4, 1, 2], "6 × 1 × 2": [6, 1, 2]}.items():
         spec = Hyperelastic.model_validate(model.model_dump() | {"body": model.body.model_dump() | {"cells": n}})
         for times in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000):
             numbers = (("loads.gravity.density", 750.0 * times),)
-            yield Case("weight of the slender beam", f"{times}", name, spec, numbers, finer(spec, numbers))
+            other = finer(spec, numbers) if times <= 10 else None
+            yield Case("weight of the slender beam", f"{times}", name, spec, numbers, other)
 
 
 def finer(spec: Hyperelastic, numbers: tuple[tuple[str, float], ...]) -> Any:
@@ -410,6 +411,9 @@ def main(*names: str) -> None:
                 print("| " + " | ".join(map(str, (r.y, r.x, r.outcome, *counts, *rest, r.note))) + " |")
     counts = {outcome: sum(r.outcome == outcome for r in rows) for outcome in COLOURS}
     print(f"\n{', '.join(f'{count} {outcome}' for outcome, count in counts.items())}")
+    unstable = sum(r.outcome == "converged" and r.negative > 0 for r in rows)
+    alone = sum(r.outcome == "converged" and np.isnan(r.path) for r in rows)
+    print(f"of the converged, small steps did not arrive in time at {alone}; {unstable} are unstable")
     print(f"<!-- {len(rows)} cases, {time.perf_counter() - begin:.0f} s -->")
     TABLE.parent.mkdir(exist_ok=True)
     with TABLE.open("w", newline="", encoding="utf-8") as file:
@@ -438,12 +442,13 @@ def draw(rows: list[Row]) -> None:
             i, j = xs.index(row.x), ys.index(row.y)
             unstable = row.outcome == "converged" and row.negative > 0
             hatch = "///" if unstable else ""
+            text = "white" if row.outcome in {"WRONG", "SILENT"} else "black"
             ax.add_patch(
                 Rectangle(
                     (i - 0.48, j - 0.48), 0.96, 0.96, facecolor=COLOURS[row.outcome], edgecolor="white", hatch=hatch
                 )
             )
-            ax.text(i, j, str(row.factorisations), ha="center", va="center", fontsize=9)
+            ax.text(i, j, str(row.factorisations), ha="center", va="center", fontsize=9, color=text)
         ax.set(title=family, xlabel=across, ylabel=down, xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
         ax.set_xticks(range(len(xs)), xs)
         ax.set_yticks(range(len(ys)), ys)
