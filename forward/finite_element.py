@@ -23,6 +23,7 @@ from forward.acceleration import Inverse, block_gcr
 from forward.functionals import functional
 from forward.geometry import AXES
 from forward.hyperelastic import Hyperelastic
+from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
@@ -34,7 +35,7 @@ STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of block GCR, before a factor is made after all
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
-_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt)
+_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh)
 
 
 class Discretisation:
@@ -98,10 +99,25 @@ class Discretisation:
     def energy_of(self, F: Any) -> Any:
         """Energy density of a deformation gradient, as UFL; in the mixed form, without that of the change of volume."""
         energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
-        values = {path.split(".")[1]: v for path, v in self._variables.items() if path.startswith("material.")}
+        values = self._numbers("material")
         if self.p is not None:
             values["D1"] = 0
-        return energy(_OPS, *kinematics.invariants(ufl, F), **values)
+        return self.stiffness_factor * energy(_OPS, *kinematics.invariants(ufl, F), **values)
+
+    @cached_property
+    def stiffness_factor(self) -> Any:
+        """What the inclusions multiply every modulus by, as a UFL expression of the place; 1 without inclusions."""
+        factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        X = ufl.SpatialCoordinate(self.mesh)
+        for inclusion in self.spec.inclusions:
+            numbers = self._numbers(f"inclusions.{inclusion.label}")
+            factor *= stiffness_factor(_OPS, X, inclusion.kind, **numbers)
+        return factor
+
+    def _numbers(self, block: str) -> dict[str, Any]:
+        """Return the numbers of a block of the model, by their names, as variables of forms."""
+        paths = (path.rpartition(".") for path in self._variables)
+        return {name: self._variables[f"{block}.{name}"] for place, _, name in paths if place == block}
 
     def _energies(self) -> tuple[Any, Any, Any]:
         """Densities of the stored energy, of the potential whose derivative is the imbalance, and of the volume change.
@@ -112,7 +128,7 @@ class Discretisation:
         energy = self.energy_of(self.F)
         if self.p is None:
             return energy, energy, self.J - 1
-        bulk = 2 * self._variables["material.D1"]
+        bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
         of_pressure = self.p**2 / (2 * bulk)
         return energy + of_pressure, energy + self.p * (self.J - 1) - of_pressure, self.p / bulk
 
@@ -215,7 +231,7 @@ class Discretisation:
                 self._constants[other].value = float(other == path)
             forces[path] = self._imbalance(np.zeros(self.size)) - forces.get("", 0.0)
             forces[path][self.fixed] = 0
-            if path == "" and self.norm(forces[path]) <= self.rounding():
+            if path == "" and self.norm(forces[path]) <= self.rounding(np.zeros(self.size), 0.0):
                 forces[path][:] = 0
         for path in paths:
             self._constants[path].value = self._values[path]
@@ -369,11 +385,12 @@ class Discretisation:
             return 0.0
         return lacking * self._force_per_volume()
 
-    def rounding(self) -> float:
-        """What the size of a residual cannot be expected to fall below, whatever the loads (N).
+    def rounding(self, u: FloatArray, scale: float) -> float:
+        """What the size of a residual with this scale (N) cannot be expected to fall below at u (U_local,).
 
         Stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch (more
-        of them where it is along one axis only).
+        of them where it is along one axis only). In a body that is turned or strained far, the last digits of u weigh
+        more: ‖F(u (1 ± ε)) − F(u)‖, of which so much counts as still leaves four digits of the loads.
         """
         if self._rounding is None:
             load = self._load.value.copy()
@@ -381,7 +398,10 @@ class Discretisation:
             few = 4 if self.p is None else 16
             self._rounding = few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
             self._load.value = load
-        return self._rounding
+        last_digits = np.where(np.arange(self.size) % 2 == 0, 1.0, -1.0) * np.finfo(float).eps
+        change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
+        change[self.fixed] = 0
+        return max(self._rounding, min(2 * self.norm(change), 1e-4 * scale))
 
     def on_target(self, u: FloatArray) -> FloatArray:
         """Return u (U_local,) with the prescribed unknowns at their targets."""

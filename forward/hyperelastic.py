@@ -8,10 +8,12 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
 
 import numpy as np
+from annotated_types import Ge, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.geometry import AXES, Body
+from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Load
 from forward.materials import MATERIALS, constants, small_strain_moduli, splits
 from forward.newton import SolverSettings
@@ -58,20 +60,20 @@ class Scalar(NamedTuple):
     value: float
     block: type[Settings]
     field: str
+    limits: tuple[Any, ...] = ()  # beyond those of the field
 
     def objection(self, value: float) -> str | None:
         """Say why the number cannot be `value`, or nothing if it can."""
         try:
-            _admissible(self.block, self.field).validate_python(value)
+            _admissible(self.block, self.field, self.limits).validate_python(value)
         except ValidationError as error:
             return str(error.errors()[0]["msg"]).lower()
         return None
 
 
 @cache
-def _admissible(block: type[Settings], field: str) -> TypeAdapter[float]:
-    limits = block.model_fields[field].metadata
-    return TypeAdapter(Annotated[(float, Field(), *limits)])
+def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> TypeAdapter[float]:
+    return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
 
 
 class Hyperelastic(Settings):
@@ -83,6 +85,8 @@ class Hyperelastic(Settings):
         Geometry and mesh.
     material
         Strain energy and its constants.
+    inclusions
+        Regions that are stiffer or softer: their factors multiply the energy density.
     clamp
         Boundaries that do not move.
     displacements
@@ -104,6 +108,7 @@ class Hyperelastic(Settings):
     formulation: Literal["displacement", "mixed", "auto"] = "auto"
     body: Body
     material: Material
+    inclusions: tuple[Inclusion, ...] = ()
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
@@ -122,6 +127,13 @@ class Hyperelastic(Settings):
         for name in type(self.material).model_fields:
             if name != "kind":
                 found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for inclusion in self.inclusions:
+            for name in type(inclusion).model_fields:
+                if name not in {"kind", "name"}:
+                    low, high = self.body.bounds[AXES.index(name)] if name in AXES else (0.0, 0.0)
+                    within = (Ge(low), Le(high)) if name in AXES else ()
+                    value = getattr(inclusion, name)
+                    found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         for load in self.loads:
             size = LOAD_SIZES[load.kind]
             found[f"loads.{load.label}.{size}"] = Scalar(getattr(load, size), type(load), size)
@@ -198,11 +210,21 @@ class Hyperelastic(Settings):
         unknown = [(place, on) for place, on in places if on not in boundaries]
         for place, on in unknown:
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
-        for block, label in (("displacements", "label"), ("loads", "label"), ("outputs", "name")):
+        for block, label in (
+            ("inclusions", "label"),
+            ("displacements", "label"),
+            ("loads", "label"),
+            ("outputs", "name"),
+        ):
             names = Counter(getattr(item, label) for item in getattr(self, block))
             for name, count in names.items():
                 if count > 1:
                     yield (block,), f"{count} of them are called '{name}', expected different names", name
+        for i, inclusion in enumerate(self.inclusions):
+            centre = (inclusion.x, inclusion.y, inclusion.z)
+            if not self.body.contains(centre):
+                message = f"its centre lies outside the body, which lies in {self._bounds}"
+                yield ("inclusions", i), message, list(centre)
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
         yield from self._contradictions()
@@ -218,6 +240,10 @@ class Hyperelastic(Settings):
             message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
             yield ("displacements",), message, ()
 
+    @property
+    def _bounds(self) -> str:
+        return " × ".join(f"[{low:g}, {high:g}]" for low, high in self.body.bounds) + " m"
+
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
         held = set(self.clamp) | {item.on for item in self.displacements}
         for i, output in enumerate(self.outputs):
@@ -228,8 +254,7 @@ class Hyperelastic(Settings):
                     output.on,
                 )
             if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
-                bounds = " × ".join(f"[{low:g}, {high:g}]" for low, high in self.body.bounds)
-                yield ("outputs", i, "at"), f"outside the body, which lies in {bounds} m", list(output.at)
+                yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
 
     def _mistakes_of_formulation(self) -> Iterator[Mistake]:
         if self.formulation == "mixed" and not self._splits:

@@ -9,21 +9,10 @@ from annotated_types import Ge
 from pydantic import Field, field_validator, model_validator
 
 from forward.geometry import AXES, Axis, Vector
-from forward.settings import Settings
+from forward.settings import Named
 
 
-class _Named(Settings):
-    """Something that parameter paths refer to by its name (by default its kind)."""
-
-    name: str = Field(default="", pattern=r"^[^.\s]*$")
-
-    @property
-    def label(self) -> str:
-        """The name in parameter paths."""
-        return self.name or str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
-
-
-class _Directed(_Named):
+class _Directed(Named):
     """A load along a direction, which is normalised."""
 
     direction: Vector
@@ -61,7 +50,7 @@ class Traction(_Directed):
     size: float
 
 
-class Pressure(_Named):
+class Pressure(Named):
     """Pressure of `size` (Pa) on a boundary, normal to the *deformed* surface and pushing inwards."""
 
     kind: Literal["pressure"] = "pressure"
@@ -73,7 +62,7 @@ Load = Annotated[Gravity | Traction | Pressure, Field(discriminator="kind")]
 LOAD_SIZES = {"gravity": "density", "traction": "size", "pressure": "size"}
 
 
-class Displacement(_Named):
+class Displacement(Named):
     """Displacement (m) prescribed on a boundary, component by component; components left out are free."""
 
     on: str

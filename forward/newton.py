@@ -52,7 +52,7 @@ class SolverSettings(Settings):
     iterations: Annotated[int, Field(ge=1)] = 25
     corrections: Annotated[int, Field(ge=1)] = 40
     minimum_damping: Annotated[float, Field(gt=0, lt=1)] = 1e-3
-    minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 512
+    minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 8192
     accept_unstable: bool = False
 
 
@@ -64,6 +64,8 @@ ROUGH = 1e-2  # relative residual of a state that only serves to predict the nex
 SHORTEST = 1 / 8  # part of the way from the reference that is not divided any more
 NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
+ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
+SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
 STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
 
 
@@ -117,8 +119,8 @@ class System(Protocol):
     def residual(self, u: FloatArray) -> Residual:
         """Return the imbalance at u."""
 
-    def rounding(self) -> float:
-        """What the size of a residual cannot be expected to fall below, whatever the loads (N)."""
+    def rounding(self, u: FloatArray, scale: float) -> float:
+        """What the size of a residual with this scale cannot be expected to fall below at u, whatever the loads (N)."""
 
     def factorise(self, u: FloatArray) -> None:
         """Assemble and factorise the stiffness at u.
@@ -275,10 +277,13 @@ def _mix(
     """Correct u with one factor; return the best state, and whether it is an equilibrium."""
     mixing = AndersonMixing(inverse, WINDOW, len(u), system.total, system.weights())
     best, smallest, since = u, residual, 0
+    sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(limit + 1):
         history.append(f"correction {iteration}: relative residual {residual.relative:.3e}")
-        if _converged(system, tolerance, residual, last[1] if last else None):
+        if residual.size > ROUNDED * residual.scale > 0:
+            sizes.clear()  # corrections falter before they are close
+        if _converged(system, tolerance, u, residual, sizes):
             # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
             convex = last is None or float(system.total((u - last[0]) @ (residual.vector - last[1].vector))) >= 0
             return u, convex and system.smallest_jacobian(u) > 0
@@ -297,16 +302,19 @@ def _mix(
     return best, False
 
 
-def _converged(system: System, tolerance: float, residual: Residual, previous: Residual | None) -> bool:
-    """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding."""
+def _converged(system: System, tolerance: float, u: FloatArray, residual: Residual, sizes: list[float]) -> bool:
+    """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding.
+
+    `sizes` are those of the residuals before, to which this one is added.
+    """
     if residual.gap != 0:
         return False
     size = max(residual.size, residual.volume)
     if size <= tolerance * residual.scale:
         return True
-    unloaded = residual.scale == 0
-    stalled = previous is not None and previous.gap == 0 and size > STALLED * max(previous.size, previous.volume)
-    return (unloaded or stalled) and size <= system.rounding()
+    stalled = bool(sizes) and size > STALLED * sizes[-1]
+    sizes.append(size)
+    return (residual.scale == 0 or stalled) and size <= system.rounding(u, residual.scale)
 
 
 def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> FloatArray:
@@ -323,6 +331,9 @@ def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, hist
             slope = np.zeros_like(zero)
             if step < settings.minimum_load_step:
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
+                jacobian = system.smallest_jacobian(u)
+                if jacobian < SQUEEZED:
+                    message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
                 raise SolveError(message, history, system.work) from None
             continue
         slope = (found - u) / (load - reached)
@@ -349,14 +360,14 @@ def _iterate(
     system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
 ) -> tuple[FloatArray, int]:
     residual = system.residual(u)
-    previous: Residual | None = None
+    sizes: list[float] = []
     longest, length = 0.0, np.inf
     if not np.isfinite(residual.size):
         message = "the starting state has no finite residual"
         raise _Diverged(message)
     for iteration in range(settings.iterations + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
-        if _converged(system, settings.tolerance, residual, previous):
+        if _converged(system, settings.tolerance, u, residual, sizes):
             return _accepted(system, settings, u, factorised=iteration > 0), iteration
         if iteration == settings.iterations:
             break
@@ -366,13 +377,12 @@ def _iterate(
         if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest):
             raise _Diverged("the Newton steps grow" + _instability(system))
         longest = max(longest, length)
-        previous = residual
         u, residual = _admissible_step(system, settings, u, step)
         if settings.kind != "newton" and length < NEAR * before < np.inf:
             u, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
                 return _accepted(system, settings, u, factorised=True), iteration + 1
-            previous, residual = residual, system.residual(u)
+            residual = system.residual(u)
     message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
     raise _Diverged(message + _instability(system))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 
@@ -27,6 +27,17 @@ class Settings(BaseModel):
             raise ValidationError.from_exception_data(
                 cls.__name__, [_explain(cls, line) for line in error.errors(include_url=False)]
             ) from None
+
+
+class Named(Settings):
+    """Something that parameter paths refer to by its name (by default its kind)."""
+
+    name: str = Field(default="", pattern=r"^[^.\s]*$")
+
+    @property
+    def label(self) -> str:
+        """The name in parameter paths."""
+        return self.name or str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
 
 
 def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:

@@ -22,7 +22,9 @@ def check(model, solution):
     body.at_load(1.0)
     residual = body.residual(solution.state)
     assert residual.gap == 0
-    assert residual.size <= max(model.spec.solver.tolerance * residual.scale, body.rounding())
+    assert residual.size <= max(
+        model.spec.solver.tolerance * residual.scale, body.rounding(solution.state, residual.scale)
+    )
     assert body.smallest_jacobian(solution.state) > 0
     assert np.isfinite(solution.outputs).all()
     model.visit(solution)

@@ -25,6 +25,7 @@ FLAT = tuple((x, y, x + y) for x, y, z in BLOCK["corners"])
 TRACTION = {"kind": "traction", "on": "x-max", "direction": (1.0, 0.0, 0.0), "size": 1.0}
 COUPLED = {"kind": "neo-hookean-coupled", "mu": 1.0, "lmbda": 1e6}
 MOVED = {"on": "x-max", "x": 0.1}
+TUMOUR = {"name": "tumour", "x": 0.5, "y": 0.5, "z": 0.5, "radius": 0.2, "contrast": 10.0, "width": 0.1}
 
 
 def mistakes(**changes):
@@ -89,6 +90,14 @@ def test_the_specification_without_mistakes_is_accepted():
         ({"body": BLOCK | {"corners": FLAT}}, "body.block", "no volume"),
         ({"body": BLOCK | {"cells": (2000, 2000, 2000)}}, "body.block", "at most 60 million"),
         ({"body": BLOCK, "clamp": ("left",)}, "clamp.0", "unknown boundary"),
+        ({"inclusions": (TUMOUR | {"y": 1.1},)}, "inclusions.0", "centre lies outside the body, which lies in [0, 1]"),
+        ({"inclusions": (TUMOUR, TUMOUR)}, "inclusions", "2 of them are called 'tumour'"),
+        ({"inclusions": (TUMOUR | {"contrast": 0.0},)}, "inclusions.0.contrast", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"radius": 0.0},)}, "inclusions.0.radius", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"width": 0.0},)}, "inclusions.0.width", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"kind": "cube"},)}, "inclusions.0.kind", "'sphere'"),
+        ({"inclusions": (TUMOUR | {"name": "a.b"},)}, "inclusions.0.name", "pattern"),
+        ({"inclusions": (TUMOUR | {"raduis": 0.1},)}, "inclusions.0.raduis", "did you mean 'radius'"),
         ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
         ({"formulation": "mixd"}, "formulation", "'displacement', 'mixed' or 'auto'"),
         ({"formulation": "mixed", "body": BLOCKS["body"] | {"degree": 1}}, "formulation", "expected body.degree = 2"),
@@ -146,6 +155,23 @@ def test_a_number_that_is_not_admissible_is_objected_to():
         assert spec.scalars[path].objection(2.0) is None
     for path in ("loads.traction.size", "displacements.x-max.x"):
         assert spec.scalars[path].objection(-2.0) is None
+
+
+def test_every_number_of_an_inclusion_has_limits():
+    spec = Hyperelastic.model_validate(BLOCKS | {"inclusions": (TUMOUR, TUMOUR | {"name": ""})})
+    paths = {path for path in spec.scalars if path.startswith("inclusions.")}
+    numbers = ("x", "y", "z", "radius", "contrast", "width")
+    assert paths == {f"inclusions.{label}.{name}" for label in ("tumour", "sphere") for name in numbers}
+    for name in numbers:
+        scalar = spec.scalars[f"inclusions.tumour.{name}"]
+        assert scalar.value == TUMOUR[name]
+        assert scalar.objection(0.7) is None
+    for name in ("radius", "contrast", "width"):
+        assert "greater than 0" in spec.scalars[f"inclusions.tumour.{name}"].objection(0.0)
+    for name in "xyz":
+        # The centre stays in the body.
+        assert "less than or equal to 1" in spec.scalars[f"inclusions.tumour.{name}"].objection(1.1)
+        assert "greater than or equal to 0" in spec.scalars[f"inclusions.tumour.{name}"].objection(-0.1)
 
 
 def test_a_specification_cannot_be_changed():

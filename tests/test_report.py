@@ -46,6 +46,18 @@ def study(**method):
     )
 
 
+def test_inclusions_in_words():
+    blocks = study().model_dump(exclude_none=True)
+    ball = {"name": "tumour", "x": 0.5, "y": 0.5, "z": 0.5, "radius": 0.2, "contrast": 4.0, "width": 0.1}
+    blocks["model"]["inclusions"] = [ball]
+    blocks["parameters"] = {"inclusions.tumour.radius": {"kind": "uniform", "lower": 0.1, "upper": 0.3}}
+    said = dict(words.model_in_words(parse(blocks)))["inclusions"]
+    assert said == ["tumour (sphere): x = 0.5 m, y = 0.5 m, z = 0.5 m, radius = random, contrast = 4, width = 0.1 m"]
+    assert words.unit_of("inclusions.tumour.contrast") == "1"
+    assert words.unit_of("inclusions.tumour.x") == "m"
+    assert words.per("m", "1") == "m"
+
+
 def function(point):
     density, bulk = point[0] / 750, point[1] / 3e5
     return np.array([0.1 * density**2 / bulk, -0.02 * density * bulk])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, assert_never
 
+from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
 from forward.materials import MATERIALS, units
 from forward.outputs import Output
@@ -60,6 +61,8 @@ def unit_of(path: str) -> str:
     if block == "material":
         # A name has the same unit in every material.
         return next(of[name] for of in map(units, MATERIALS.values()) if name in of)
+    if block == "inclusions":
+        return "1" if path.endswith(".contrast") else "m"
     if path.endswith(".density"):
         return "kg/m³"
     return "m" if block == "displacements" else "Pa"
@@ -94,6 +97,8 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    if model.inclusions:
+        yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     held = [f"{boundary} clamped" for boundary in model.clamp] + [
         f"{item.on}: u{axis} = {_scalar(study, f'displacements.{item.label}.{axis}')}"
         for item in model.displacements
@@ -108,6 +113,16 @@ def _output(output: Output) -> str:
     details = settings(output.model_dump(), "kind", "name")
     unit = "" if output.unit == "1" else f" ({output.unit})"
     return f"{output.name}: {output.kind}{', ' if details else ''}{details}{unit}"
+
+
+def _inclusion(study: Study, inclusion: Inclusion) -> str:
+    numbers = [
+        f"{name} = {_scalar(study, f'inclusions.{inclusion.label}.{name}')}"
+        for name in type(inclusion).model_fields
+        if name not in {"kind", "name"}
+    ]
+    named = f"{inclusion.name} ({inclusion.kind})" if inclusion.name else inclusion.kind
+    return f"{named}: {', '.join(numbers)}"
 
 
 def _load(study: Study, load: Load) -> str:
