@@ -445,7 +445,7 @@ def draw(rows: list[Row]) -> None:
             )
             ax.text(i, j, str(row.factorisations), ha="center", va="center", fontsize=9, color=text)
         ax.set(title=family, xlabel=across, ylabel=down, xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
-        ax.set_xticks(range(len(xs)), xs)
+        ax.set_xticks(range(len(xs)), xs, rotation=90 if len(xs) > 12 else 0)
         ax.set_yticks(range(len(ys)), ys)
         ax.spines[:].set_visible(False)
         ax.tick_params(length=0)

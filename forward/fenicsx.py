@@ -16,14 +16,18 @@ from typing import Any
 import basix
 import basix.cell
 import numpy as np
+import petsc4py
 import ufl
-from dolfinx import fem, geometry, mesh, plot
 from mpi4py import MPI
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from forward.geometry import AXES, Body
 from forward.model import FloatArray, SolveError
+
+petsc4py.init(["tissuq", "-no_signal_handler"])  # PETSc would end the study where a child process dies (SIGPIPE)
+
+from dolfinx import fem, geometry, mesh, plot  # noqa: E402
+from petsc4py import PETSc  # noqa: E402
 
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
 

@@ -448,6 +448,14 @@ class Discretisation:
         y[:, self.fixed] = x[:, self.fixed]
         return y
 
+    def curvature(self, move: FloatArray, change: FloatArray) -> float:
+        """Second difference of the energy along a move (U_local,), from the change of the imbalance.
+
+        The energy of displacements and pressures is a saddle, so that the pressures count with the other sign.
+        """
+        n = 3 * self.nodes_owned
+        return float(self.total(np.array([move[:n] @ change[:n] - move[n:] @ change[n:]]))[0])
+
     def total(self, values: FloatArray) -> FloatArray:
         """Sum over all ranks."""
         return fenicsx.total(self.comm, values)
@@ -633,7 +641,7 @@ class FiniteElementSolution:
     """An equilibrium with its linearisation.
 
     k derivatives cost one factorisation and k back-substitutions. Few derivatives of a solution that was found with a
-    reference are instead solved for with the factor of the reference, to the tolerance of the solver.
+    reference are instead solved for with the factor of the reference, to the solver's `derivative_tolerance`.
     """
 
     def __init__(
@@ -684,7 +692,7 @@ class FiniteElementSolution:
                 weights * right,
                 body.total,
                 body.norms,
-                model.spec.solver.tolerance,
+                model.spec.solver.derivative_tolerance,
                 ITERATIONS,
             )
             if found is not None:

@@ -35,6 +35,9 @@ class SolverSettings(Settings):
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
         prescribed); in the mixed form, also of the volumes, as the force of the pressure that they lack.
+    derivative_tolerance
+        Largest error of a tangent or adjoint of a solution that was found with a reference factor, relative to its
+        size. Derivatives of other solutions are exact.
     iterations
         Newton iterations allowed in one load step.
     corrections
@@ -49,6 +52,7 @@ class SolverSettings(Settings):
 
     kind: Literal["predict-correct", "newton"] = "predict-correct"
     tolerance: Annotated[float, Field(gt=0, le=1e-2)] = 1e-8
+    derivative_tolerance: Annotated[float, Field(gt=0, le=1e-2)] = 1e-6
     iterations: Annotated[int, Field(ge=1)] = 25
     corrections: Annotated[int, Field(ge=1)] = 40
     minimum_damping: Annotated[float, Field(gt=0, lt=1)] = 1e-3
@@ -136,6 +140,9 @@ class System(Protocol):
 
     def total(self, values: FloatArray) -> FloatArray:
         """Sum over all ranks."""
+
+    def curvature(self, move: FloatArray, change: FloatArray) -> float:
+        """Second difference of the energy along a move, from the change of the residual's vector."""
 
     def weights(self) -> FloatArray:
         """What turns a residual's vector into forces (N)."""
@@ -285,7 +292,7 @@ def _mix(
             sizes.clear()  # corrections falter before they are close
         if _converged(system, tolerance, u, residual, sizes):
             # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
-            convex = last is None or float(system.total((u - last[0]) @ (residual.vector - last[1].vector))) >= 0
+            convex = last is None or system.curvature(u - last[0], residual.vector - last[1].vector) >= 0
             return u, convex and system.smallest_jacobian(u) > 0
         if iteration > 0 and residual.size < smallest.size:
             best, smallest, since = u, residual, 0
@@ -404,7 +411,8 @@ def _accepted(system: System, settings: SolverSettings, u: FloatArray, *, factor
         _factorise(system, u)  # the factor at hand is that of a state nearby
         negative = system.negative_pivots()
         if negative > 0:
-            message = f"the equilibrium is unstable (its stiffness has {_counted(negative)}): the body buckles"
+            what = f"the equilibrium is unstable (its stiffness has {_counted(negative)})"
+            message = f"{what}: the body buckles, or its mesh is too coarse"
             raise _Diverged(message)
     return u
 
