@@ -35,7 +35,7 @@ outputs = [
     { name = "sag", kind = "max-displacement", component = "y" },
     { name = "energy", kind = "strain-energy" },
 ]
-# solver = { tolerance = 1e-8 }
+# solver = { tolerance = 1e-8 }  # or solver = "newton": the textbook, from zero with a new factor for every step
 
 [parameters]
 # Any number of the model by its path: material.*, loads.<name or kind>.density|size, displacements.<name or boundary>.x
