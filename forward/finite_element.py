@@ -73,12 +73,14 @@ class Discretisation:
         self._along = fenicsx.function(self.unknowns.whole)
         self._variation = ufl.TestFunction(self.unknowns.whole)
         self.u, self.p = self.unknowns.split(self._state)
-        self.test, _ = self.unknowns.split(self._variation)
+        self.test, self._test_pressure = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
+        self._invariants = tuple(ufl.variable(invariant) for invariant in kinematics.invariants(ufl, self.F))
+        self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
-        self._potentials, self._followers = self._loads()
-        self._symmetric = not self._followers
+        self._loads = self._virtual_works()
+        self._symmetric = not any(isinstance(load, Pressure) for load in spec.loads)
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
@@ -96,13 +98,13 @@ class Discretisation:
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
-    def energy_of(self, F: Any) -> Any:
-        """Energy density of a deformation gradient, as UFL; in the mixed form, without that of the change of volume."""
+    def energy_of(self, invariants: tuple[Any, Any, Any]) -> Any:
+        """Energy density of I1, I2 and J, as UFL; in the mixed form, without that of the change of volume."""
         energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
         values = self._numbers("material")
         if self.p is not None:
             values["D1"] = 0
-        return self.stiffness_factor * energy(_OPS, *kinematics.invariants(ufl, F), **values)
+        return self.stiffness_factor * energy(_OPS, *invariants, **values)
 
     @cached_property
     def stiffness_factor(self) -> Any:
@@ -125,12 +127,18 @@ class Discretisation:
         In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
         keeps its digits however small it is.
         """
-        energy = self.energy_of(self.F)
-        if self.p is None:
+        energy, J, p = self.energy_of(self._invariants), self._invariants[2], self._pressure
+        if p is None:
             return energy, energy, self.J - 1
         bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
-        of_pressure = self.p**2 / (2 * bulk)
-        return energy + of_pressure, energy + self.p * (self.J - 1) - of_pressure, self.p / bulk
+        of_pressure = p**2 / (2 * bulk)
+        return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
+
+    def _variation_of(self, density: Any) -> Any:
+        """First variation of a density of the invariants and the pressure: P : ∇v, and that of the pressure."""
+        slopes = tuple(ufl.diff(density, invariant) for invariant in self._invariants)
+        work = ufl.inner(kinematics.nominal_stress(ufl, self.F, slopes), ufl.grad(self.test))
+        return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
 
     def derivative(self, form: Any) -> Any:
         """Gâteaux derivative of a functional with respect to all unknowns."""
@@ -144,39 +152,33 @@ class Discretisation:
         """Compile a linear form."""
         return fenicsx.VectorAssembler(form, self.unknowns, self.comm)
 
-    def _loads(self) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-        """Potentials (integrand, measure) of energy and dead loads; virtual work of loads that follow the surface."""
-        potentials = [(self._potential, self.dx)]
-        followers = []
+    def _virtual_works(self) -> list[tuple[Any, Any]]:
+        """Virtual works (integrand, measure) of the loads, with the sign of forces that are out of balance."""
+        works = []
         for load in self.spec.loads:
             size = self._load * self._variables[f"loads.{load.label}.{LOAD_SIZES[load.kind]}"]
             match load:
                 case Gravity():
                     pull = fenicsx.constant(self.mesh, load.acceleration * np.array(load.unit))
-                    potentials.append((-size * ufl.dot(pull, self.u), self.dx))
+                    works.append((-size * ufl.dot(pull, self.test), self.dx))
                 case Traction():
                     direction = fenicsx.constant(self.mesh, load.unit)
-                    potentials.append((-size * ufl.dot(direction, self.u), self.surface(load.on)))
+                    works.append((-size * ufl.dot(direction, self.test), self.surface(load.on)))
                 case Pressure():
                     # Nanson's formula: the deformed area element is J F⁻ᵀ N dS.
                     normal = ufl.dot(self.J * ufl.inv(self.F).T, ufl.FacetNormal(self.mesh))
-                    followers.append((size * ufl.dot(normal, self.test), self.surface(load.on)))
-        return potentials, followers
+                    works.append((size * ufl.dot(normal, self.test), self.surface(load.on)))
+        return works
 
     def _imbalance_form(self, change: Callable[[Any], Any | None] = lambda integrand: integrand) -> Any | None:
         """Virtual work of all forces, with each integrand replaced by its `change`; nothing if all vanish."""
-        form = None
-        for integrand, measure in self._potentials:
+        density = change(self._potential)
+        terms = [] if density is None else [self._variation_of(density) * self.dx]
+        for integrand, measure in self._loads:
             changed = change(integrand)
             if changed is not None:
-                term = self.derivative(changed * measure)
-                form = term if form is None else form + term
-        for integrand, measure in self._followers:
-            changed = change(integrand)
-            if changed is not None:
-                term = changed * measure
-                form = term if form is None else form + term
-        return form
+                terms.append(changed * measure)
+        return sum(terms[1:], terms[0]) if terms else None
 
     def along_parameters(self, integrand: Any) -> Any | None:
         """Σ_i (∂ integrand/∂ω_i) dω_i with the direction dω as constants; nothing if it depends on no parameter."""
