@@ -8,22 +8,26 @@ from workflows.config import Study
 def seconds_per_solve(unknowns: int) -> float:
     """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so.
 
-    Fitted to 0.049, 0.222 and 1.277 s at 1 071, 3 375 and 13 209 unknowns (quadratic hexahedra, a 2.8 GHz core;
-    `python -m benchmarks newton`).
+    Fitted to 0.011, 0.067 and 0.98 s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core;
+    `python -m benchmarks realisation`). Inputs so wide that the prediction fails take several times as long.
     """
-    return float(6.24e-6 * unknowns**1.29)
+    return float(4e-3 + 1.2e-6 * unknowns**1.2)
+
+
+TEXTBOOK = 15  # times as long is a solve by the textbook, at 10⁴ unknowns
 
 
 def bytes_per_model(unknowns: int) -> float:
-    """Predict the memory of one model with its factorised stiffness, to a factor of two or so."""
-    return float(1.5e8 + 8 * (200 * unknowns + 30 * unknowns ** (4 / 3)))
+    """Predict the memory of one model with the factors of a solution and of a reference, to a factor of two or so."""
+    return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
 
 
 def plan(study: Study, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     unknowns = study.model.unknowns
     solves = study.method.planned
-    seconds = solves * seconds_per_solve(unknowns) / groups
+    each = seconds_per_solve(unknowns) * (TEXTBOOK if study.model.solver.kind == "newton" else 1)
+    seconds = solves * each / groups
     body = study.model.body
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
@@ -36,7 +40,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
         f"solves      {up_to}{solves:,}",
         f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
-        f" (rough; {seconds_per_solve(unknowns):.2g} s a solve)",
+        f" (rough; {each:.2g} s a solve)",
     ]
 
 
