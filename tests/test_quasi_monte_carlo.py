@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,15 @@ from uq.linearisation import linearise
 from uq.monte_carlo import MonteCarlo
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 from uq.sampling import sobol_points
+
+remembered = cache(sobol_points)
+
+
+@pytest.fixture(autouse=True)
+def points_are_drawn_once(monkeypatch):
+    """Repeats with other controls have the same points, which take most of the time."""
+    monkeypatch.setattr(quasi_monte_carlo, "sobol_points", remembered)
+
 
 UNIT = Uniform(lower=0.0, upper=1.0)
 ANGLE = Uniform(lower=-np.pi, upper=np.pi)
@@ -112,11 +122,12 @@ def test_a_wrong_second_moment_of_the_control_would_be_noticed(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coefficient", ["one", "optimal"])
-@pytest.mark.parametrize("control", CONTROLS)
-@pytest.mark.parametrize("name", ["ishigami", "product"])
-def test_claimed_intervals_cover_of_all(name, control, coefficient):
-    check_coverage(CASES[name], 600, samples=128, control=control, coefficient=coefficient)
+@pytest.mark.parametrize(
+    ("control", "coefficient"),
+    [("none", "one"), ("tangent", "one"), ("tangent", "optimal"), ("quadratic", "one"), ("quadratic", "optimal")],
+)
+def test_claimed_intervals_cover_where_controls_are_useless(control, coefficient):
+    check_coverage(ISHIGAMI, 250, samples=1024, control=control, coefficient=coefficient)
 
 
 @pytest.mark.parametrize(
@@ -155,22 +166,26 @@ def test_controls_are_exact_where_the_model_is_their_polynomial(coefficient):
 
 
 def test_the_better_the_control_the_smaller_the_error():
-    errors = [np.abs(repeats(PRODUCT, 8, samples=256, control=control)) for control in CONTROLS]
-    none, tangent, quadratic = (e.mean(axis=1) for e in errors)
+    errors = [repeats(PRODUCT, 12, samples=64, control=control) for control in CONTROLS]
+    none, tangent, quadratic = (np.sqrt((e**2).mean(axis=1)) for e in errors)
     for estimate in (0, 1, 2, 3):
-        assert quadratic[estimate] < tangent[estimate] < none[estimate]
+        assert 2 * quadratic[estimate] < tangent[estimate] < none[estimate]
 
 
 def test_an_optimal_coefficient_mends_a_control_that_hurts():
-    """A control of three times the right slope."""
+    """A control of three times the right slope: the coefficient is a third, and the estimate the same."""
     inputs, model, mean, variance = PRODUCT
-    wrong = FunctionModel(model.function, model.parameters, model.outputs, lambda p: 3 * np.array(model.jacobian(p)))
-    hurt, mended, right = (
-        np.abs(repeats((inputs, m, mean, variance), 20, samples=64, control="tangent", coefficient=c)[0]).mean()
-        for m, c in ((wrong, "one"), (wrong, "optimal"), (model, "one"))
-    )
-    assert mended < hurt / 3
-    assert mended < 3 * right
+    steep = FunctionModel(model.function, model.parameters, model.outputs, lambda p: 3 * np.array(model.jacobian(p)))
+    wrong = (inputs, steep, mean, variance)
+    hurt = repeats(wrong, 12, samples=256, control="tangent")
+    mended, right = (repeats(of, 12, samples=256, control="tangent", coefficient="optimal") for of in (wrong, PRODUCT))
+    np.testing.assert_allclose(mended, right, rtol=1e-6, atol=1e-12)
+    assert (np.abs(hurt).mean(axis=1) > 1.2 * np.abs(mended).mean(axis=1)).all()
+    slopes = [
+        QuasiMonteCarlo(samples=256, coefficient="optimal").run(inputs, SerialEvaluate(m))["coefficient"].item()
+        for m in (model, steep)
+    ]
+    assert slopes[0] == pytest.approx(3 * slopes[1])
 
 
 def test_quadratic_control_with_a_copula():
