@@ -29,7 +29,7 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
     assert path.read_text().startswith("# "), "a shipped study begins with what it shows and how long it takes"
 
 
-@pytest.mark.parametrize("kind", ["monte-carlo", "sensitivity-monte-carlo", "local-sensitivity"])
+@pytest.mark.parametrize("kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity"])
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind
 

@@ -196,6 +196,39 @@ def test_control_variate_that_hurts_is_called_so(tmp_path, sampled, undrawn):
     assert page.count("It hurts the mean: there, plain Monte Carlo is better.") == 1
 
 
+@pytest.mark.parametrize(("control", "words_"), [("none", "with Sobol"), ("tangent", "points and the control variate")])
+def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
+    method = {"kind": "quasi-monte-carlo", "samples": 64, "control": control}
+    dataset = solve(parse({**study().model_dump(mode="json", exclude_none=True), "method": method}))
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    sag = dataset.sel(output="sag")
+    for text in (
+        "Quasi-Monte Carlo: independent scrambles",
+        "64 samples (16 scrambles of 4 Sobol",
+        "scatter of 16 independent scrambles",
+        "a 95 % interval is ± 2.13 of them",
+        words_,
+        words.with_error(float(sag["mean"]), float(sag["mean_error"])) + " m",
+        words.with_error(float(sag["std"]), float(sag["std_error"])) + " m",
+        f"worth {words.worth(float(sag['variance_ratio']))} plain samples for the mean",
+    ):
+        assert text in page, text
+    assert page.count("<figure>") == 2 * 3 + 4 + 2
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("samples", [16, 64])
+def test_quasi_monte_carlo_is_drawn(samples):
+    method = {"kind": "quasi-monte-carlo", "samples": samples, "fields": False, "seed": 7}
+    dataset = solve(parse({**study().model_dump(mode="json", exclude_none=True), "method": method}))
+    for output in dataset.output.values:
+        for draw in (plots.convergence, plots.standard_error, plots.histogram, plots.tornado):
+            assert plots.png(draw(dataset, output)).startswith(PNG)
+    line = plots.standard_error(dataset, "sag").lines[0]
+    assert line.get_ydata()[-1] == dataset["mean_error"].sel(output="sag").item()
+    assert line.get_xdata()[-1] == samples
+
+
 def test_local_study_has_sensitivities_only(tmp_path, undrawn):
     case = parse({**study().model_dump(mode="json", exclude_none=True), "method": {"kind": "local-sensitivity"}})
     page = write_report(write(tmp_path / "out", solve(case))).read_text()

@@ -37,6 +37,15 @@ class _Distribution(Settings):
 
         return float(chaospy.E(self.dist)), float(chaospy.Std(self.dist))
 
+    @cached_property
+    def higher_moments(self) -> tuple[float, float]:
+        """Third and fourth central moments, by Gauss quadrature: raw moments would lose them by cancellation."""
+        import chaospy
+
+        (nodes,), weights = chaospy.generate_quadrature(3, self.dist, rule="gaussian")
+        deviations = nodes - self.moments[0]
+        return float(weights @ deviations**3), float(weights @ deviations**4)
+
     @property
     def support(self) -> tuple[float, float] | None:
         """Ends of a bounded range; nothing for a distribution with tails."""

@@ -89,9 +89,8 @@ class LocalSensitivity(Settings):
 
     kind: Literal["local-sensitivity"] = "local-sensitivity"
 
-    @property
-    def planned(self) -> int:
-        """Number of solves."""
+    def planned(self, dimension: int) -> int:
+        """Number of solves, whatever the number of parameters."""
         return 1
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
@@ -39,17 +40,13 @@ def monomials(w: FloatArray, L: FloatArray | None) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Moments:
+class Estimates:
     """Estimates with their standard errors, each of the shape of the quantity.
 
     Attributes
     ----------
     mean, mean_error, std, std_error
         In the unit of the quantity. Errors are one standard error; that of the standard deviation is by linearisation.
-    variance_ratio
-        Variance of one plain sample over that of one controlled sample (for the mean): above 1 the control helps.
-    std_variance_ratio
-        The same for the variance estimate.
     coefficient
         β₁.
     """
@@ -58,9 +55,29 @@ class Moments:
     mean_error: FloatArray
     std: FloatArray
     std_error: FloatArray
+    coefficient: FloatArray
+
+    @property
+    def relative_error(self) -> FloatArray:
+        """Standard error of the mean relative to the mean, or to the standard deviation where that is larger."""
+        scale = np.maximum(np.abs(self.mean), self.std)
+        return np.where(scale > 0, self.mean_error / np.where(scale > 0, scale, 1), 0)
+
+
+@dataclass(frozen=True)
+class Moments(Estimates):
+    """Estimates from independent samples, and what the control variate was worth.
+
+    Attributes
+    ----------
+    variance_ratio
+        Variance of one plain sample over that of one controlled sample (for the mean): above 1 the control helps.
+    std_variance_ratio
+        The same for the variance estimate.
+    """
+
     variance_ratio: FloatArray
     std_variance_ratio: FloatArray
-    coefficient: FloatArray
 
 
 def estimate(
@@ -102,8 +119,8 @@ def estimate(
     elif coefficient == "one":
         beta1, beta2 = zero + 1, zero + 1
     else:
-        beta1 = _ratio(mean_of(1, 1) - mean_of(1, 0) * mean_of(0, 1), mean_of(0, 2) - mean_of(0, 1) ** 2)
-        beta2 = _ratio(mean_of(2, 2) - mean_of(2, 0) * mean_of(0, 2), mean_of(0, 4) - mean_of(0, 2) ** 2)
+        beta1 = ratio(mean_of(1, 1) - mean_of(1, 0) * mean_of(0, 1), mean_of(0, 2) - mean_of(0, 1) ** 2)
+        beta2 = ratio(mean_of(2, 2) - mean_of(2, 0) * mean_of(0, 2), mean_of(0, 4) - mean_of(0, 2) ** 2)
     if second_moment == "linear":
         beta2 = zero
 
@@ -128,14 +145,87 @@ def estimate(
         mean=reference + m1,
         mean_error=np.sqrt(var1 / n),
         std=std,
-        std_error=_ratio(variance_error, 2 * std),
-        variance_ratio=_ratio(plain1, var1, empty=1.0),
-        std_variance_ratio=_ratio(plain_variance, n * variance_error**2, empty=1.0),
+        std_error=ratio(variance_error, 2 * std),
+        variance_ratio=ratio(plain1, var1, empty=1.0),
+        std_variance_ratio=ratio(plain_variance, n * variance_error**2, empty=1.0),
         coefficient=beta1,
     )
 
 
-def _ratio(a: FloatArray, b: FloatArray, empty: float = 0.0) -> FloatArray:
+def estimate_from_replicates(
+    means: FloatArray,
+    reference: FloatArray,
+    expected: tuple[FloatArray, FloatArray] | None = None,
+    coefficient: Coefficient = "one",
+) -> Estimates:
+    """Estimate mean and standard deviation from independent replicates, with errors from their scatter.
+
+    A replicate is a set of points, however these depend on each other, over which the mean of every function is
+    unbiased. With means over all replicates ⟨·⟩, the estimators are those of the module for a control C of the
+    deviation and D of its square:
+
+        mean:            ψ̄ + ⟨w − β₁(C − E[C])⟩
+        second moment:   ⟨w² − β₂(D − E[D])⟩
+
+    Parameters
+    ----------
+    means
+        Means (2, R, …) of w and w² over each of R replicates; (4, R, …) of w, w², C and D with a control.
+    reference
+        ψ̄ (…).
+    expected
+        E[C] and E[D] (…).
+    coefficient
+        β = 1, or the slope of the regression over the replicates: not the points but the replicates say what is left
+        for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20 (2005) 1–31). Its errors count the
+        fitted slopes and the distance of the controls from what is expected, as in any regression; R > 3.
+
+    Returns
+    -------
+    Estimates
+        Errors are one standard error, known to R − 1 degrees of freedom (R − 2 for the mean with fitted slopes): a
+        95 % interval is ± 2.13 of them for 16 replicates.
+    """
+    w, square = means[:2]
+    R = len(w)
+    beta1 = beta2 = leverage1 = leverage2 = np.zeros_like(reference)
+    if expected is not None:
+        c, d = means[2] - expected[0], means[3] - expected[1]
+        if coefficient == "one":
+            beta1 = beta2 = np.ones_like(reference)
+        else:
+            beta1, leverage1 = _regression(w, c)
+            beta2, leverage2 = _regression(square, d)
+        w, square = w - beta1 * c, square - beta2 * d
+    fitted = int(expected is not None and coefficient == "optimal")
+    m1 = w.mean(axis=0)
+    mean_variance = _scatter(w) / (R - 1 - fitted) * (1 / R + leverage1)
+    # ⟨w⟩² exceeds its square by its variance, which is added back.
+    variance = np.maximum(square.mean(axis=0) - m1**2 + mean_variance, 0)
+    variance_variance = _scatter(square - 2 * m1 * w) / (R - 1 - 2 * fitted) * (1 / R + leverage1 + leverage2)
+    std = np.sqrt(variance)
+    return Estimates(
+        mean=reference + m1,
+        mean_error=np.sqrt(mean_variance),
+        std=std,
+        std_error=ratio(np.sqrt(variance_variance), 2 * std),
+        coefficient=beta1,
+    )
+
+
+def _scatter(values: FloatArray) -> FloatArray:
+    return np.asarray(((values - values.mean(axis=0)) ** 2).sum(axis=0))
+
+
+def _regression(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slope of y on x, and x̄² over the scatter of x; the sets are rows."""
+    x_mean = x.mean(axis=0)
+    scatter = _scatter(x)
+    slope = ratio(((x - x_mean) * (y - y.mean(axis=0))).sum(axis=0), scatter)
+    return slope, ratio(x_mean**2, scatter)
+
+
+def ratio(a: FloatArray, b: FloatArray, empty: float = 0.0) -> FloatArray:
     """A / b, and `empty` where both vanish (a node that does not move)."""
     both = (a == 0) & (b == 0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -151,7 +241,32 @@ def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> tuple[Flo
     n = len(values)
     p = np.array(probabilities)
     spread = np.sqrt(p * (1 - p) / n)
+    return np.quantile(values, p, axis=0), _around(values, p, spread)
+
+
+def quantiles_from_replicates(
+    values: FloatArray, replicate: NDArray[np.int64], probabilities: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Sample quantiles (k, m) of all values (n, m), with errors from the scatter of the replicates (n,) they belong to.
+
+    As `quantiles`, with p ± the standard error over the replicates of the share of values below the quantile; a share
+    of n/R values is known to no better than a rounding error, 1/√12 of R/n.
+    """
+    p = np.array(probabilities)
     central = np.quantile(values, p, axis=0)
+    names = np.unique(replicate)
+    R = len(names)
+    below = values[None, :, :] <= central[:, None, :]
+    shares = np.array([below[:, replicate == name].mean(axis=1) for name in names])
+    floor = R / len(values) / np.sqrt(12 * R)
+    spread = np.maximum(shares.std(axis=0, ddof=1) / np.sqrt(R), floor)
+    errors = [
+        [_around(values[:, [j]], p[[i]], spread[i, [j]])[0, 0] for j in range(values.shape[1])] for i in range(len(p))
+    ]
+    return central, np.array(errors).reshape(central.shape)
+
+
+def _around(values: FloatArray, p: FloatArray, spread: FloatArray) -> FloatArray:
     upper = np.quantile(values, np.minimum(p + spread, 1), axis=0)
     lower = np.quantile(values, np.maximum(p - spread, 0), axis=0)
-    return central, (upper - lower) / 2
+    return np.asarray((upper - lower) / 2)

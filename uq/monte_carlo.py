@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 FIRST_ROUND = 64  # samples before a tolerance is first looked at
+UNLIMITED = 100_000  # samples that a tolerance may take where no limit is given
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -57,9 +59,13 @@ class MonteCarlo(Settings):
         return self
 
     @property
-    def planned(self) -> int:
-        """Number of solves, the largest where a tolerance may end the study earlier."""
-        return 1 + (self.samples or 100_000)
+    def limit(self) -> int:
+        """Number of samples, the largest where a tolerance may end the study earlier."""
+        return self.samples or UNLIMITED
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
+        return 1 + self.limit
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -135,7 +141,7 @@ def _sample(
     slopes = centre.slopes if control else None
     fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
-    limit = method.planned - 1
+    limit = method.limit
     target = limit if method.tolerance is None else min(limit, FIRST_ROUND)
     count = 0
     while True:
@@ -147,7 +153,7 @@ def _sample(
         if method.tolerance is None:
             stopped = f"{count} samples, as asked"
             break
-        reached = float(_relative_error(scalars).max())
+        reached = float(scalars.relative_error.max())
         if reached <= method.tolerance:
             stopped = f"tolerance {method.tolerance:g} met: relative error {reached:.3g} after {count} samples"
             break
@@ -157,11 +163,6 @@ def _sample(
         growth = min(4.0, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
         target = min(limit, int(count * growth) + 1)
     return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
-
-
-def _relative_error(moments: Moments) -> FloatArray:
-    scale = np.maximum(np.abs(moments.mean), moments.std)
-    return np.where(scale > 0, moments.mean_error / np.where(scale > 0, scale, 1), 0)
 
 
 def _scalar_moments(
@@ -237,15 +238,29 @@ def _dataset(
         fields = {f"field_{name}": getattr(field, name)[:count].reshape(-1, 3) for name in ESTIMATES}
         dataset = dataset.assign({name: (("node", "component"), values) for name, values in fields.items()})
     dataset.attrs["stopped"] = stopped
-    failed = int((~ok).sum())
-    if failed:
+    if not ok.all():
         which = "plain estimates" if control else "all estimates"
-        note = (
-            f"{failed} of {len(ok)} samples have no answer; {which} are over the {len(ok) - failed} others, "
-            "that is, conditional on the model having an answer"
-        )
-        if control:
-            # E[L] = 0 holds over all samples, also those that failed.
-            note += "; controlled estimates take the failed ones to follow the tangent, which their errors do not cover"
-        dataset.attrs["note"] = note
+        dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)
     return dataset
+
+
+def failure_note(ok: NDArray[np.bool_], which: str, followed: str | None) -> str:
+    """Say what estimates mean where some samples have no answer.
+
+    Parameters
+    ----------
+    ok
+        Which samples have an answer, not all of them.
+    which
+        The estimates that use nothing but answers.
+    followed
+        What the samples without an answer are taken to follow in controlled estimates, if there are any.
+    """
+    failed = int((~ok).sum())
+    note = f"{failed} of {len(ok)} samples have no answer"
+    if which:
+        note += f"; {which} are over the {len(ok) - failed} others, that is, conditional on the model having an answer"
+    if followed is not None:
+        # The mean of the control is known over all samples, also those that failed.
+        note += f"; controlled estimates take the failed ones to follow {followed}, which their errors do not cover"
+    return note

@@ -16,3 +16,18 @@ def random_points(seed: int, start: int, stop: int, dimension: int) -> FloatArra
     bits.advance(start * dimension)
     points = np.random.Generator(bits).random((stop - start, dimension))
     return np.clip(points, 2.0**-54, 1 - 2.0**-53)
+
+
+def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int) -> FloatArray:
+    """Return the Sobol' points number `start` to `stop` (stop − start, dimension) of one of the scrambles of `seed`.
+
+    A point is the same whichever range it is drawn in and however many scrambles there are. Each is uniform in the
+    cube by itself (a random linear scramble and a digital shift of 52 bits); different scrambles are independent.
+    """
+    from scipy.stats import qmc
+
+    engine = qmc.Sobol(dimension, scramble=True, bits=52, seed=np.random.default_rng([seed, scramble]))
+    # Balance, which scipy warns of, is a matter of whole powers of two.
+    points = engine.random(1 << (stop - 1).bit_length())[start:stop]
+    # The points are lower corners of cells of this size: the centres lie strictly inside the cube.
+    return np.asarray(points + 2.0**-53, dtype=float)

@@ -16,8 +16,9 @@ from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.quasi_monte_carlo import QuasiMonteCarlo
 
-Method = Annotated[MonteCarlo | SensitivityMonteCarlo | LocalSensitivity, Field(discriminator="kind")]
+Method = Annotated[MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity, Field(discriminator="kind")]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -75,6 +76,11 @@ class Study(Settings):
     def inputs(self) -> Inputs:
         """The random parameters."""
         return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def planned(self) -> int:
+        """Number of solves, the largest where a tolerance may end the study earlier."""
+        return self.method.planned(len(self.parameters))
 
     @model_validator(mode="after")
     def _check(self) -> Study:

@@ -25,7 +25,7 @@ def bytes_per_model(unknowns: int) -> float:
 def plan(study: Study, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     unknowns = study.model.unknowns
-    solves = study.method.planned
+    solves = study.planned
     each = seconds_per_solve(unknowns) * (TEXTBOOK if study.model.solver.kind == "newton" else 1)
     seconds = solves * each / groups
     body = study.model.body

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-BAND = 1.96  # standard errors on either side of a 95 % confidence band
 FIRST_SHOWN = 8  # estimates from fewer samples say nothing
 BARS = 15  # parameters that a tornado chart shows
 
@@ -57,15 +56,24 @@ def running_estimates(
     return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
 
 
+def band(dataset: xr.Dataset) -> float:
+    """Standard errors on either side of a 95 % confidence band: more where they come from a few scrambles."""
+    if "scramble" not in dataset:
+        return 1.96
+    from scipy.special import stdtrit
+
+    return float(stdtrit(int(dataset["scramble"].max()), 0.975))
+
+
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
     ax = ax or _axes()
-    for label, colour, counts, running in _series(dataset, output):
-        mean = np.array([m.mean for m in running])
-        half = BAND * np.array([m.mean_error for m in running])
+    series = _series(dataset, output)
+    for label, colour, counts, mean, error in series:
+        half = band(dataset) * error
         ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
         ax.plot(counts, mean, color=colour, label=label)
-    _count_axis(ax, int(dataset["ok"].sum()))
+    _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
     ax.set_ylabel(f"running mean of {_quantity(dataset, output)}")
     ax.legend(title="mean, 95 % band")
     return ax
@@ -76,12 +84,12 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     ax = ax or _axes()
-    for label, colour, counts, running in _series(dataset, output):
-        error = np.array([m.mean_error for m in running])
+    series = _series(dataset, output)
+    for label, colour, counts, _, error in series:
         ax.plot(counts, error, color=colour, label=label)
         ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
     ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
-    _count_axis(ax, int(dataset["ok"].sum()))
+    _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
@@ -154,7 +162,7 @@ def comparison(
     ax = ax or _axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
-    errors = [BAND * float(d[f"{estimated}_error"]) for d in shown.values()]
+    errors = [band(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
     ax.set_yticks(places, [_text(name) for name in shown])
     ax.set_ylim(-0.6, len(shown) - 0.4)
@@ -197,17 +205,24 @@ def _text(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def _series(dataset: xr.Dataset, output: str) -> list[tuple[str, str, NDArray[np.int64], list[Moments]]]:
-    """Label, colour, numbers of samples and running estimates of each estimator that the study has."""
+def _series(
+    dataset: xr.Dataset, output: str
+) -> list[tuple[str, str, NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Label, colour, numbers of samples, running mean and its standard error of each estimator that the study has."""
+    if "running_mean" in dataset:
+        mean, error = (dataset[f"running_{name}"].sel(output=output).to_numpy() for name in ("mean", "mean_error"))
+        return [("scrambled Sobol' points", CONTROLLED, dataset["round"].to_numpy(), mean, error)]
     n = int(dataset["ok"].sum())
     counts = np.unique(np.geomspace(_first(n), n, 160).round().astype(np.int64))
     kinds = [("plain", PLAIN, False)]
     if "variance_ratio" in dataset:
         kinds.append(("with sensitivity derivatives", CONTROLLED, True))
-    return [
-        (label, colour, counts, running_estimates(dataset, output, counts.tolist(), controlled=controlled))
-        for label, colour, controlled in kinds
-    ]
+    series = []
+    for label, colour, controlled in kinds:
+        running = running_estimates(dataset, output, counts.tolist(), controlled=controlled)
+        mean, error = np.array([m.mean for m in running]), np.array([m.mean_error for m in running])
+        series.append((label, colour, counts, mean, error))
+    return series
 
 
 def _first(n: int) -> int:
@@ -215,11 +230,11 @@ def _first(n: int) -> int:
     return max(2, min(FIRST_SHOWN, n // 2))
 
 
-def _count_axis(ax: Axes, n: int) -> None:
+def _count_axis(ax: Axes, first: int, n: int) -> None:
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     ax.set_xscale("log")
-    ax.set_xlim(_first(n), max(n, 3))
+    ax.set_xlim(first, max(n, first + 1))
     ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     ax.xaxis.set_minor_locator(NullLocator())

@@ -67,6 +67,15 @@ coefficient = "one"   # or "optimal": estimated on the samples
 second_moment = "quadratic"   # or "linear": the published form
 fields = true         # mean and standard deviation of the displacement at every node
 """,
+    "quasi-monte-carlo": """\
+kind = "quasi-monte-carlo"
+samples = 256         # scrambles × a power of two; or tolerance = 0.001: relative standard error of the means; or both
+scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
+control = "tangent"   # or "none", or "quadratic": two more solves for each parameter
+coefficient = "one"   # or "optimal": regression over the scrambles
+seed = 1
+fields = true         # mean and standard deviation of the displacement at every node
+""",
     "local-sensitivity": """\
 kind = "local-sensitivity"
 """,

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from workflows.config import Study
+from workflows.plots import band
 from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
 
 if TYPE_CHECKING:
@@ -98,13 +99,23 @@ class Gain:
 
 
 def gains(dataset: xr.Dataset) -> Iterator[Gain]:
-    """Say what the control variate is worth, output by output."""
+    """Say what the control variate, or quasi-random points, are worth, output by output."""
     if "variance_ratio" not in dataset:
         return
+    means = "the control variate"
+    if "scramble" in dataset:
+        means = "Sobol' points and the control variate" if "coefficient" in dataset else "Sobol' points"
+        R = int(dataset["scramble"].max()) + 1
+        spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
+        yield Gain(
+            f"Errors are from the scatter of {R} independent scrambles, and so known to {spread} % or so when squared; "
+            f"a 95 % interval is ± {number(band(dataset), 3)} of them.",
+            hurts=False,
+        )
     for output in dataset["output"].values:
         mean, std = (float(dataset[name].sel(output=output)) for name in ("variance_ratio", "std_variance_ratio"))
         text = (
-            f"{output}: with the control variate, one sample is worth {worth(mean)} plain samples for the mean "
+            f"{output}: with {means}, one sample is worth {worth(mean)} plain samples for the mean "
             f"and {worth(std)} for the standard deviation."
         )
         worse = [word for word, ratio in (("mean", mean), ("standard deviation", std)) if ratio < 1]

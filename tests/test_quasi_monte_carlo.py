@@ -1,0 +1,454 @@
+"""Randomised quasi-Monte Carlo on analytic models and on the finite-element beam."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy import stats
+
+from forward.model import FunctionModel, SolveError
+from tests.launch import run_script
+from uq import quasi_monte_carlo, taylor
+from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
+from uq.evaluate import SerialEvaluate
+from uq.inputs import Inputs
+from uq.linearisation import linearise
+from uq.monte_carlo import MonteCarlo
+from uq.quasi_monte_carlo import QuasiMonteCarlo
+from uq.sampling import sobol_points
+
+remembered = cache(sobol_points)
+
+
+@pytest.fixture(autouse=True)
+def points_are_drawn_once(monkeypatch):
+    """Repeats with other controls have the same points, which take most of the time."""
+    monkeypatch.setattr(quasi_monte_carlo, "sobol_points", remembered)
+
+
+UNIT = Uniform(lower=0.0, upper=1.0)
+ANGLE = Uniform(lower=-np.pi, upper=np.pi)
+CONTROLS = ("none", "tangent", "quadratic")
+
+
+def case(function, jacobian, mean, variance, *marginals):
+    """A model of one output with its inputs and its exact moments."""
+    names = tuple("abc"[: len(marginals)])
+    return (
+        Inputs(dict(zip(names, marginals, strict=True))),
+        FunctionModel(function, names, ("f",), jacobian),
+        mean,
+        variance,
+    )
+
+
+LINEAR = case(lambda p: 2 * p[0] - p[1] + 3, lambda p: [[2, -1]], 3.5, 5 / 12, UNIT, UNIT)
+QUADRATIC = case(
+    lambda p: p[0] + p[1] ** 2 / 2,
+    lambda p: [[1, p[1]]],
+    0.5 + 7 / 6,
+    1 / 12 + (31 / 5 - 49 / 9) / 4,
+    UNIT,
+    Uniform(lower=1.0, upper=2.0),
+)
+A, B = 7.0, 0.1
+ISHIGAMI = case(
+    lambda p: np.sin(p[0]) + A * np.sin(p[1]) ** 2 + B * p[2] ** 4 * np.sin(p[0]),
+    lambda p: [[np.cos(p[0]) * (1 + B * p[2] ** 4), A * np.sin(2 * p[1]), 4 * B * p[2] ** 3 * np.sin(p[0])]],
+    A / 2,
+    A**2 / 8 + B * np.pi**4 / 5 + B**2 * np.pi**8 / 18 + 1 / 2,
+    ANGLE,
+    ANGLE,
+    ANGLE,
+)
+PRODUCT = case(
+    lambda p: p[0] * p[1] * np.exp(p[2]),
+    lambda p: [np.exp(p[2]) * np.array([p[1], p[0], p[0] * p[1]])],
+    1.5**2 * (np.e - 1),
+    (7 / 3) ** 2 * (np.e**2 - 1) / 2 - (1.5**2 * (np.e - 1)) ** 2,
+    Uniform(lower=1.0, upper=2.0),
+    Uniform(lower=1.0, upper=2.0),
+    UNIT,
+)
+CASES = {"linear": LINEAR, "quadratic": QUADRATIC, "ishigami": ISHIGAMI, "product": PRODUCT}
+
+
+def repeats(of, count, **settings):
+    """Deviations of mean and variance from the exact ones, and the errors that were claimed, each (count,)."""
+    inputs, model, mean, variance = of
+    rows = []
+    for seed in range(count):
+        data = QuasiMonteCarlo(seed=seed, fields=False, **settings).run(inputs, SerialEvaluate(model))
+        e, s, es = data["mean"].item(), data["std"].item(), data["std_error"].item()
+        rows.append((e - mean, data["mean_error"].item(), s**2 - variance, 2 * s * es))
+    return np.array(rows).T
+
+
+def is_unbiased(deviations, scale):
+    """Whether deviations have the mean zero, by their own scatter; rounding errors of `scale` aside."""
+    return abs(deviations.mean()) < 4 * deviations.std(ddof=1) / np.sqrt(len(deviations)) + 1e-13 * scale
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("name", CASES)
+def test_mean_and_variance_are_unbiased(name, control):
+    mean, _, variance, _ = repeats(CASES[name], 60, samples=32, scrambles=4, control=control)
+    assert is_unbiased(mean, CASES[name][2])
+    assert is_unbiased(variance, CASES[name][3])
+
+
+def test_a_control_expanded_elsewhere_would_be_noticed(monkeypatch):
+    inputs = PRODUCT[0]
+    elsewhere = Inputs(dict.fromkeys(inputs.names, Uniform(lower=0.9, upper=2.1)))
+    monkeypatch.setattr(quasi_monte_carlo, "linearise", lambda _, evaluate: linearise(elsewhere, evaluate))
+    for control in ("tangent", "quadratic"):
+        mean, _, _, _ = repeats(PRODUCT, 60, samples=32, scrambles=4, control=control)
+        assert not is_unbiased(mean, PRODUCT[2])
+
+
+def test_a_wrong_second_moment_of_the_control_would_be_noticed(monkeypatch):
+    exact = taylor.tangent
+    monkeypatch.setattr(
+        quasi_monte_carlo,
+        "tangent",
+        lambda *a: replace(exact(*a), features_second=0.99 * exact(*a).features_second),
+    )
+    _, _, variance, _ = repeats(PRODUCT, 60, samples=256, scrambles=4, control="tangent")
+    assert not is_unbiased(variance, PRODUCT[3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("control", "coefficient"),
+    [("none", "one"), ("tangent", "one"), ("tangent", "optimal"), ("quadratic", "one"), ("quadratic", "optimal")],
+)
+def test_claimed_intervals_cover_where_controls_are_useless(control, coefficient):
+    check_coverage(ISHIGAMI, 250, samples=1024, control=control, coefficient=coefficient)
+
+
+@pytest.mark.parametrize(
+    ("control", "coefficient"), [("none", "one"), ("tangent", "one"), ("quadratic", "one"), ("quadratic", "optimal")]
+)
+def test_claimed_intervals_cover(control, coefficient):
+    check_coverage(PRODUCT, 250, samples=256, control=control, coefficient=coefficient)
+
+
+def check_coverage(of, count, **settings):
+    """The 95 % intervals of Student's distribution for 16 scrambles cover the mean in 92 to 98 % of the repeats."""
+    mean, mean_error, variance, variance_error = repeats(of, count, **settings)
+    t = stats.t.ppf(0.975, 15 if settings["coefficient"] == "one" else 14)
+    assert 0.92 <= (np.abs(mean) < t * mean_error).mean() <= 0.98
+    t = stats.t.ppf(0.975, 15 if settings["coefficient"] == "one" else 13)
+    assert 0.91 <= (np.abs(variance) < t * variance_error).mean() <= 0.99
+
+
+@pytest.mark.parametrize("name", ["ishigami", "product"])
+def test_converges_faster_than_monte_carlo(name):
+    few, many = (repeats(CASES[name], 12, samples=n, scrambles=8, control="none")[0].std() for n in (128, 2048))
+    assert few / many > 8, "16 times the samples: 4 for Monte Carlo"
+    inputs, model, _, _ = CASES[name]
+    plain = MonteCarlo(samples=2048, fields=False).run(inputs, SerialEvaluate(model))["mean_error"].item()
+    assert many < plain / 5
+
+
+@pytest.mark.parametrize("coefficient", ["one", "optimal"])
+def test_controls_are_exact_where_the_model_is_their_polynomial(coefficient):
+    for of, control in ((LINEAR, "tangent"), (QUADRATIC, "quadratic")):
+        mean, mean_error, variance, variance_error = repeats(
+            of, 3, samples=64, scrambles=8, control=control, coefficient=coefficient
+        )
+        for found in (mean, mean_error, variance, variance_error):
+            assert np.abs(found).max() < 1e-12
+
+
+def test_the_better_the_control_the_smaller_the_error():
+    errors = [repeats(PRODUCT, 12, samples=64, control=control) for control in CONTROLS]
+    none, tangent, quadratic = (np.sqrt((e**2).mean(axis=1)) for e in errors)
+    for estimate in (0, 1, 2, 3):
+        assert 2 * quadratic[estimate] < tangent[estimate] < none[estimate]
+
+
+def test_an_optimal_coefficient_mends_a_control_that_hurts():
+    """A control of three times the right slope: the coefficient is a third, and the estimate the same."""
+    inputs, model, mean, variance = PRODUCT
+    steep = FunctionModel(model.function, model.parameters, model.outputs, lambda p: 3 * np.array(model.jacobian(p)))
+    wrong = (inputs, steep, mean, variance)
+    hurt = repeats(wrong, 12, samples=256, control="tangent")
+    mended, right = (repeats(of, 12, samples=256, control="tangent", coefficient="optimal") for of in (wrong, PRODUCT))
+    np.testing.assert_allclose(mended, right, rtol=1e-6, atol=1e-12)
+    assert (np.abs(hurt).mean(axis=1) > 1.2 * np.abs(mended).mean(axis=1)).all()
+    slopes = [
+        QuasiMonteCarlo(samples=256, coefficient="optimal").run(inputs, SerialEvaluate(m))["coefficient"].item()
+        for m in (model, steep)
+    ]
+    assert slopes[0] == pytest.approx(3 * slopes[1])
+
+
+def test_quadratic_control_with_a_copula():
+    """Mean of ab is E[a]E[b] + Cov(a, b), which the quadratic control knows; the second moment has the tangent's."""
+    a, b = Uniform(lower=1.0, upper=2.0), LogNormal(mean=1.0, std=0.2)
+    inputs = Inputs({"a": a, "b": b}, (("a", "b", 0.7),))
+    model = FunctionModel(lambda p: p[0] * p[1], ("a", "b"), ("f",), lambda p: [[p[1], p[0]]])
+    data = QuasiMonteCarlo(samples=2048, control="quadratic").run(inputs, SerialEvaluate(model))
+    exact = inputs.mean.prod() + inputs.covariance[0, 1]
+    assert data["mean"].item() == pytest.approx(exact, rel=1e-12)
+    plain = QuasiMonteCarlo(samples=16 * 4096, control="none", fields=False).run(inputs, SerialEvaluate(model))
+    error = np.hypot(data["std_error"].item(), plain["std_error"].item())
+    assert abs(data["std"].item() - plain["std"].item()) < 4 * error
+
+
+@pytest.mark.parametrize(
+    ("marginal", "skewness", "kurtosis"),
+    [
+        (Uniform(lower=600.0, upper=900.0), 0, 1.8),
+        (Beta(a=2.0, b=2.0, lower=2e5, upper=4e5), 0, 15 / 7),
+        (Normal(mean=3e5, std=2e2), 0, 3),
+        (Gamma(shape=4.0, scale=0.25), 1, 4.5),
+        (LogNormal(mean=1e3, std=2e3), 14, 947),
+        (LogUniform(lower=1.0, upper=1e3), *(stats.loguniform.stats(1, 1e3, moments="sk") + np.array([0, 3]))),
+        (Triangular(lower=0.0, upper=1.0, mode=0.2), float(stats.triang.stats(0.2, moments="s")), 2.4),
+        (
+            TruncatedNormal(mean=1000.0, std=50.0, lower=900.0, upper=1200.0),
+            *(stats.truncnorm.stats(-2, 4, moments="sk") + np.array([0, 3])),
+        ),
+    ],
+    ids=lambda x: getattr(x, "kind", None),
+)
+def test_higher_moments(marginal, skewness, kurtosis):
+    third, fourth = marginal.higher_moments
+    std = marginal.moments[1]
+    assert third / std**3 == pytest.approx(skewness, abs=1e-6)
+    assert fourth / std**4 == pytest.approx(kurtosis, rel=1e-6)
+
+
+def test_moments_of_features():
+    """E[φ] and E[φφᵀ] against a Gauss rule of independent inputs that are not symmetric."""
+    marginals = {"a": Beta(a=2.0, b=5.0, lower=0.0, upper=3.0), "b": Gamma(shape=2.0, scale=0.5)}
+    inputs = Inputs(marginals)
+    model = FunctionModel(lambda p: p[0], ("a", "b"), ("f",), lambda p: [[1, 0]])
+    evaluate = SerialEvaluate(model)
+    of = taylor.quadratic(inputs, evaluate, linearise(inputs, evaluate), fields=False)
+    x, w = np.polynomial.legendre.leggauss(64)
+    y = 1.5 * (x + 1)
+    wa = w * stats.beta(2, 5, 0, 3).pdf(y) * 1.5
+    z, wb = np.polynomial.laguerre.laggauss(40)
+    wb = wb * z  # z e^{−z}: shape 2
+    grid = np.stack(np.meshgrid(y, z * 0.5, indexing="ij"), axis=-1).reshape(-1, 2)
+    weights = np.outer(wa, wb).ravel()
+    features = of.features(grid)
+    np.testing.assert_allclose(weights @ features, of.features_mean, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("n,nk,nl->kl", weights, features, features), of.features_second, atol=1e-9)
+
+
+# --- points, amounts and failures ----------------------------------------------------------------------------------
+
+
+def test_points_depend_on_their_numbers_only():
+    whole = sobol_points(5, 3, 0, 64, 4)
+    assert (whole > 0).all()
+    assert (whole < 1).all()
+    np.testing.assert_array_equal(sobol_points(5, 3, 16, 50, 4), whole[16:50])
+    assert not np.array_equal(sobol_points(5, 2, 0, 64, 4), whole)
+    assert not np.array_equal(sobol_points(6, 3, 0, 64, 4), whole)
+    # one point in each interval of 1/64, along each axis
+    assert (np.sort(np.floor(64 * whole), axis=0) == np.arange(64)[:, None]).all()
+
+
+def test_a_longer_study_begins_with_the_shorter_one():
+    inputs, model, _, _ = PRODUCT
+    short, long = (QuasiMonteCarlo(samples=n, seed=4).run(inputs, SerialEvaluate(model)) for n in (64, 256))
+    for name in ("points", "values", "scramble"):
+        np.testing.assert_array_equal(long[name][:64], short[name])
+    at = long.sel(round=64)
+    assert at["running_mean"].item() == short["mean"].item()
+    assert at["running_mean_error"].item() == short["mean_error"].item()
+    more = QuasiMonteCarlo(samples=128, scrambles=32, seed=4).run(inputs, SerialEvaluate(model))
+    np.testing.assert_array_equal(more["points"][more.scramble == 9], short["points"][short.scramble == 9])
+
+
+def test_tolerance_is_met_by_doubling():
+    inputs, model, _, _ = PRODUCT
+    asked = []
+
+    def counting(p):
+        asked.append(tuple(p))
+        return model.function(p)
+
+    counted = replace(model, function=counting)
+    data = QuasiMonteCarlo(tolerance=1e-5, seed=1).run(inputs, SerialEvaluate(counted))
+    n = data.sizes["sample"]
+    assert data["mean_error"].item() <= 1e-5 * data["mean"].item()
+    assert 64 < n < 100_000
+    assert n == 16 * 2 ** int(np.log2(n / 16))
+    assert len(asked) == 1 + n, "no point is asked for twice"
+    assert re.fullmatch(
+        r"tolerance 1e-05 met: relative error .* samples \(16 scrambles of \d+ Sobol' points\)", data.stopped
+    )
+    fixed = QuasiMonteCarlo(samples=n, seed=1).run(inputs, SerialEvaluate(model))
+    assert fixed["mean"].item() == data["mean"].item()
+    short = QuasiMonteCarlo(tolerance=1e-9, samples=128).run(inputs, SerialEvaluate(model))
+    assert short.sizes["sample"] == 128
+    assert "not met" in short.stopped
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": 300}, "samples = 300, expected scrambles = 16 times a power of two, such as 256 or 512"),
+        ({"samples": 10}, "such as 16"),
+        ({"samples": 96, "scrambles": 8}, "such as 64 or 128"),
+        ({"samples": 6, "scrambles": 3, "coefficient": "optimal"}, "expected at least 4"),
+        ({}, "neither samples nor tolerance"),
+    ],
+)
+def test_amounts_that_cannot_be(settings, message):
+    with pytest.raises(ValidationError, match=message):
+        QuasiMonteCarlo(**settings)
+
+
+def test_planned_solves():
+    inputs, model, _, _ = PRODUCT
+    for control, more in (("none", 0), ("tangent", 0), ("quadratic", 6)):
+        method = QuasiMonteCarlo(samples=64, control=control)
+        asked = []
+        counted = replace(model, function=lambda p, asked=asked: (asked.append(1), model.function(p))[1])
+        method.run(inputs, SerialEvaluate(counted))
+        assert method.planned(3) == len(asked) == 65 + more
+
+
+def test_failures_are_left_out_and_counted():
+    def fails_sometimes(p):
+        if p[0] > 0.95:
+            message = "gone"
+            raise SolveError(message)
+        return p[0]
+
+    model = FunctionModel(fails_sometimes, ("a", "b"), ("f",), lambda p: [[1, 0]])
+    inputs = Inputs({"a": UNIT, "b": UNIT})
+    for control in CONTROLS:
+        data = QuasiMonteCarlo(samples=512, control=control).run(inputs, SerialEvaluate(model))
+        failed = int((~data.ok).sum())
+        assert failed == pytest.approx(0.05 * 512, abs=16)
+        assert f"{failed} of 512 samples have no answer" in data.attrs["note"]
+        assert ("follow" in data.attrs["note"]) == (control != "none")
+        assert np.isfinite(data["mean"].item())
+    plain = QuasiMonteCarlo(samples=512, control="none").run(inputs, SerialEvaluate(model))
+    assert abs(plain["mean"].item() - 0.475) < 4 * plain["mean_error"].item() + 1 / 32
+
+
+def test_failures_that_leave_nothing_are_an_error():
+    def fails_off_centre(p):
+        if abs(p[0] - 0.5) > 1e-9:
+            message = "gone"
+            raise SolveError(message)
+        return p[0]
+
+    inputs = Inputs({"a": UNIT})
+    model = FunctionModel(fails_off_centre, ("a",), ("f",), lambda p: [[1]])
+    for control, message in (
+        ("tangent", "0 of 16 scrambles have an answer.*gone"),
+        ("quadratic", "near the mean.*gone"),
+    ):
+        with pytest.raises(SolveError, match=message):
+            QuasiMonteCarlo(samples=32, control=control).run(inputs, SerialEvaluate(model))
+
+
+def test_a_model_without_derivatives_needs_no_control():
+    inputs, model, mean, _ = PRODUCT
+    bare = replace(model, jacobian=None)
+    with pytest.raises(ValueError, match="no derivatives"):
+        QuasiMonteCarlo(samples=32).run(inputs, SerialEvaluate(bare))
+    data = QuasiMonteCarlo(samples=1024, control="none").run(inputs, SerialEvaluate(bare))
+    assert abs(data["mean"].item() - mean) < 5 * data["mean_error"].item()
+    assert "coefficient" not in data
+
+
+def test_quantiles_and_their_errors():
+    """Quantiles of one uniform variable: errors are as large as deviations are, and smaller than those of samples."""
+    inputs = Inputs({"a": UNIT, "b": UNIT})
+    model = FunctionModel(lambda p: p[0] + p[1], ("a", "b"), ("f",))
+    exact = np.array([np.sqrt(0.1), 1, 2 - np.sqrt(0.1)])
+    found = [QuasiMonteCarlo(samples=512, seed=s, control="none").run(inputs, SerialEvaluate(model)) for s in range(40)]
+    deviations = np.array([d["quantiles"].to_numpy()[:, 0] - exact for d in found])
+    errors = np.array([d["quantiles_error"].to_numpy()[:, 0] for d in found])
+    actual = np.sqrt((deviations**2).mean(axis=0))
+    assert (errors.mean(axis=0) > 0.6 * actual).all()
+    assert (errors.mean(axis=0) < 3 * actual).all()
+    plain = MonteCarlo(samples=512).run(inputs, SerialEvaluate(model))["quantiles_error"].to_numpy()[:, 0]
+    assert (errors.mean(axis=0) < plain).all()
+
+
+RANKS = """
+import numpy as np
+from mpi4py import MPI
+from forward.model import FunctionModel
+from uq.distributions import Uniform
+from uq.ensemble import Ensemble
+from uq.evaluate import SerialEvaluate
+from uq.inputs import Inputs
+from uq.quasi_monte_carlo import QuasiMonteCarlo
+
+inputs = Inputs({name: Uniform(lower=0.5, upper=2.0) for name in "ab"})
+model = FunctionModel(
+    lambda p: [p[0] * np.sin(p[1]), p[1] ** 3], ("a", "b"), ("f", "g"),
+    lambda p: [[np.sin(p[1]), p[0] * np.cos(p[1])], [0, 3 * p[1] ** 2]],
+)
+method = QuasiMonteCarlo(tolerance=1e-5, samples=2048, control="quadratic")
+data = Ensemble.split(MPI.COMM_WORLD).run(model, lambda evaluate: method.run(inputs, evaluate))
+if data is not None:
+    assert data.identical(method.run(inputs, SerialEvaluate(model)))
+    print("same")
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_same_numbers_as_in_one_process(ranks):
+    done = run_script(ranks, RANKS)
+    assert done.returncode == 0, done.stderr
+    assert "same" in done.stdout
+
+
+# --- the finite-element beam ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def beam():
+    from mpi4py import MPI
+
+    from workflows.config import load
+
+    study = load(Path(__file__).parent.parent / "configs" / "tiny.toml")
+    return study.inputs, SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names))
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("coefficient", ["one", "optimal"])
+@pytest.mark.parametrize("control", CONTROLS)
+def test_field_agrees_with_scalar(beam, control, coefficient):
+    """The largest displacement is that of a corner of the free end at every sample, so its moments are the field's."""
+    inputs, evaluate = beam
+    data = QuasiMonteCarlo(samples=64, scrambles=8, seed=5, control=control, coefficient=coefficient).run(
+        inputs, evaluate
+    )
+    tip = np.abs(data["field_nominal"].sel(component="y")).argmax().item()
+    for name, sign in (("mean", -1), ("mean_error", 1), ("std", 1), ("std_error", 1)):
+        field = data[f"field_{name}"].sel(component="y")[tip].item()
+        assert sign * field == pytest.approx(data[name].sel(output="uy_max").item(), rel=1e-5)
+
+
+@pytest.mark.fem
+def test_fields_do_not_change_scalars_and_are_continued(beam):
+    inputs, evaluate = beam
+    fixed = QuasiMonteCarlo(samples=128, scrambles=8).run(inputs, evaluate)
+    scalars = QuasiMonteCarlo(samples=128, scrambles=8, fields=False).run(inputs, evaluate)
+    grown = QuasiMonteCarlo(samples=128, scrambles=8, tolerance=1e-12).run(inputs, evaluate)
+    for name in ("points", "values", "mean", "mean_error", "std", "std_error"):
+        np.testing.assert_array_equal(fixed[name], scalars[name])
+        np.testing.assert_array_equal(fixed[name], grown[name])
+    for name in ("field_mean", "field_mean_error", "field_std", "field_std_error"):
+        np.testing.assert_allclose(grown[name], fixed[name], rtol=1e-7, atol=1e-14)
