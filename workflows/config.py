@@ -12,12 +12,13 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
+from uq.chaos import Chaos
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 
-Method = Annotated[MonteCarlo | SensitivityMonteCarlo | LocalSensitivity, Field(discriminator="kind")]
+Method = Annotated[MonteCarlo | SensitivityMonteCarlo | LocalSensitivity | Chaos, Field(discriminator="kind")]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -76,6 +77,13 @@ class Study(Settings):
         """The random parameters."""
         return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
 
+    @property
+    def planned(self) -> int:
+        """Number of solves, the largest where a tolerance may end the study earlier."""
+        if isinstance(self.method, Chaos):
+            return self.method.planned_for(len(self.parameters))
+        return self.method.planned
+
     @model_validator(mode="after")
     def _check(self) -> Study:
         mistakes = list(self._mistakes())
@@ -107,9 +115,13 @@ class Study(Settings):
                     yield ("parameters", path), message, distribution.model_dump()
                     break
         try:
-            assert self.inputs
+            inputs = self.inputs
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            if objection is not None:
+                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:

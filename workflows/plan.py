@@ -22,7 +22,7 @@ def bytes_per_model(unknowns: int) -> float:
 def plan(study: Study, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     unknowns = study.model.unknowns
-    solves = study.method.planned
+    solves = study.planned
     seconds = solves * seconds_per_solve(unknowns) / groups
     body = study.model.body
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)

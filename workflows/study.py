@@ -81,7 +81,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     inputs = study.inputs
     model = study.model.build(ensemble.group, inputs.names)
-    progress = Progress(study.method.planned, quiet=quiet or world.rank > 0)
+    progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     log = _Log()
     # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
@@ -164,7 +164,7 @@ def _prepare(study: Study, directory: Path, ranks: int) -> int | None:
     if ranks % share:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
-    groups, blocks = ranks // share, min(max(study.method.planned - 1, 1), BLOCKS)
+    groups, blocks = ranks // share, min(max(study.planned - 1, 1), BLOCKS)
     if groups > blocks:
         message = (
             f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
