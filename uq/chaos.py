@@ -2,8 +2,8 @@
 
 The expansion Σ_a c_a ψ_a(ω) in orthonormal polynomials is fitted to the samples by least squares. A sample gives one
 row for its value, ψ(ω_z)·c = f(ω_z), and with derivatives one row more for each parameter, σ_i ∂_iψ(ω_z)·c =
-σ_i ∂_i f(ω_z): d + 1 rows for little more than the price of one solve. All rows count the same: on five test functions of
-two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within the scatter of the designs.
+σ_i ∂_i f(ω_z): d + 1 rows for little more than the price of one solve. All rows count the same: on five test functions
+of two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within the scatter of the designs.
 Moments and Sobol' indices are sums of squares of coefficients.
 
 What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
@@ -471,18 +471,22 @@ def _moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArra
     }
 
 
-def _estimates(fit: _Fit, indices: IntArray) -> dict[str, FloatArray]:
+def _estimates(fit: _Fit, indices: IntArray, *, tails: bool) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. To it comes what no coefficient can
-    show, the part of the function outside the basis, of the size λ of the leave-one-out error: λ/√n for the standard
-    deviation σ, as if it were n independent values, and (λ/σ)² for the indices, the share of its variance.
+    show, the part r of the function outside the basis, whose norm is the leave-one-out error λ. For the indices this is
+    its share (λ/σ)² of the variance. For the standard deviation it is λ/√n, as if r were n independent values; where
+    distributions have tails, r is large there and no sample says so: then λ, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for
+    the mean. (Without, intervals of functions of normal and gamma parameters covered 60 % instead of 95 %.)
     """
     central = _moments(fit.coefficients.T, indices)
     left_out = _moments(np.swapaxes(fit.without, 1, 2), indices)
     n = len(fit.without)
     share = _ratio(fit.loo**2, central["std"] ** 2)[:, None]
-    missing = {"mean": np.zeros(1), "std": fit.loo / np.sqrt(n), "sobol_first": share, "sobol_total": share}
+    mean = fit.loo / np.sqrt(n) if tails else np.zeros_like(fit.loo)
+    std = fit.loo if tails else fit.loo / np.sqrt(n)
+    missing = {"mean": mean, "std": std, "sobol_first": share, "sobol_total": share}
     for name, values in left_out.items():
         spread = np.sqrt((n - 1) / n * ((values - central[name]) ** 2).sum(axis=0))
         central[f"{name}_error"] = np.hypot(spread, missing[name])
@@ -506,8 +510,8 @@ def _dataset(
     stopped: str,
 ) -> xr.Dataset:
     basis = largest.subset(fit.chosen.which)
-    estimates = _estimates(fit, basis.indices)
     supports = [m.support for m in inputs.marginals.values()]
+    estimates = _estimates(fit, basis.indices, tails=None in supports)
     lower, upper = (
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
