@@ -29,9 +29,20 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
     assert path.read_text().startswith("# "), "a shipped study begins with what it shows and how long it takes"
 
 
-@pytest.mark.parametrize("kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity"])
+@pytest.mark.parametrize(
+    "kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos"]
+)
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind
+
+
+def test_chaos_needs_independent_parameters():
+    names = list(blocks()["parameters"])
+    document_ = blocks() | {"method": {"kind": "chaos", "samples": 9}}
+    assert parse(document_).planned == 10
+    assert parse(document_ | {"method": {"kind": "chaos", "fit": "projection", "max_order": 3}}).planned == 26
+    with pytest.raises(StudyError, match="correlations: polynomial chaos needs independent parameters"):
+        parse(document_ | {"correlations": [{"between": names, "value": 0.3}]})
 
 
 def test_a_study_is_a_few_lines_of_python():

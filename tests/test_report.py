@@ -229,6 +229,19 @@ def test_quasi_monte_carlo_is_drawn(samples):
     assert line.get_xdata()[-1] == samples
 
 
+def test_expansion_has_its_terms_and_indices(tmp_path, undrawn):
+    case = study(kind="chaos", samples=8)
+    dataset = solve(case)
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    for told in ("Polynomial chaos", "leave-one-out error", "Sobol", "Density of"):
+        assert told in page
+    assert "Running mean" not in page
+    shares = summarise(dataset)["sobol"]["sag"]["loads.gravity.density"]
+    assert set(shares) == {"first", "first_error", "total", "total_error"}
+    assert 0 < shares["first"] <= shares["total"] <= 1
+    assert case.planned == 9
+
+
 def test_local_study_has_sensitivities_only(tmp_path, undrawn):
     case = parse({**study().model_dump(mode="json", exclude_none=True), "method": {"kind": "local-sensitivity"}})
     page = write_report(write(tmp_path / "out", solve(case))).read_text()

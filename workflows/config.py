@@ -12,13 +12,16 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
+from uq.chaos import Chaos
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 
-Method = Annotated[MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity, Field(discriminator="kind")]
+Method = Annotated[
+    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos, Field(discriminator="kind")
+]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -113,9 +116,13 @@ class Study(Settings):
                     yield ("parameters", path), message, distribution.model_dump()
                     break
         try:
-            assert self.inputs
+            inputs = self.inputs
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            if objection is not None:
+                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:

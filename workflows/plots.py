@@ -100,11 +100,15 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the normalised density of the samples of an output, with marks at the mean and at the quantiles."""
+    """Draw the density of an output, of its expansion or else of its samples, with its mean and quantiles."""
     ax = ax or _axes()
-    values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
-    spread = np.ptp(values) > 1e-12 * np.abs(values).max()
-    ax.hist(values, bins="auto" if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
+    if "density" in dataset:
+        density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
+        ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
+    else:
+        values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
+        spread = np.ptp(values) > 1e-12 * np.abs(values).max()
+        ax.hist(values, bins="auto" if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
     ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
     for i, probability in enumerate(dataset["quantile"].to_numpy()):
         place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))

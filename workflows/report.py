@@ -105,6 +105,8 @@ def _context(results: Results) -> dict[str, Any]:
         "moments": tables.moments(results) if sampled else None,
         "gains": list(tables.gains(dataset)),
         "quantiles": tables.quantiles(results) if sampled else None,
+        "expansion": tables.expansion(results) if "multi_index" in dataset else None,
+        "sobol": [(o, tables.sobol(results, o)) for o in results.outputs] if "sobol_first" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
         "field_lines": field_lines,
         "bodies": drawn,
@@ -124,6 +126,10 @@ def _picture(ax: Axes, caption: str) -> Picture:
 
 
 def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
+    if "density" in dataset:
+        return [
+            _picture(plots.histogram(dataset, output), f"Density of {output} by the expansion, mean and quantiles.")
+        ]
     return [
         _picture(plots.histogram(dataset, output), f"Samples of {output}: density, mean and quantiles."),
         _picture(plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),

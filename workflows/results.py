@@ -73,9 +73,22 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
     if "mean" in dataset:
-        names = [name for name in (*ESTIMATES, "variance_ratio", "std_variance_ratio") if name in dataset]
+        names = [name for name in (*ESTIMATES, "variance_ratio", "std_variance_ratio", "loo_error") if name in dataset]
         summary["outputs"] = {
             output: {name: float(dataset[name].sel(output=output)) for name in names} for output in outputs
+        }
+    if "sobol_first" in dataset:
+        shares = {"first": "sobol_first", "total": "sobol_total"}
+        names_of = {f"{short}{end}": f"{name}{end}" for short, name in shares.items() for end in ("", "_error")}
+        summary["sobol"] = {
+            output: {
+                str(parameter): {
+                    short: _number(dataset[name].sel(output=output, parameter=parameter))
+                    for short, name in names_of.items()
+                }
+                for parameter in dataset.parameter.values
+            }
+            for output in outputs
         }
     for key, variable in (
         ("local", "derivative"),

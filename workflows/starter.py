@@ -76,6 +76,16 @@ coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
 """,
+    "chaos": """\
+kind = "chaos"
+samples = 15          # or tolerance = 1e-3: leave-one-out error over standard deviation; both: whichever comes first
+max_order = 6         # order and terms up to it are chosen by the leave-one-out error
+gradients = true      # fit the derivatives too: d + 1 rows for every solve
+fit = "regression"    # or "projection": (max_order + 2)^d Gauss points and no samples
+seed = 1
+quantiles = [0.05, 0.5, 0.95]
+fields = true         # expand the displacement at every node
+""",
     "local-sensitivity": """\
 kind = "local-sensitivity"
 """,

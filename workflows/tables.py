@@ -134,6 +134,34 @@ def quantiles(results: Results) -> Table:
     return Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 
+def expansion(results: Results) -> Table:
+    """The polynomials of an expansion and what they are worth, output by output."""
+    dataset = results.dataset
+    used, order = int(dataset["ok"].sum()), int(dataset["order"])
+    rows = [
+        (
+            output,
+            f"{order}",
+            f"{dataset.sizes['term']}",
+            f"{used}",
+            number(float(dataset["loo_error"].sel(output=output)), 2),
+        )
+        for output in results.outputs
+    ]
+    return Table(("output", "order", "terms", "samples", "leave-one-out error / standard deviation"), rows)
+
+
+def sobol(results: Results, output: str) -> Table:
+    """Sobol' indices of an output."""
+    of_output = results.dataset.sel(output=output)
+    rows = []
+    for name in results.parameters:
+        of_parameter = of_output.sel(parameter=name)
+        pairs = [(of_parameter[f"sobol_{which}"], of_parameter[f"sobol_{which}_error"]) for which in ("first", "total")]
+        rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
+    return Table(("parameter", "first order", "total"), rows)
+
+
 def sensitivities(results: Results, output: str) -> Table:
     """Derivatives of an output, in physical units and times the spread of the parameter."""
     unit, slopes = results.unit(output), results.dataset.sel(output=output)

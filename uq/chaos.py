@@ -1,0 +1,700 @@
+"""Polynomial chaos by regression on values and gradients, for outputs and for the whole displacement field.
+
+The expansion Σ_a c_a ψ_a(ω) in orthonormal polynomials is fitted to the samples by least squares. A sample gives one
+row for its value, ψ(ω_z)·c = f(ω_z), and with derivatives one row more for each parameter, σ_i ∂_iψ(ω_z)·c =
+σ_i ∂_i f(ω_z): d + 1 rows for little more than the price of one solve. All rows count the same: on five test functions
+of two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within the scatter of the designs.
+Moments and Sobol' indices are sums of squares of coefficients.
+
+What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
+residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there by (I − H_z)⁻¹ r_z, and its coefficients differ
+by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
+
+The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
+of the largest basis that may be chosen. These rows are summed while the samples stream by.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.settings import Settings
+from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
+from uq.evaluate import Evaluate, Evaluations, Request, merge
+from uq.inputs import Inputs
+from uq.linearisation import Linearisation, linearise, local_dataset
+from uq.sampling import sobol_points
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Probability = Annotated[float, Field(gt=0, lt=1)]
+TRUNCATIONS = (0.5, 0.75, 1.0)
+ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
+FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
+DICTIONARY = 2000  # functions to select from, at most
+FIELD_DICTIONARY = 500  # the same where fields are expanded: every block of samples keeps a field for each function
+PATIENCE = 30  # functions that may be selected without a gain before the selection ends
+LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
+GROWTH = 1.5  # of the design, from one look at the tolerance to the next
+DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
+BINS = 80
+
+
+class Chaos(Settings):
+    """Polynomial chaos, by regression on values and gradients or by Gauss quadrature.
+
+    Parameters
+    ----------
+    samples
+        Number of solves (and one at the mean parameters); with a tolerance, the largest number.
+    tolerance
+        Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
+    max_order
+        Largest order that is tried; the order of the projection.
+    gradients
+        Whether derivatives are fitted too, where the model has them.
+    fit
+        "regression" on a scrambled Sobol' design, or "projection" by a tensor product of Gauss rules with
+        ``max_order + 2`` points for each parameter, on values only: one more than orthogonality needs, so that there
+        is something left to measure the error by.
+    seed
+        Seed of the design; sample z of a seed is the same in every study.
+    quantiles
+        Probabilities of the quantiles of the outputs.
+    fields
+        Whether the displacement field is expanded too, node by node.
+    """
+
+    kind: Literal["chaos"] = "chaos"
+    samples: Annotated[int, Field(ge=2)] | None = None
+    tolerance: Annotated[float, Field(gt=0)] | None = None
+    max_order: Annotated[int, Field(ge=1, le=20)] = 6
+    gradients: bool = True
+    fit: Literal["regression", "projection"] = "regression"
+    seed: Annotated[int, Field(ge=0)] = 0
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
+    fields: bool = True
+
+    @model_validator(mode="after")
+    def _check_amount(self) -> Chaos:
+        asked = self.samples is not None or self.tolerance is not None
+        if self.fit == "regression" and not asked:
+            message = "gives neither samples nor tolerance, expected at least one of them"
+            raise ValueError(message)
+        if self.fit == "projection" and asked:
+            message = "gives samples or a tolerance, expected neither: a projection takes (max_order + 2)^d points"
+            raise ValueError(message)
+        return self
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
+        if self.fit == "projection":
+            return int(1 + (self.max_order + 2) ** dimension)
+        return 1 + (self.samples or LARGEST)
+
+    @staticmethod
+    def objection(inputs: Inputs) -> str | None:
+        """Say why these parameters cannot be expanded in, or nothing."""
+        if any(rho for *_, rho in inputs.correlations):
+            return "polynomial chaos needs independent parameters, expected no correlations for method.kind = 'chaos'"
+        return None
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Solve at the points of the design, fit and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            Estimates by output, Sobol' indices, the expansion itself (`load` makes it callable) and, with `fields`,
+            moments and coefficients by node and component; see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, or at too many samples for an expansion of order 1.
+        ValueError
+            If the parameters are correlated.
+        """
+        objection = self.objection(inputs)
+        if objection is not None:
+            raise ValueError(objection)
+        centre = linearise(inputs, evaluate)
+        projection = self.fit == "projection"
+        gradients = self.gradients and evaluate.differentiable and not projection
+        limit = self.planned(len(inputs.names)) - 1
+        grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
+        expand_fields = self.fields and centre.state.size > 0
+        if projection:
+            bases = _whole(inputs, self.max_order)
+        else:
+            dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
+            bases = _candidates(inputs, self.max_order, limit * _rows(inputs, gradients=gradients), dictionary)
+        largest = orthonormal(inputs, bases.all)
+        fields = None
+        if expand_fields:
+            fields = _Projections(largest, centre.state, gradients, grid, weights)
+        rounds: list[Evaluations] = []
+        count, target = 0, limit if self.tolerance is None else min(limit, _first(inputs, gradients=gradients))
+        while True:
+            points = (
+                grid
+                if grid is not None
+                else inputs.points(sobol_points(self.seed, 0, count, target, len(inputs.names)))
+            )
+            rounds.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
+            count = target
+            evaluations = merge(rounds)
+            data = _Data.of(evaluations, inputs, weights)
+            fitted = _fit(bases, largest, data)
+            reached = float(fitted.relative.max())
+            stopped = (
+                f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
+            )
+            if self.tolerance is None:
+                stopped = f"{count} samples, as asked: {stopped}"
+                break
+            if reached <= self.tolerance:
+                stopped = f"tolerance {self.tolerance:g} met after {count} samples: {stopped}"
+                break
+            if count >= limit:
+                stopped = f"tolerance {self.tolerance:g} not met after all {count} samples: {stopped}"
+                break
+            target = min(limit, int(np.ceil(GROWTH * count)))
+        return _dataset(self, inputs, evaluate, centre, evaluations, largest, data, fitted, stopped)
+
+
+# --- design and candidates -----------------------------------------------------------------------------------------
+
+
+def _rows(inputs: Inputs, *, gradients: bool) -> int:
+    """Number of rows that a sample gives."""
+    return 1 + len(inputs.names) if gradients else 1
+
+
+def _first(inputs: Inputs, *, gradients: bool) -> int:
+    """Samples before a tolerance is first looked at: enough for all products of two parameters, or for all slopes."""
+    d = len(inputs.names)
+    terms = (d + 1) * (d + 2) // 2 if d <= FULL else 2 * (d + 1)
+    return max(4, -(-ROWS_PER_TERM * terms // _rows(inputs, gradients=gradients)))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """Some functions of the largest basis, by their numbers; order and q of the set that they are from."""
+
+    order: int
+    q: float
+    which: IntArray
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Sets to choose from, whole or (where `sparse`) function by function; `all` (P, d) is their union."""
+
+    all: IntArray
+    sets: tuple[_Candidate, ...]
+    sparse: bool
+    most: int
+
+
+def _whole(inputs: Inputs, order: int) -> _Candidates:
+    """Return the full basis of one order as the only choice."""
+    indices = hyperbolic(len(inputs.names), order, 1.0)
+    whole = _Candidate(order, 1.0, np.arange(len(indices)))
+    return _Candidates(indices, (whole,), sparse=False, most=len(indices))
+
+
+def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _Candidates:
+    """Return the bases that `rows` rows may determine, or sets of up to `dictionary` functions to select from."""
+    d = len(inputs.names)
+    sparse = d > FULL
+    most = dictionary if sparse else max(rows // ROWS_PER_TERM, d + 1)
+    found: dict[tuple[tuple[int, ...], ...], tuple[int, float]] = {}
+    for q in reversed(TRUNCATIONS):
+        for order in range(1, max_order + 1):
+            indices = hyperbolic(d, order, q)
+            if len(indices) > most and order > 1:
+                break
+            found.setdefault(tuple(map(tuple, indices.tolist())), (order, q))
+    union = sorted({index for members in found for index in members}, key=by_degree)
+    number = {index: i for i, index in enumerate(union)}
+    sets = [_Candidate(order, q, np.array([number[a] for a in members])) for members, (order, q) in found.items()]
+    return _Candidates(np.array(union, dtype=np.int64), tuple(sets), sparse, most)
+
+
+# --- regression ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) per standard deviation or nothing.
+
+    `weights` (n,) count the samples in sums of squares.
+    """
+
+    points: FloatArray
+    values: FloatArray
+    slopes: FloatArray | None
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> _Data:
+        ok = evaluations.ok
+        slopes = None
+        if evaluations.tangents is not None:
+            slopes = np.swapaxes(evaluations.tangents[ok] * inputs.std, 1, 2)
+        counted = np.ones(int(ok.sum())) if weights is None else weights[ok]
+        return cls(evaluations.points[ok], evaluations.outputs[ok], slopes, counted)
+
+    @property
+    def right(self) -> FloatArray:
+        """Right-hand sides (n, rows, m)."""
+        return self._rows(self.values, self.slopes)
+
+    def left(self, basis: Basis) -> FloatArray:
+        """Matrix (n, rows, P)."""
+        return self._rows(basis.values(self.points), None if self.slopes is None else basis.derivatives(self.points))
+
+    def _rows(self, values: FloatArray, slopes: FloatArray | None) -> FloatArray:
+        blocks = values[:, None, :]
+        if slopes is not None:
+            blocks = np.concatenate([blocks, slopes], axis=1)
+        return np.asarray(blocks * np.sqrt(self.weights)[:, None, None])
+
+    def size(self, errors: FloatArray) -> FloatArray:
+        """Root mean square (m,) of the first rows of residuals (n, rows, m): those of the values."""
+        return np.asarray(np.sqrt((errors[:, 0] ** 2).sum(axis=0) / self.weights.sum()))
+
+    def relative(self, errors: FloatArray) -> FloatArray:
+        """The same over the standard deviation of the values; zero where that is rounding."""
+        share = self.weights / self.weights.sum()
+        mean = share @ self.values
+        std = np.sqrt(share @ (self.values - mean) ** 2)
+        constant = std <= 1e-13 * np.abs(mean)
+        return np.where(constant, 0.0, self.size(errors) / np.where(constant, 1.0, std))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A regression and what it is worth.
+
+    Attributes
+    ----------
+    chosen
+        The functions of the fit.
+    coefficients
+        (P, m).
+    without
+        Coefficients (n, P, m) of the fits that leave one sample out.
+    triangle
+        R (P, P) of the matrix of the regression, of which the Gram matrix is RᵀR.
+    loo, relative
+        Root mean square (m,) of the leave-one-out errors of the values, and that over their standard deviation.
+    squares
+        Sum of squares (m,) of the residuals of all rows.
+    """
+
+    chosen: _Candidate
+    coefficients: FloatArray
+    without: FloatArray
+    triangle: FloatArray
+    loo: FloatArray
+    relative: FloatArray
+    squares: FloatArray
+
+
+def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
+    """Choose the functions with the smallest leave-one-out error, and fit.
+
+    Raises
+    ------
+    SolveError
+        If there are not enough samples.
+    """
+    left, right = data.left(largest), data.right
+    rows = left.shape[0] * left.shape[1]
+    scores: list[tuple[float, _Candidate]] = []
+    for candidate in candidates.sets:
+        if candidates.sparse:
+            scores += _select(left, right, data, candidate, rows // ROWS_PER_TERM)
+        elif candidate.which.size <= min(candidates.most, rows) and (
+            candidate.order == 1 or len(candidates.sets) == 1 or candidate.which.size * ROWS_PER_TERM <= rows
+        ):
+            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(rows, -1))
+            size = np.abs(np.diag(r))
+            if size.min() > 1e-10 * size.max():
+                scores.append((_score(q, right, data), candidate))
+    scores = [(score, candidate) for score, candidate in scores if np.isfinite(score)]
+    if not scores:
+        message = f"{len(data.points)} samples have an answer, too few for an expansion of order 1"
+        raise SolveError(message)
+    best = min(score for score, _ in scores)
+    # Of those that are as good, the smallest.
+    good = [candidate for score, candidate in scores if score <= 1.05 * best + 1e-13]
+    return _regress(left, right, data, min(good, key=lambda candidate: candidate.which.size))
+
+
+def _score(q: FloatArray, right: FloatArray, data: _Data) -> float:
+    """Largest relative leave-one-out error of a fit whose orthonormal columns are q (n·rows, P)."""
+    blocks = q.reshape(*right.shape[:2], -1)
+    residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
+    return float(data.relative(_left_out(blocks, residual)).max())
+
+
+def _left_out(blocks: FloatArray, residual: FloatArray) -> FloatArray:
+    """Errors (n, rows, m) at each sample of the fit without it, from the orthonormal columns and the residuals."""
+    rest = np.eye(blocks.shape[1]) - blocks @ np.swapaxes(blocks, 1, 2)
+    needed = np.linalg.eigvalsh(rest)[:, 0] < 1e-10  # without this sample the fit is not determined
+    rest[needed] = np.eye(blocks.shape[1])
+    errors = np.linalg.solve(rest, residual)
+    errors[needed] = np.inf
+    return np.asarray(errors)
+
+
+def _select(
+    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, most: int
+) -> list[tuple[float, _Candidate]]:
+    """Take functions one by one, each time the one that explains most of what all outputs have left.
+
+    Orthogonal least squares: after every step the columns of the dictionary are made orthogonal to those taken.
+    """
+    n, rows, m = right.shape
+    columns = left[:, :, dictionary.which].reshape(n * rows, -1).copy()
+    lengths = (columns**2).sum(axis=0)
+    rest = right.reshape(n * rows, m) / np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    taken: list[int] = []
+    q = np.empty((n * rows, 0))
+    found: list[tuple[float, _Candidate]] = []
+    best, waited = np.inf, 0
+    while len(taken) < min(most, columns.shape[1]) and waited < PATIENCE:
+        left_over = (columns**2).sum(axis=0)
+        usable = left_over > 1e-8 * lengths
+        if not usable.any():
+            break
+        gains = np.where(usable, ((columns.T @ rest) ** 2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0)
+        pick = int(gains.argmax()) if taken else 0  # the constant comes first
+        column = columns[:, pick]
+        column = column - q @ (q.T @ column)
+        column /= np.linalg.norm(column)
+        q = np.column_stack([q, column])
+        columns -= np.outer(column, column @ columns)
+        rest = rest - np.outer(column, column @ rest)
+        taken.append(pick)
+        score = _score(q, right, data)
+        which = dictionary.which[np.array(taken)]
+        found.append((score, _Candidate(dictionary.order, dictionary.q, which)))
+        waited = 0 if score < best else waited + 1
+        best = min(best, score)
+    return found
+
+
+def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate) -> _Fit:
+    from scipy.linalg import solve_triangular
+
+    n, rows, m = right.shape
+    q, r = np.linalg.qr(left[:, :, chosen.which].reshape(n * rows, -1))
+    blocks = q.reshape(n, rows, -1)
+    rotated = np.einsum("zrp,zrm->pm", blocks, right)
+    residual = right - blocks @ rotated
+    errors = _left_out(blocks, residual)
+    terms = chosen.which.size
+    moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
+    coefficients = solve_triangular(r, rotated)
+    without = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
+    return _Fit(
+        chosen, coefficients, without, r, data.size(errors), data.relative(errors), (residual**2).sum(axis=(0, 1))
+    )
+
+
+@dataclass(frozen=True)
+class _Projections:
+    """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    state
+        State (U,) at the mean parameters.
+    gradients
+        Whether derivatives give rows too.
+    points, weights
+        Points (n, d) whose weights (n,) are not one.
+    """
+
+    basis: Basis
+    state: FloatArray
+    gradients: bool
+    points: FloatArray | None
+    weights: FloatArray | None
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        state = model.scatter(self.state[None, :])[0]
+        directions = np.diag(self.basis.scale)
+
+        def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
+            left = self.basis.values(parameters[None, :])
+            right = (solution.state - state)[None, :]
+            if self.gradients:
+                left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
+                right = np.vstack([right, solution.state_tangent(directions)])
+            total = np.vstack([left.T @ right, (right**2).sum(axis=0)])
+            if self.points is None or self.weights is None:
+                return total
+            return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
+
+        return rows
+
+
+# --- what follows from an expansion --------------------------------------------------------------------------------
+
+
+def _moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArray]:
+    """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
+    squares = np.where((indices > 0).any(axis=1), coefficients**2, 0.0)
+    variance = squares.sum(axis=-1)
+    used = (indices > 0).astype(float)
+    alone = used * (used.sum(axis=1) == 1)[:, None]
+    safe = np.where(variance > 0, variance, 1.0)[..., None]
+    constant = (indices == 0).all(axis=1)
+    return {
+        "mean": coefficients[..., constant].sum(axis=-1),
+        "std": np.sqrt(variance),
+        "sobol_first": squares @ alone / safe,
+        "sobol_total": squares @ used / safe,
+    }
+
+
+def _estimates(fit: _Fit, indices: IntArray, *, cautious: bool) -> dict[str, FloatArray]:
+    """Moments and indices by output with their standard errors, by the jackknife over samples.
+
+    The jackknife is taken around the estimate itself, so that a bias counts too. To it comes what no coefficient can
+    show, the part r of the function outside the basis, whose norm is the leave-one-out error λ. For the indices this is
+    its share (λ/σ)² of the variance. For the standard deviation it is λ/√n, as if r were n independent values; where
+    distributions have tails, r is large there and no sample says so, and where functions were selected, the same
+    samples selected them: there, `cautious`, it is λ, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the mean. (Without,
+    intervals of functions of normal and gamma parameters covered 60 % instead of 95 %.)
+    """
+    central = _moments(fit.coefficients.T, indices)
+    left_out = _moments(np.swapaxes(fit.without, 1, 2), indices)
+    n = len(fit.without)
+    share = _ratio(fit.loo**2, central["std"] ** 2)[:, None]
+    mean = fit.loo / np.sqrt(n) if cautious else np.zeros_like(fit.loo)
+    std = fit.loo if cautious else fit.loo / np.sqrt(n)
+    missing = {"mean": mean, "std": std, "sobol_first": share, "sobol_total": share}
+    for name, values in left_out.items():
+        spread = np.sqrt((n - 1) / n * ((values - central[name]) ** 2).sum(axis=0))
+        central[f"{name}_error"] = np.hypot(spread, missing[name])
+    return central
+
+
+def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
+    """A / b, and 0 where b vanishes."""
+    return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 0.0))
+
+
+def _dataset(
+    method: Chaos,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    centre: Linearisation,
+    evaluations: Evaluations,
+    largest: Basis,
+    data: _Data,
+    fit: _Fit,
+    stopped: str,
+) -> xr.Dataset:
+    basis = largest.subset(fit.chosen.which)
+    supports = [m.support for m in inputs.marginals.values()]
+    estimates = _estimates(fit, basis.indices, cautious=None in supports or len(supports) > FULL)
+    lower, upper = (
+        np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
+        for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
+    )
+    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
+    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
+    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
+    by_output, by_pair = ("output",), ("output", "parameter")
+    dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
+    dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
+        {
+            **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
+            "loo_error": (by_output, fit.relative),
+            "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
+            # No quantile moves by more than the function does.
+            "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
+            "density": (("output", "bin"), np.array([density for density, _ in counts])),
+            "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
+            "points": (("sample", "parameter"), evaluations.points),
+            "values": (("sample", "output"), evaluations.outputs),
+            "ok": (("sample",), evaluations.ok),
+            "order": ((), fit.chosen.order),
+            "q": ((), fit.chosen.q),
+            "multi_index": (("term", "parameter"), basis.indices),
+            "coefficients": (("term", "output"), fit.coefficients),
+            "recurrence_alpha": (("parameter", "degree"), basis.alpha),
+            "recurrence_beta": (("parameter", "degree"), basis.beta),
+            "range_lower": (("parameter",), lower),
+            "range_upper": (("parameter",), upper),
+        }
+    )
+    if evaluations.fields.size:
+        fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
+        dataset = dataset.assign(fields)
+    dataset.attrs["stopped"] = stopped
+    failed = int((~evaluations.ok).sum())
+    if failed:
+        dataset.attrs["note"] = (
+            f"{failed} of {len(evaluations.ok)} samples have no answer; the expansion is fitted to the others and "
+            "continues them to where the model has no answer"
+        )
+    return dataset
+
+
+def _field_estimates(
+    evaluations: Evaluations,
+    centre: Linearisation,
+    count: int,
+    basis: Basis,
+    fit: _Fit,
+    estimates: dict[str, FloatArray],
+) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Coefficients, mean and standard deviation of the displacements.
+
+    Their errors are those of the outputs in proportion to the residuals, which come from the same rows.
+    """
+    from scipy.linalg import cho_solve
+
+    projections = evaluations.fields[fit.chosen.which][:, :count]
+    coefficients = cho_solve((fit.triangle, False), projections)
+    squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
+    coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
+    moments = _moments(coefficients.T, basis.indices)
+    fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
+    for name in ("mean", "std"):
+        share = np.sqrt(_ratio(estimates[f"{name}_error"] ** 2, fit.squares).max())
+        fields[f"{name}_error"] = (share * np.sqrt(squares)).reshape(-1, 3)
+    return {
+        **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
+        "field_coefficients": (("term", "node", "component"), coefficients.reshape(len(coefficients), -1, 3)),
+    }
+
+
+# --- the expansion as a function -----------------------------------------------------------------------------------
+
+
+class OutsideRangeWarning(UserWarning):
+    """Points where an expansion was not fitted."""
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """A polynomial that stands for a model, for any number of points at once.
+
+    Attributes
+    ----------
+    parameters, output_names
+        Names of the d parameters and of the m outputs.
+    basis
+        The P functions.
+    coefficients
+        (P, m).
+    lower, upper
+        Range (d,) of the parameters: their support, or that of the samples where a distribution has tails.
+    fields
+        Coefficients (P, nodes, 3) of the displacement field, in m, where it was expanded.
+    """
+
+    parameters: tuple[str, ...]
+    output_names: tuple[str, ...]
+    basis: Basis
+    coefficients: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    fields: FloatArray | None = None
+    _told: list[str] = field(default_factory=list, repr=False, compare=False)
+
+    def outputs(self, points: FloatArray) -> FloatArray:
+        """Return the outputs (n, m) at points (n, d)."""
+        return self.basis.values(self._checked(points)) @ self.coefficients
+
+    def tangents(self, points: FloatArray) -> FloatArray:
+        """Return the derivatives dψ/dω (n, m, d) at points (n, d)."""
+        slopes = self.basis.derivatives(self._checked(points)) @ self.coefficients
+        return np.asarray(np.swapaxes(slopes, 1, 2) / self.basis.scale)
+
+    def displacements(self, points: FloatArray) -> FloatArray:
+        """Return the displacement fields (n, nodes, 3) at points (n, d), in m.
+
+        Raises
+        ------
+        ValueError
+            If the field was not expanded.
+        """
+        if self.fields is None:
+            message = "the field was not expanded, expected a study with method.fields = true"
+            raise ValueError(message)
+        return np.asarray(np.tensordot(self.basis.values(self._checked(points)), self.fields, axes=1))
+
+    def _checked(self, points: FloatArray) -> FloatArray:
+        points = np.asarray(points, dtype=float)
+        if points.ndim != 2 or points.shape[1] != len(self.parameters):
+            message = f"points of shape {points.shape}, expected (n, {len(self.parameters)})"
+            raise ValueError(message)
+        slack = 1e-12 * (self.upper - self.lower)
+        outside = ((points < self.lower - slack) | (points > self.upper + slack)).any(axis=0)
+        if outside.any() and not self._told:
+            names = [name for name, out in zip(self.parameters, outside, strict=True) if out]
+            self._told.extend(names)
+            message = f"points outside the range where the expansion was fitted, in: {', '.join(names)}"
+            warnings.warn(message, OutsideRangeWarning, stacklevel=3)
+        return points
+
+
+def load(source: str | Path | xr.Dataset) -> Expansion:
+    """Make the expansion of a finished study callable.
+
+    Parameters
+    ----------
+    source
+        The results directory, its results.nc, or the dataset.
+
+    Raises
+    ------
+    ValueError
+        If these are not results of `method.kind = "chaos"`.
+    """
+    import xarray as xr
+
+    if isinstance(source, str | Path):
+        path = Path(source)
+        source = xr.load_dataset(path / "results.nc" if path.is_dir() else path, engine="h5netcdf")
+    if "multi_index" not in source:
+        message = "these results hold no expansion, expected those of method.kind = 'chaos'"
+        raise ValueError(message)
+    arrays = {str(name): variable.to_numpy() for name, variable in source.data_vars.items()}
+    basis = Basis(
+        arrays["parameter_mean"],
+        arrays["parameter_std"],
+        arrays["recurrence_alpha"],
+        arrays["recurrence_beta"],
+        arrays["multi_index"],
+    )
+    return Expansion(
+        tuple(map(str, source["parameter"].values)),
+        tuple(map(str, source["output"].values)),
+        basis,
+        arrays["coefficients"],
+        arrays["range_lower"],
+        arrays["range_upper"],
+        arrays.get("field_coefficients"),
+    )
