@@ -356,7 +356,7 @@ def walk(model: HyperelasticModel, point: FloatArray, loads: FloatArray) -> tupl
     """
     at, step, u, slope, solution = 0.0, 1 / PATH, np.zeros(model.body.size), None, None
     end = time.perf_counter() + PATIENCE
-    while time.perf_counter() < end:
+    while time.perf_counter() < end and at + step > at:
         to = min(1.0, at + step)
         start = u if slope is None else u + (to - at) * slope
         try:
