@@ -198,17 +198,13 @@ class Unknowns:
         """Copy what DOLFINx or PETSc holds of the whole space into a vector (U_local,), or into rows (k, U_local)."""
         return np.array(values[..., : self.size]) if self._order is None else np.asarray(values[..., self._order])
 
-    def reorder(self, rows: FloatArray) -> FloatArray:
-        """Return rows (k, U_local) in PETSc's order."""
+    def reorder(self, values: FloatArray) -> FloatArray:
+        """Return a vector (U_local,), or rows (k, U_local), in PETSc's order."""
         if self._order is None:
-            return rows
-        reordered = np.empty_like(rows)
-        reordered[:, self._order] = rows
+            return values
+        reordered = np.empty_like(values)
+        reordered[..., self._order] = values
         return reordered
-
-    def put(self, vector: Any, values: FloatArray) -> None:
-        """Copy a vector (U_local,) into PETSc's."""
-        vector.array[slice(None) if self._order is None else self._order] = values
 
 
 def quadrature_space(msh: Any, degree: int) -> Any:
@@ -414,7 +410,7 @@ class DirectSolver:
         """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
         transpose = transpose and not self._symmetric
         if right.ndim == 1:
-            self._unknowns.put(self._right, right)
+            self._right.array[:] = self._unknowns.reorder(right)
             (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
             return self._unknowns.take(self._solution.array_r)
         if transpose or len(right) == 1 or self._ksp.comm.size > 1:

@@ -283,7 +283,6 @@ class Discretisation:
         for path, mover in self._movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
-        self._rounding = None
         external = np.zeros(self.size)
         with np.errstate(invalid="ignore"):  # a load that is not finite has no finite residual, which the solver says
             for path, force in self._unit_loads.items():
@@ -469,8 +468,7 @@ class Discretisation:
 
     def norm(self, x: FloatArray) -> float:
         """Euclidean norm over the displacements (or their forces) of all ranks."""
-        displacements = x[: 3 * self.nodes_owned]
-        return float(np.sqrt(self.dot(displacements, displacements)))
+        return float(self.norms(x[None])[0])
 
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J over the quadrature points of all ranks."""

@@ -130,8 +130,10 @@ class Hyperelastic(Settings):
         for inclusion in self.inclusions:
             for name in type(inclusion).model_fields:
                 if name not in {"kind", "name"}:
-                    low, high = self.body.bounds[AXES.index(name)] if name in AXES else (0.0, 0.0)
-                    within = (Ge(low), Le(high)) if name in AXES else ()
+                    within: tuple[Any, ...] = ()
+                    if name in AXES:  # the centre stays in the body
+                        low, high = self.body.bounds[AXES.index(name)]
+                        within = Ge(low), Le(high)
                     value = getattr(inclusion, name)
                     found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         for load in self.loads:

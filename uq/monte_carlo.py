@@ -15,7 +15,7 @@ from forward.settings import Settings
 from uq.evaluate import Evaluate, Evaluations, Request, merge
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
-from uq.moments import ESTIMATES, Coefficient, Moments, SecondMoment, estimate, monomials, quantiles
+from uq.moments import ESTIMATES, Coefficient, Estimates, Moments, SecondMoment, estimate, monomials, quantiles
 from uq.sampling import random_points
 
 if TYPE_CHECKING:
@@ -150,19 +150,22 @@ def _sample(
         count = target
         evaluations = merge(rounds)
         scalars = _scalar_moments(evaluations, inputs, centre, control)
-        if method.tolerance is None:
-            stopped = f"{count} samples, as asked"
-            break
         reached = float(scalars.relative_error.max())
-        if reached <= method.tolerance:
-            stopped = f"tolerance {method.tolerance:g} met: relative error {reached:.3g} after {count} samples"
-            break
-        if count >= limit:
-            stopped = f"tolerance {method.tolerance:g} not met: relative error {reached:.3g} after all {count} samples"
+        if method.tolerance is None or reached <= method.tolerance or count >= limit:
             break
         growth = min(4.0, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
         target = min(limit, int(count * growth) + 1)
+    stopped = why_stopped(method.tolerance, reached, f"{count} samples")
     return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
+
+
+def why_stopped(tolerance: float | None, reached: float, amount: str) -> str:
+    """Say whether sampling stopped at the tolerance of the relative errors, or after the amount that was asked for."""
+    if tolerance is None:
+        return f"{amount}, as asked"
+    if reached <= tolerance:
+        return f"tolerance {tolerance:g} met: relative error {reached:.3g} after {amount}"
+    return f"tolerance {tolerance:g} not met: relative error {reached:.3g} after all {amount}"
 
 
 def _scalar_moments(
@@ -234,14 +237,20 @@ def _dataset(
         )
     if evaluations.fields.size:
         field = _field_moments(evaluations, inputs, centre, control)
-        count = evaluate.displacements
-        fields = {f"field_{name}": getattr(field, name)[:count].reshape(-1, 3) for name in ESTIMATES}
-        dataset = dataset.assign({name: (("node", "component"), values) for name, values in fields.items()})
+        dataset = dataset.assign(by_node(field, evaluate.displacements))
     dataset.attrs["stopped"] = stopped
     if not ok.all():
         which = "plain estimates" if control else "all estimates"
         dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)
     return dataset
+
+
+def by_node(field: Estimates, displacements: int) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Return estimates of a state, of which so many entries are displacements, as arrays by node and component."""
+    return {
+        f"field_{name}": (("node", "component"), getattr(field, name)[:displacements].reshape(-1, 3))
+        for name in ESTIMATES
+    }
 
 
 def failure_note(ok: NDArray[np.bool_], which: str, followed: str | None) -> str:

@@ -29,7 +29,7 @@ from uq.moments import (
     quantiles_from_replicates,
     ratio,
 )
-from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, failure_note
+from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, why_stopped
 from uq.sampling import sobol_points
 from uq.taylor import Taylor, quadratic, tangent
 
@@ -161,23 +161,14 @@ class QuasiMonteCarlo(MonteCarlo):
             dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
         field = samples.field()
         if field is not None:
-            count = evaluate.displacements
-            fields = {f"field_{name}": getattr(field, name)[:count].reshape(-1, 3) for name in ESTIMATES}
-            dataset = dataset.assign({name: (("node", "component"), of) for name, of in fields.items()})
-        dataset.attrs["stopped"] = self._stopped(samples.each, float(scalars.relative_error.max()))
+            dataset = dataset.assign(by_node(field, evaluate.displacements))
+        amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
+        dataset.attrs["stopped"] = why_stopped(self.tolerance, float(scalars.relative_error.max()), amount)
         if not ok.all():
             followed = None if self.control == "none" else f"the {self.control} control"
             which = "all estimates" if self.control == "none" else "quantiles"
             dataset.attrs["note"] = failure_note(ok, which, followed)
         return dataset
-
-    def _stopped(self, each: int, reached: float) -> str:
-        amount = f"{self.scrambles * each} samples ({self.scrambles} scrambles of {each} Sobol' points)"
-        if self.tolerance is None:
-            return f"{amount}, as asked"
-        if reached <= self.tolerance:
-            return f"tolerance {self.tolerance:g} met: relative error {reached:.3g} after {amount}"
-        return f"tolerance {self.tolerance:g} not met: relative error {reached:.3g} after all {amount}"
 
 
 def _power_of_two(limit: int) -> int:
