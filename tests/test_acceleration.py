@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.acceleration import AndersonMixing, block_gcr
+from forward.acceleration import AndersonMixing, block_galerkin
 from forward.reference import rotations, turned
 
 RNG = np.random.default_rng(3)
@@ -27,16 +27,16 @@ def matrices(spread):
 
 
 @pytest.mark.parametrize("k", [1, 3])
-def test_block_gcr_solves_to_its_tolerance(k):
+def test_block_galerkin_solves_to_its_tolerance(k):
     A, inverse = matrices(0.2)
     right = RNG.standard_normal((k, N)) * np.logspace(0, 6, k)[:, None]
     exact = np.linalg.solve(A, right.T).T
     for tolerance in (1e-4, 1e-8, 1e-11):
-        x = block_gcr(lambda v: v @ A.T, lambda v: v @ inverse.T, right, same, sizes, tolerance, 30)
+        x = block_galerkin(lambda v: v @ A.T, lambda v: v @ inverse.T, right, same, sizes, tolerance, 30)
         assert (sizes(x - exact) <= 2 * tolerance * sizes(exact)).all()
 
 
-def test_block_gcr_shares_what_it_learns_and_says_when_it_fails():
+def test_block_galerkin_shares_what_it_learns_and_says_when_it_fails():
     A, inverse = matrices(0.2)
     products = []
 
@@ -46,7 +46,7 @@ def test_block_gcr_shares_what_it_learns_and_says_when_it_fails():
 
     def iterations(right):
         products.clear()
-        assert block_gcr(multiply, lambda v: v @ inverse.T, right, same, sizes, 1e-10, 30) is not None
+        assert block_galerkin(multiply, lambda v: v @ inverse.T, right, same, sizes, 1e-10, 30) is not None
         return len(products)
 
     right = RNG.standard_normal((4, N))
@@ -54,8 +54,8 @@ def test_block_gcr_shares_what_it_learns_and_says_when_it_fails():
     assert iterations(right) < alone
     # Dependent right-hand sides, and one that is zero.
     assert iterations(np.array([right[0], 2 * right[0], 0 * right[0]])) <= alone + 1
-    assert block_gcr(multiply, lambda v: v @ inverse.T, right, same, sizes, 1e-10, 2) is None
-    assert block_gcr(multiply, lambda v: np.nan * v, right, same, sizes, 1e-10, 9) is None
+    assert block_galerkin(multiply, lambda v: v @ inverse.T, right, same, sizes, 1e-10, 2) is None
+    assert block_galerkin(multiply, lambda v: np.nan * v, right, same, sizes, 1e-10, 9) is None
 
 
 def test_mixing_finds_the_fixed_point_that_plain_corrections_miss():
