@@ -15,6 +15,7 @@ from forward.model import FloatArray
 Inverse = Callable[[FloatArray], FloatArray]  # applies P⁻¹ to (n,) or to rows (k, n)
 Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
 NEGLIGIBLE = 1e-13  # relative size of a direction, in least squares, that is taken to be rounding
+MARGIN = 2.0  # what convergence may fall short of that of the iterations before
 
 
 class AndersonMixing:
@@ -95,8 +96,8 @@ def block_galerkin(
     Where A is symmetric these are block conjugate gradients, whose errors are the smallest in energy; with
     P ≈ A that says more about x than the size of a residual does. Full orthogonalisation keeps them so after rounding,
     and allows A without symmetry. All systems share their search spaces, so that k need fewer iterations than one.
-    Stopped where the next correction, times the factor by which the last two iterations have at least shortened it, is
-    below the tolerance; that correction is still added, since it costs no product.
+    Stopped where the next correction, times the factor by which both of the last two iterations have shortened it and
+    with a margin, is below the tolerance; that correction is still added, since it costs no product.
     Sources: D. P. O'Leary, Linear Algebra Appl. 29 (1980) 293–322; Y. Saad, Math. Comp. 37 (1981) 105–126.
 
     Parameters
@@ -125,11 +126,12 @@ def block_galerkin(
     most = (0 if first is None else len(first)) + iterations * len(right)
     directions, images = np.empty((most, right.shape[1])), np.empty((most, right.shape[1]))
     energies = np.empty((most, most))  # directions · images
+    inverse = np.empty((0, 0))  # of the energies so far
     searched = 0
 
     def search(p: FloatArray) -> None:
         """Make the residuals orthogonal to the directions p (j, n) too."""
-        nonlocal x, r, searched
+        nonlocal x, r, inverse, searched
         old, new = slice(searched), slice(searched, searched + len(p))
         searched = new.stop
         directions[new], images[new] = p, multiply(p)
@@ -137,7 +139,8 @@ def block_galerkin(
         both = np.concatenate([images[new], r])
         ahead, back = total(D @ both.T), total(p @ images[old].T)
         energies[:searched, new], energies[new, old] = ahead[:, : len(p)], back
-        part = _scaled_solve(energies[:searched, :searched], ahead[:, len(p) :]).T
+        inverse = _scaled_inverse(energies[:searched, :searched])
+        part = (inverse @ ahead[:, len(p) :]).T
         x = x + part @ D
         r = r - part @ Q
 
@@ -148,14 +151,14 @@ def block_galerkin(
         p = precondition(r)
         if searched:
             overlap = total(images[:searched] @ p.T)
-            p -= _scaled_solve(energies[:searched, :searched], overlap).T @ directions[:searched]
+            p -= (inverse @ overlap).T @ directions[:searched]
         before, lengths = lengths, size(p)
         if not np.isfinite(lengths).all():
             return None
-        factor = 1.0
+        factor = np.ones(len(right))
         if np.isfinite(before).all():
             earlier, ratio = ratio, np.minimum(1, lengths / np.maximum(before, np.finfo(float).tiny))
-            factor = np.maximum(ratio, earlier)
+            factor = MARGIN * np.maximum(ratio, earlier)
         unfinished = lengths * factor > tolerance * size(x + p)
         if not unfinished.any():
             return np.asarray(x + p)
@@ -163,9 +166,13 @@ def block_galerkin(
     return None
 
 
-def _scaled_solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve with a small matrix (k, k) of scaled rows and columns, without the directions that are rounding."""
+def _scaled_inverse(matrix: FloatArray) -> FloatArray:
+    """Invert a small matrix (k, k) of scaled rows and columns, without the directions that are rounding."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
     size = np.sqrt(np.abs(np.diag(matrix)))
     size[size == 0] = 1
-    found = np.linalg.lstsq(matrix / np.outer(size, size), right / size[:, None], rcond=NEGLIGIBLE)[0]
-    return np.asarray(found / size[:, None])
+    scale = np.outer(size, size)
+    left, values, right = np.linalg.svd(matrix / scale)
+    good = values > NEGLIGIBLE * values[0]
+    return np.asarray((right[good].T / values[good]) @ left[:, good].T / scale)

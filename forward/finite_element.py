@@ -94,6 +94,7 @@ class Discretisation:
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding: float | None = None
+        self._given: FloatArray | None = None  # parameters that are set
         self._stretch = self._small_stretch()
 
     # --- forms -------------------------------------------------------------------------------------------------------
@@ -276,6 +277,10 @@ class Discretisation:
 
     def set_parameters(self, parameters: FloatArray) -> None:
         """Give the parameters (d,) their values."""
+        self._rounding = None
+        if self._given is not None and np.array_equal(parameters, self._given):
+            return
+        self._given = np.array(parameters, dtype=float)
         self._values |= dict(zip(self.parameters, map(float, parameters), strict=True))
         for path, constant in self._constants.items():
             constant.value = self._values[path]
@@ -288,7 +293,6 @@ class Discretisation:
             for path, force in self._unit_loads.items():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
-        self._rounding = None
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""

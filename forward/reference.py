@@ -123,7 +123,7 @@ class ReferenceFactor:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
         body = self._body
         body.set_state(u)
-        return np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations)
+        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations))
 
     def near(self, u: FloatArray) -> Inverse:
         """Return the approximate inverse at a state u (U_local,)."""
