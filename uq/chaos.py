@@ -42,6 +42,7 @@ ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
 FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
 DICTIONARY = 2000  # functions to select from, at most
 FIELD_DICTIONARY = 500  # the same where fields are expanded: every block of samples keeps a field for each function
+FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
 GROWTH = 1.5  # of the design, from one look at the tolerance to the next
@@ -189,46 +190,52 @@ def _first(inputs: Inputs, *, gradients: bool) -> int:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Some functions of the largest basis, by their numbers; order and q of the set that they are from."""
+    """Some functions of the largest basis, by their numbers; order and q of the set that they are from.
+
+    Where `sparse` is set they are a dictionary, to select functions from.
+    """
 
     order: int
     q: float
     which: IntArray
+    sparse: bool = False
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Sets to choose from, whole or (where `sparse`) function by function; `all` (P, d) is their union."""
+    """Sets to choose from; `all` (P, d) is their union."""
 
     all: IntArray
     sets: tuple[_Candidate, ...]
-    sparse: bool
-    most: int
 
 
 def _whole(inputs: Inputs, order: int) -> _Candidates:
     """Return the full basis of one order as the only choice."""
     indices = hyperbolic(len(inputs.names), order, 1.0)
-    whole = _Candidate(order, 1.0, np.arange(len(indices)))
-    return _Candidates(indices, (whole,), sparse=False, most=len(indices))
+    return _Candidates(indices, (_Candidate(order, 1.0, np.arange(len(indices))),))
 
 
 def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _Candidates:
-    """Return the bases that `rows` rows may determine, or sets of up to `dictionary` functions to select from."""
+    """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
     d = len(inputs.names)
-    sparse = d > FULL
-    most = dictionary if sparse else max(rows // ROWS_PER_TERM, d + 1)
-    found: dict[tuple[tuple[int, ...], ...], tuple[int, float]] = {}
+    most = max(rows // ROWS_PER_TERM, d + 1)
+    found: dict[tuple[bool, tuple[tuple[int, ...], ...]], tuple[int, float]] = {}
     for q in reversed(TRUNCATIONS):
         for order in range(1, max_order + 1):
             indices = hyperbolic(d, order, q)
-            if len(indices) > most and order > 1:
-                break
-            found.setdefault(tuple(map(tuple, indices.tolist())), (order, q))
-    union = sorted({index for members in found for index in members}, key=by_degree)
+            members = tuple(map(tuple, indices.tolist()))
+            if d <= FULL and (len(indices) <= most or order == 1):
+                found.setdefault((False, members), (order, q))
+            if len(indices) <= dictionary or order == 1:
+                widest = members, order
+        found.setdefault((True, widest[0]), (widest[1], q))
+    union = sorted({index for _, members in found for index in members}, key=by_degree)
     number = {index: i for i, index in enumerate(union)}
-    sets = [_Candidate(order, q, np.array([number[a] for a in members])) for members, (order, q) in found.items()]
-    return _Candidates(np.array(union, dtype=np.int64), tuple(sets), sparse, most)
+    sets = [
+        _Candidate(order, q, np.array([number[a] for a in members]), sparse)
+        for (sparse, members), (order, q) in found.items()
+    ]
+    return _Candidates(np.array(union, dtype=np.int64), tuple(sets))
 
 
 # --- regression ----------------------------------------------------------------------------------------------------
@@ -321,21 +328,23 @@ def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
         If there are not enough samples.
     """
     left, right = data.left(largest), data.right
-    rows = left.shape[0] * left.shape[1]
+    n, rows, _ = right.shape
+    held = np.arange(n) % min(n, FOLDS)
     scores: list[tuple[float, _Candidate]] = []
     for candidate in candidates.sets:
-        if candidates.sparse:
-            scores += _select(left, right, data, candidate, rows // ROWS_PER_TERM)
-        elif candidate.which.size <= min(candidates.most, rows) and (
-            candidate.order == 1 or len(candidates.sets) == 1 or candidate.which.size * ROWS_PER_TERM <= rows
-        ):
-            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(rows, -1))
+        terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
+        if candidate.sparse:
+            scores.append(_select(left, right, data, candidate, held, most))
+        elif terms <= n * rows and (candidate.order == 1 or len(candidates.sets) == 1 or terms <= most):
+            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(n * rows, -1))
             size = np.abs(np.diag(r))
             if size.min() > 1e-10 * size.max():
-                scores.append((_score(q, right, data), candidate))
+                blocks = q.reshape(n, rows, terms)
+                residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
+                scores.append((float(data.relative(_left_out(blocks, residual, held)).max()), candidate))
     scores = [(score, candidate) for score, candidate in scores if np.isfinite(score)]
     if not scores:
-        message = f"{len(data.points)} samples have an answer, too few for an expansion of order 1"
+        message = f"{n} samples have an answer, too few for an expansion of order 1"
         raise SolveError(message)
     best = min(score for score, _ in scores)
     # Of those that are as good, the smallest.
@@ -343,58 +352,69 @@ def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
     return _regress(left, right, data, min(good, key=lambda candidate: candidate.which.size))
 
 
-def _score(q: FloatArray, right: FloatArray, data: _Data) -> float:
-    """Largest relative leave-one-out error of a fit whose orthonormal columns are q (n·rows, P)."""
-    blocks = q.reshape(*right.shape[:2], -1)
-    residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
-    return float(data.relative(_left_out(blocks, residual)).max())
+def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
+    """Errors (n, rows, m) at each sample of the fit without those that share its number in `held` (n,).
 
-
-def _left_out(blocks: FloatArray, residual: FloatArray) -> FloatArray:
-    """Errors (n, rows, m) at each sample of the fit without it, from the orthonormal columns and the residuals."""
-    rest = np.eye(blocks.shape[1]) - blocks @ np.swapaxes(blocks, 1, 2)
-    needed = np.linalg.eigvalsh(rest)[:, 0] < 1e-10  # without this sample the fit is not determined
-    rest[needed] = np.eye(blocks.shape[1])
-    errors = np.linalg.solve(rest, residual)
-    errors[needed] = np.inf
-    return np.asarray(errors)
+    They follow from the orthonormal columns (n, rows, P) and the residuals.
+    """
+    errors = np.empty_like(residual)
+    for number in np.unique(held):
+        out = held == number
+        part = blocks[out].reshape(-1, blocks.shape[2])
+        rest = np.eye(len(part)) - part @ part.T
+        if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
+            errors[out] = np.inf
+        else:
+            errors[out] = np.linalg.solve(rest, residual[out].reshape(len(part), -1)).reshape(residual[out].shape)
+    return errors
 
 
 def _select(
-    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, most: int
-) -> list[tuple[float, _Candidate]]:
+    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, held: IntArray, most: int
+) -> tuple[float, _Candidate]:
     """Take functions one by one, each time the one that explains most of what all outputs have left.
 
-    Orthogonal least squares: after every step the columns of the dictionary are made orthogonal to those taken.
+    Orthogonal least squares, from all samples and, to learn when to stop, without those of each number in `held` (n,):
+    what is selected by samples cannot be judged by them.
+
+    Returns
+    -------
+    float, _Candidate
+        The relative error at the samples left out, and the functions selected from all.
     """
     n, rows, m = right.shape
-    columns = left[:, :, dictionary.which].reshape(n * rows, -1).copy()
-    lengths = (columns**2).sum(axis=0)
-    rest = right.reshape(n * rows, m) / np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    columns = left[:, :, dictionary.which].reshape(n * rows, -1)
+    # The last of these fits sees everything.
+    numbers = np.arange(held.max() + 2)
+    seen = np.repeat(held[None, :] != numbers[:, None], rows, axis=1).astype(float)
+    scale = np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    rest = np.tile(right.reshape(n * rows, m) / scale, (len(numbers), 1, 1))
+    lengths = seen @ columns**2
+    left_over = lengths.copy()
     taken: list[int] = []
-    q = np.empty((n * rows, 0))
-    found: list[tuple[float, _Candidate]] = []
-    best, waited = np.inf, 0
-    while len(taken) < min(most, columns.shape[1]) and waited < PATIENCE:
-        left_over = (columns**2).sum(axis=0)
+    q = np.empty((0, len(numbers), n * rows))
+    scores: list[float] = []
+    while len(taken) < min(most, columns.shape[1]) and len(scores) - int(np.argmin(scores or [0])) <= PATIENCE:
         usable = left_over > 1e-8 * lengths
-        if not usable.any():
+        if not usable.any(axis=1).all():
             break
-        gains = np.where(usable, ((columns.T @ rest) ** 2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0)
-        pick = int(gains.argmax()) if taken else 0  # the constant comes first
-        column = columns[:, pick]
-        column = column - q @ (q.T @ column)
-        column /= np.linalg.norm(column)
-        q = np.column_stack([q, column])
-        columns -= np.outer(column, column @ columns)
-        rest = rest - np.outer(column, column @ rest)
-        taken.append(pick)
-        score = _score(q, right, data)
-        which = dictionary.which[np.array(taken)]
-        found.append((score, _Candidate(dictionary.order, dictionary.q, which)))
-        waited = 0 if score < best else waited + 1
-        best = min(best, score)
-    return found
+        pick = np.zeros(len(numbers), dtype=np.int64)  # the constant comes first
+        if taken:
+            gains = np.einsum("nfm,np->fpm", (rest * seen[:, :, None]).swapaxes(0, 1), columns, optimize=True)
+            pick = np.where(usable, (gains**2).sum(axis=2) / np.where(usable, left_over, 1.0), -1.0).argmax(axis=1)
+        column = columns[:, pick].T
+        for _ in range(2):
+            column = column - np.einsum("kf,kfn->fn", np.einsum("kfn,fn->kf", q, column * seen), q)
+        column = column / np.sqrt((column**2 * seen).sum(axis=1))[:, None]
+        q = np.concatenate([q, column[None]])
+        left_over -= ((column * seen) @ columns) ** 2
+        rest = rest - column[:, :, None] * np.einsum("fn,fnm->fm", column * seen, rest)[:, None, :]
+        taken.append(int(pick[-1]))
+        errors = rest.reshape(len(numbers), n, rows, m)[held, np.arange(n)] * scale
+        scores.append(float(data.relative(errors).max()))
+    count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
+    chosen = _Candidate(dictionary.order, dictionary.q, dictionary.which[np.array(taken[:count])], sparse=True)
+    return scores[count - 1], chosen
 
 
 def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate) -> _Fit:
@@ -405,7 +425,7 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
     blocks = q.reshape(n, rows, -1)
     rotated = np.einsum("zrp,zrm->pm", blocks, right)
     residual = right - blocks @ rotated
-    errors = _left_out(blocks, residual)
+    errors = _left_out(blocks, residual, np.arange(n))
     terms = chosen.which.size
     moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
     coefficients = solve_triangular(r, rotated)
