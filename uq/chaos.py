@@ -230,7 +230,7 @@ def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _
                 found.setdefault((False, members), (order, q))
             if len(indices) <= dictionary or order == 1:
                 widest = members, order
-        if not (True, widest[0]) in found and not determined:
+        if (True, widest[0]) not in found and not determined:
             found[True, widest[0]] = (widest[1], q)
         # Nothing is lost by selecting from all of them where there are as many rows.
         determined = determined or (widest[1] == max_order and len(widest[0]) <= rows)
