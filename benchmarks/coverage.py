@@ -83,7 +83,5 @@ def main() -> None:
             columns.append((hits, np.sqrt((claims**2).mean(axis=0) / (errors**2).mean(axis=0))))
         (mean, claim), (std, std_claim) = columns
         for i, output in enumerate(evaluate.outputs):
-            print(
-                f"| {name} | {output} | {100 * mean[i]:.1f} | {100 * std[i]:.1f} | {claim[i]:.2f} | {std_claim[i]:.2f} |",
-                flush=True,
-            )
+            shares = f"{100 * mean[i]:.1f} | {100 * std[i]:.1f}"
+            print(f"| {name} | {output} | {shares} | {claim[i]:.2f} | {std_claim[i]:.2f} |", flush=True)

@@ -528,7 +528,9 @@ class _Projections:
             if self.gradients:
                 left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
                 right = np.vstack([right, solution.state_tangent(directions)])
-            total = np.vstack([left.T @ right, (right**2).sum(axis=0)])
+            total = np.empty((left.shape[1] + 1, right.shape[1]))
+            np.matmul(left.T, right, out=total[:-1])
+            np.einsum("ru,ru->u", right, right, out=total[-1])
             if self.points is None or self.weights is None:
                 return total
             return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
