@@ -11,7 +11,8 @@ residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there 
 by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
 The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
-of the largest basis that may be chosen. These rows are summed while the samples stream by.
+of the largest basis that may be chosen. These rows are summed where blocks are added, from the d + 1 fields of a sample
+that the blocks carry.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
@@ -41,7 +43,7 @@ TRUNCATIONS = (0.5, 0.75, 1.0)
 ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
 FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
 DICTIONARY = 2000  # functions to select from, at most
-FIELD_DICTIONARY = 500  # the same where fields are expanded: every block of samples keeps a field for each function
+FIELD_DICTIONARY = 500  # the same where fields are expanded: a field in memory for each function
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
 GROWTH = 1.5  # of the design, from one look at the tolerance to the next
@@ -302,6 +304,12 @@ class _Fit:
     relative: FloatArray
     squares: FloatArray
 
+    def of_fields(self, projections: FloatArray) -> FloatArray:
+        """Coefficients (P, U) of fields, from their projections (P, U) on the functions of the fit."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(cho_solve((self.triangle, False), projections))
+
 
 def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
@@ -410,6 +418,8 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
 class _Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
+    A compact sum: blocks carry y_z, the deviation and its slopes.
+
     Attributes
     ----------
     basis
@@ -433,17 +443,66 @@ class _Projections:
         directions = np.diag(self.basis.scale)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            left = self.basis.values(parameters[None, :])
-            right = (solution.state - state)[None, :]
-            if self.gradients:
-                left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
-                right = np.vstack([right, solution.state_tangent(directions)])
-            total = np.vstack([left.T @ right, (right**2).sum(axis=0)])
-            if self.points is None or self.weights is None:
-                return total
-            return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
+            deviation = (solution.state - state)[None, :]
+            return np.vstack([deviation, solution.state_tangent(directions)]) if self.gradients else deviation
 
         return rows
+
+    def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
+        left = self.basis.values(parameters[None, :])
+        if self.gradients:
+            left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
+        total = np.vstack([left.T @ rows, (rows**2).sum(axis=0)])
+        if self.points is None or self.weights is None:
+            return total
+        return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Expansion of the deviations of outputs and state from those at the mean parameters.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    outputs, state
+        Coefficients (P, m) and (P, U); (P, 0) where the state was not wanted.
+    relative
+        Leave-one-out errors (m,) of the outputs over their standard deviation.
+    ok
+        Which samples (n,) had an answer and were fitted.
+    """
+
+    basis: Basis
+    outputs: FloatArray
+    state: FloatArray
+    relative: FloatArray
+    ok: NDArray[np.bool_]
+
+
+def expand(
+    inputs: Inputs, evaluate: Evaluate, centre: Linearisation, points: FloatArray, max_order: int, *, fields: bool
+) -> Deviations:
+    """Fit an expansion to values and gradients at points (n, d), outputs and whole state alike.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at too many of the points for an expansion of order 1.
+    """
+    candidates = _candidates(inputs, max_order, len(points) * _rows(inputs, gradients=True), FIELD_DICTIONARY)
+    largest = orthonormal(inputs, candidates.all)
+    wanted = _Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
+    data = _Data.of(evaluations, inputs, None)
+    fit = _fit(candidates, largest, data)
+    basis = largest.subset(fit.chosen.which)
+    outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
+    state = np.zeros((len(outputs), 0))
+    if wanted is not None:
+        state = fit.of_fields(evaluations.fields[fit.chosen.which])
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok)
 
 
 # --- what follows from an expansion --------------------------------------------------------------------------------
@@ -563,10 +622,8 @@ def _field_estimates(
 
     Their errors are those of the outputs in proportion to the residuals, which come from the same rows.
     """
-    from scipy.linalg import cho_solve
-
     projections = evaluations.fields[fit.chosen.which][:, :count]
-    coefficients = cho_solve((fit.triangle, False), projections)
+    coefficients = fit.of_fields(projections)
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
     moments = _moments(coefficients.T, basis.indices)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,8 @@ class Evaluations:
     work
         Counts (n, k) of the operations `forward.model.WORK`.
     fields
-        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
+        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
+        `CompactSum`, the rows of these points themselves, one point after the other.
     """
 
     points: FloatArray
@@ -72,6 +73,17 @@ class FieldSum(Protocol):
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
+
+
+@runtime_checkable
+class CompactSum(FieldSum, Protocol):
+    """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
+
+    `on` returns the few; the terms are formed where blocks are added, so that files and messages stay small.
+    """
+
+    def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return what is summed (K, U), from the parameters (d,) of a realisation and its rows (k, U)."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +211,7 @@ class SerialEvaluate:
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
         solver = BlockSolver(self.model, request)
-        return merge([solver(block.points, self.progress) for block in request.blocks()])
+        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
 
 
 class Recorder:
@@ -264,6 +276,7 @@ class BlockSolver:
         self._model = model
         self._tangents = request.tangents
         self._row = request.fields.on(model) if request.fields is not None else None
+        self._compact = isinstance(request.fields, CompactSum)
         self._predict: Callable[[FloatArray], FloatArray] | None = None
         self._reference: Reference | None = None
         if request.start is not None:
@@ -278,7 +291,7 @@ class BlockSolver:
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         failures: list[Failure] = []
-        total: FloatArray | None = None
+        rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
         for i, point in enumerate(points):
             begin = time.process_time()
             try:
@@ -293,19 +306,21 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
-                if row is not None:
-                    total = row if total is None else total + row
+                if row is not None and (self._compact or not rows):
+                    rows.append(row)
+                elif row is not None:
+                    rows[0] = rows[0] + row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
-        fields = np.zeros((0, 0)) if total is None else model.gather(total)
+        fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
         return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
 
 
-def merge(blocks: Sequence[Evaluations]) -> Evaluations:
-    """Put the blocks of a request together, in their order."""
-    merger = Merger()
+def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
+    """Put the blocks of a request for these fields together, or several evaluations, in their order."""
+    merger = Merger(fields)
     for block in blocks:
         merger.add(block)
     return merger.result()
@@ -314,13 +329,19 @@ def merge(blocks: Sequence[Evaluations]) -> Evaluations:
 class Merger:
     """Adds blocks in their order, keeping one sum of fields.
 
+    Parameters
+    ----------
+    fields
+        The sum that the blocks are parts of; none where each of them is complete.
+
     Attributes
     ----------
     count
         Number of blocks added so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fields: FieldSum | None = None) -> None:
+        self._compact = fields if isinstance(fields, CompactSum) else None
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
         self._points = 0
@@ -329,12 +350,22 @@ class Merger:
 
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
-        if block.fields.size:
-            self._fields = block.fields if self._fields.size == 0 else self._fields + block.fields
+        for term in self._terms(block):
+            self._fields = term if self._fields.size == 0 else self._fields + term
         self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
         self._points += len(block.points)
         self.count += 1
         self._blocks.append(replace(block, fields=np.zeros((0, 0))))
+
+    def _terms(self, block: Evaluations) -> Iterator[FloatArray]:
+        if block.fields.size == 0:
+            return
+        if self._compact is None:
+            yield block.fields
+            return
+        solved = block.points[block.ok]
+        for point, rows in zip(solved, np.split(block.fields, len(solved)), strict=True):
+            yield self._compact.term(point, rows)
 
     def result(self) -> Evaluations:
         """Return everything added so far as one."""

@@ -120,7 +120,7 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            objection = self.method.objection(inputs) if isinstance(self.method, Chaos | QuasiMonteCarlo) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
 

@@ -71,7 +71,7 @@ fields = true         # mean and standard deviation of the displacement at every
 kind = "quasi-monte-carlo"
 samples = 256         # scrambles × a power of two; or tolerance = 0.001, or budget_seconds = 600: whichever comes first
 scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
-control = "tangent"   # or "none", or "quadratic": two more solves for each parameter
+control = "tangent"   # or "none"; "quadratic": two more solves for each parameter; "chaos": a fit to samples of its own
 coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
