@@ -196,7 +196,14 @@ def test_control_variate_that_hurts_is_called_so(tmp_path, sampled, undrawn):
     assert page.count("It hurts the mean: there, plain Monte Carlo is better.") == 1
 
 
-@pytest.mark.parametrize(("control", "words_"), [("none", "with Sobol"), ("tangent", "points and the control variate")])
+@pytest.mark.parametrize(
+    ("control", "words_"),
+    [
+        ("none", "with Sobol"),
+        ("tangent", "points and the control variate"),
+        ("chaos", "fitted to 7 samples of its own"),
+    ],
+)
 def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
     method = {"kind": "quasi-monte-carlo", "samples": 64, "control": control}
     dataset = solve(parse({**study().model_dump(mode="json", exclude_none=True), "method": method}))

@@ -112,6 +112,13 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
             f"a 95 % interval is ± {number(band(dataset), 3)} of them.",
             hurts=False,
         )
+    if "control_samples" in dataset:
+        error, fitted = number(float(dataset["loo_error"].max()), 2), int(dataset["control_samples"])
+        yield Gain(
+            f"The control variate is an expansion fitted to {fitted} samples of its own, with a leave-one-out "
+            f"error of at most {error} standard deviations.",
+            hurts=False,
+        )
     for output in dataset["output"].values:
         mean, std = (float(dataset[name].sel(output=output)) for name in ("variance_ratio", "std_variance_ratio"))
         text = (
