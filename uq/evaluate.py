@@ -47,6 +47,8 @@ class Evaluations:
         Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
     work
         Counts (n, k) of the operations `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
     fields
         Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
     """
@@ -57,6 +59,7 @@ class Evaluations:
     failures: tuple[Failure, ...]
     seconds: FloatArray
     work: NDArray[np.int64]
+    residuals: FloatArray
     fields: FloatArray
 
     @property
@@ -74,9 +77,19 @@ class FieldSum(Protocol):
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
 
 
+class Start(Protocol):
+    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+
+    A dataclass, by whose fields the blocks that were started from it are found again.
+    """
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
+    """A linear prediction of the state, with the factor at `point`.
 
     Attributes
     ----------
@@ -100,12 +113,27 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of an evaluation."""
+    """What is asked of an evaluation.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    tangents
+        Whether dψ/dω is wanted.
+    fields
+        What is summed.
+    start
+        Where the solver starts.
+    iterations
+        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
+    """
 
     points: FloatArray
     tangents: bool = False
     fields: FieldSum | None = None
-    start: Prediction | None = None
+    start: Start | None = None
+    iterations: int | None = None
 
     def blocks(self) -> list[Request]:
         """Cut into blocks that depend on the number of points only."""
@@ -183,6 +211,7 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents = request.tangents
+        self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
         self._predict: Callable[[FloatArray], FloatArray] | None = None
         self._reference: Reference | None = None
@@ -197,13 +226,14 @@ class BlockSolver:
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals = np.full(n, np.nan)
         failures: list[Failure] = []
         total: FloatArray | None = None
         for i, point in enumerate(points):
             begin = time.process_time()
             try:
                 start = self._predict(point) if self._predict is not None else None
-                solution = model.solve(point, start, self._reference)
+                solution = model.solve(point, start, self._reference, self._iterations)
                 row = self._row(solution, point) if self._row is not None else None
                 if tangents is not None:
                     tangents[i] = solution.tangent(np.eye(d)).T
@@ -213,6 +243,7 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
+                residuals[i] = solution.residual
                 if row is not None:
                     total = row if total is None else total + row
             seconds[i] = time.process_time() - begin
@@ -220,7 +251,7 @@ class BlockSolver:
         fields = np.zeros((0, 0)) if total is None else model.gather(total)
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, fields)
 
 
 def merge(blocks: Sequence[Evaluations]) -> Evaluations:
@@ -273,5 +304,6 @@ class Merger:
             tuple(self._failures),
             np.concatenate(list(joined(lambda b: b.seconds))),
             np.concatenate([b.work for b in self._blocks]),
+            np.concatenate(list(joined(lambda b: b.residuals))),
             self._fields,
         )
