@@ -28,7 +28,7 @@ from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
 from forward.model import FloatArray, Reference, SolveError, Work
-from forward.newton import Residual, solve
+from forward.newton import Found, Residual, solve
 from forward.reference import ReferenceFactor
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
@@ -593,9 +593,7 @@ class HyperelasticModel:
         found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         corrected = body.work.factorisations == 0
-        return FiniteElementSolution(
-            self, parameters, found.state, found.residual, body.work, reference if corrected else None
-        )
+        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -657,15 +655,14 @@ class FiniteElementSolution:
         self,
         model: HyperelasticModel,
         parameters: FloatArray,
-        state: FloatArray,
-        residual: float,
+        found: Found,
         work: Work,
         reference: Reference | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
-        self.state = np.array(state)
-        self.residual = residual
+        self.state = np.array(found.state)
+        self.residual, self.converged = found.residual, found.converged
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False

@@ -103,6 +103,10 @@ class Solution(Protocol):
         """Relative residual of the state, in the solver's measure; zero for a model that is not solved for."""
 
     @property
+    def converged(self) -> bool:
+        """Whether that meets the solver's tolerance (or is rounding); if not, the solver was stopped before."""
+
+    @property
     def work(self) -> Work:
         """What this solution has cost so far."""
 
@@ -243,6 +247,11 @@ class FunctionSolution:
     def residual(self) -> float:
         """Nothing is left to solve."""
         return 0.0
+
+    @property
+    def converged(self) -> bool:
+        """Always."""
+        return True
 
     @property
     def work(self) -> Work:

@@ -176,10 +176,11 @@ class Way(Protocol):
 
 
 class Found(NamedTuple):
-    """A state (U_local,) and its relative residual."""
+    """A state (U_local,), its relative residual, and whether it is an equilibrium to the solver's tolerance."""
 
     state: FloatArray
     residual: float
+    converged: bool = True
 
 
 class _Diverged(Exception):  # noqa: N818 - control flow inside this file
@@ -210,7 +211,8 @@ def solve(
         Where the prediction comes from.
     iterations
         Stop after so many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
-        or, without one, Newton steps. The equilibrium is looked for after all where they lead to no admissible state.
+        or, without one, Newton steps. The equilibrium is looked for after all where they lead to no admissible state,
+        and where they are as many as the settings allow at all.
 
     Returns
     -------
@@ -223,13 +225,14 @@ def solve(
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
     history: list[str] = []
-    if iterations is not None:
+    if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
         system.at_load(1.0)
         try:
             return _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
         except _Diverged as stop:
             history.append(f"{stop}: the equilibrium is looked for after all")
-    guesses = [zero] if start is None or settings.kind == "newton" else [start, zero]
+    from_zero = start is None or (settings.kind == "newton" and iterations is None)
+    guesses = [zero] if start is None or from_zero else [start, zero]
     if way is not None and len(guesses) == 2:
         system.at_load(1.0)
         try:
@@ -282,7 +285,7 @@ def _iterate_few(
         else:
             _factorise(system, u)
             u, residual = _admissible_step(system, settings, u, system.solve(-residual.vector))
-    return Found(_accepted(system, settings, u, factorised=False), residual.relative)
+    return Found(_accepted(system, settings, u, factorised=False), residual.relative, converged=False)
 
 
 def _convex(system: System, before: tuple[FloatArray, Residual], now: tuple[FloatArray, Residual]) -> bool:
@@ -395,7 +398,7 @@ def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, hist
         load = min(1.0, reached + step)
         try:
             # The secant through the last two states predicts the next one.
-            (found, left), iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
+            there, iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
         except _Diverged as stop:
             step /= 2
             slope = np.zeros_like(zero)

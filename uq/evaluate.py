@@ -49,6 +49,8 @@ class Evaluations:
         Counts (n, k) of the operations `forward.model.WORK`.
     residuals
         Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
     fields
         Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
     """
@@ -60,6 +62,7 @@ class Evaluations:
     seconds: FloatArray
     work: NDArray[np.int64]
     residuals: FloatArray
+    converged: NDArray[np.bool_]
     fields: FloatArray
 
     @property
@@ -226,7 +229,7 @@ class BlockSolver:
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
-        residuals = np.full(n, np.nan)
+        residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         failures: list[Failure] = []
         total: FloatArray | None = None
         for i, point in enumerate(points):
@@ -243,7 +246,7 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
-                residuals[i] = solution.residual
+                residuals[i], converged[i] = solution.residual, solution.converged
                 if row is not None:
                     total = row if total is None else total + row
             seconds[i] = time.process_time() - begin
@@ -251,7 +254,7 @@ class BlockSolver:
         fields = np.zeros((0, 0)) if total is None else model.gather(total)
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, fields)
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, fields)
 
 
 def merge(blocks: Sequence[Evaluations]) -> Evaluations:
@@ -305,5 +308,6 @@ class Merger:
             np.concatenate(list(joined(lambda b: b.seconds))),
             np.concatenate([b.work for b in self._blocks]),
             np.concatenate(list(joined(lambda b: b.residuals))),
+            np.concatenate([b.converged for b in self._blocks]),
             self._fields,
         )
