@@ -392,29 +392,29 @@ def _converged(system: System, tolerance: float, u: FloatArray, residual: Residu
 
 def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> Found:
     """Raise the load from zero; halve the step where Newton fails, double it where it is quick."""
-    reached, step, left = 0.0, 0.5, 0.0
-    u, slope = zero, np.zeros_like(zero)
+    reached, step = 0.0, 0.5
+    found, slope = Found(zero, 0.0), np.zeros_like(zero)
     while reached < 1:
         load = min(1.0, reached + step)
         try:
             # The secant through the last two states predicts the next one.
-            there, iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
+            there, iterations = _newton(system, settings, found.state + (load - reached) * slope, history, load)
         except _Diverged as stop:
             step /= 2
             slope = np.zeros_like(zero)
             if step < settings.minimum_load_step:
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
-                jacobian = system.smallest_jacobian(u)
+                jacobian = system.smallest_jacobian(found.state)
                 if jacobian < SQUEEZED:
                     message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
                 raise SolveError(message, history, system.work) from None
             continue
-        slope = (found - u) / (load - reached)
-        u, reached = found, load
+        slope = (there.state - found.state) / (load - reached)
+        found, reached = there, load
         system.work.load_steps += 1
         if iterations <= QUICK:
             step *= 2
-    return Found(u, left)
+    return found
 
 
 def _newton(
