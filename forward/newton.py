@@ -70,6 +70,7 @@ SHORTEST = 1 / 8  # part of the way from the reference that is not divided any m
 NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
+ASTRAY = 100  # relative residual after the corrections that were allowed: the reference is too far away
 SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
 STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
 
@@ -285,6 +286,9 @@ def _iterate_few(
         else:
             _factorise(system, u)
             u, residual = _admissible_step(system, settings, u, system.solve(-residual.vector))
+    if mixing is not None and residual.relative > ASTRAY:
+        message = "the reference is too far away"
+        raise _Diverged(message)
     return Found(_accepted(system, settings, u, factorised=False), residual.relative, converged=False)
 
 
