@@ -164,7 +164,9 @@ class MultilevelChaos(Amount):
                 break
         controlled = _controlled(data, expected)
         # Samples and coefficients go different ways to the moments; short of equilibrium, levels do too.
-        others = [controlled] if found.converged[found.ok].all() else [controlled, expected]
+        others: list[_Known | Moments] = [controlled]
+        if not found.converged[found.ok].all():
+            others.append(expected)
         further = {
             "mean": np.linalg.norm([known.mean - other.mean for other in others], axis=0),
             "std": np.linalg.norm([known.std - other.std for other in others], axis=0),
@@ -205,9 +207,8 @@ class _Known:
     def change_from(self, other: _Known) -> float:
         """Return the largest relative change of a moment."""
         norm = np.linalg.norm
-        mean, std = (
-            np.append(np.abs(a), norm(b)) for a, b in ((self.mean, self.field_mean), (self.std, self.field_std))
-        )
+        mean = np.append(np.abs(self.mean), norm(self.field_mean))
+        std = np.append(self.std, norm(self.field_std))
         by_mean = np.append(np.abs(self.mean - other.mean), norm(self.field_mean - other.field_mean))
         by_std = np.append(np.abs(self.std - other.std), norm(self.field_std - other.field_std))
         return float(max(ratio(by_mean, np.maximum(mean, std)).max(), ratio(by_std, std).max()))
