@@ -249,6 +249,16 @@ def test_expansion_has_its_terms_and_indices(tmp_path, undrawn):
     assert case.planned == 9
 
 
+def test_levels_are_told_and_drawn(tmp_path, undrawn):
+    case = study(kind="multilevel-chaos", samples=16, max_levels=3)
+    dataset = solve(case)
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    for told in ("Polynomial chaos", "<h2>Levels</h2>", "change of the moments", "Sobol"):
+        assert told in page
+    assert plots.png(plots.levels(dataset)).startswith(PNG)
+    assert case.planned == 49
+
+
 def test_local_study_has_sensitivities_only(tmp_path, undrawn):
     case = parse({**study().model_dump(mode="json", exclude_none=True), "method": {"kind": "local-sensitivity"}})
     page = write_report(write(tmp_path / "out", solve(case))).read_text()

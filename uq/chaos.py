@@ -18,16 +18,16 @@ that the blocks carry.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
 from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.inputs import Inputs
@@ -100,12 +100,9 @@ class Chaos(Amount):
             return int(1 + (self.max_order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
 
-    @staticmethod
-    def objection(inputs: Inputs) -> str | None:
+    def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters cannot be expanded in, or nothing."""
-        if any(rho for *_, rho in inputs.correlations):
-            return "polynomial chaos needs independent parameters, expected no correlations for method.kind = 'chaos'"
-        return None
+        return objection(inputs, self.kind)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Solve at the points of the design, fit and estimate.
@@ -123,9 +120,9 @@ class Chaos(Amount):
         ValueError
             If the parameters are correlated.
         """
-        objection = self.objection(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refusal = self.objection(inputs)
+        if refusal is not None:
+            raise ValueError(refusal)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         projection = self.fit == "projection"
@@ -134,14 +131,14 @@ class Chaos(Amount):
         grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
         expand_fields = self.fields and centre.state.size > 0
         if projection:
-            bases = _whole(inputs, self.max_order)
+            bases = whole(inputs, self.max_order)
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
             bases = _candidates(inputs, self.max_order, limit * _rows(inputs, gradients=gradients), dictionary)
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
-            fields = _Projections(largest, centre.state, gradients, grid, weights)
+            fields = Projections(largest, centre.state, gradients, grid, weights)
         rounds: list[Evaluations] = []
         count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
         while True:
@@ -153,8 +150,8 @@ class Chaos(Amount):
             rounds.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
             count = target
             evaluations = merge(rounds)
-            data = _Data.of(evaluations, inputs, weights)
-            fitted = _fit(bases, largest, data)
+            data = Data.of(evaluations, inputs, weights)
+            fitted = fit_best(bases, largest, data)
             reached = float(fitted.relative.max())
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             target = int(min(limit, np.ceil(GROWTH * count), paid))
@@ -162,7 +159,14 @@ class Chaos(Amount):
                 break
         error = f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
         stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
-        return _dataset(self, inputs, evaluate, centre, evaluations, largest, data, fitted, stopped)
+        return expansion_dataset(self, inputs, evaluate, centre, evaluations, largest, data, fitted, stopped)
+
+
+def objection(inputs: Inputs, kind: str) -> str | None:
+    """Say why a method of this kind cannot expand in these parameters, or nothing."""
+    if any(rho for *_, rho in inputs.correlations):
+        return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
+    return None
 
 
 # --- design and candidates -----------------------------------------------------------------------------------------
@@ -199,7 +203,7 @@ class _Candidates:
     most: int
 
 
-def _whole(inputs: Inputs, order: int) -> _Candidates:
+def whole(inputs: Inputs, order: int) -> _Candidates:
     """Return the full basis of one order as the only choice."""
     indices = hyperbolic(len(inputs.names), order, 1.0)
     whole = _Candidate(order, 1.0, np.arange(len(indices)))
@@ -228,7 +232,7 @@ def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _
 
 
 @dataclass(frozen=True)
-class _Data:
+class Data:
     """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) per standard deviation or nothing.
 
     `weights` (n,) count the samples in sums of squares.
@@ -240,7 +244,8 @@ class _Data:
     weights: FloatArray
 
     @classmethod
-    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> _Data:
+    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
+        """Take those of the evaluations that have an answer; `weights` are one where none are given."""
         ok = evaluations.ok
         slopes = None
         if evaluations.tangents is not None:
@@ -277,7 +282,7 @@ class _Data:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """A regression and what it is worth.
 
     Attributes
@@ -304,14 +309,8 @@ class _Fit:
     relative: FloatArray
     squares: FloatArray
 
-    def of_fields(self, projections: FloatArray) -> FloatArray:
-        """Coefficients (P, U) of fields, from their projections (P, U) on the functions of the fit."""
-        from scipy.linalg import cho_solve
 
-        return np.asarray(cho_solve((self.triangle, False), projections))
-
-
-def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
+def fit_best(candidates: _Candidates, largest: Basis, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 
     Raises
@@ -342,7 +341,7 @@ def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
     return _regress(left, right, data, min(good, key=lambda candidate: candidate.which.size))
 
 
-def _score(q: FloatArray, right: FloatArray, data: _Data) -> float:
+def _score(q: FloatArray, right: FloatArray, data: Data) -> float:
     """Largest relative leave-one-out error of a fit whose orthonormal columns are q (n·rows, P)."""
     blocks = q.reshape(*right.shape[:2], -1)
     residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
@@ -360,7 +359,7 @@ def _left_out(blocks: FloatArray, residual: FloatArray) -> FloatArray:
 
 
 def _select(
-    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, most: int
+    left: FloatArray, right: FloatArray, data: Data, dictionary: _Candidate, most: int
 ) -> list[tuple[float, _Candidate]]:
     """Take functions one by one, each time the one that explains most of what all outputs have left.
 
@@ -396,7 +395,7 @@ def _select(
     return found
 
 
-def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate) -> _Fit:
+def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: _Candidate) -> Fit:
     from scipy.linalg import solve_triangular
 
     n, rows, m = right.shape
@@ -409,13 +408,13 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
     moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
     coefficients = solve_triangular(r, rotated)
     without = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
-    return _Fit(
+    return Fit(
         chosen, coefficients, without, r, data.size(errors), data.relative(errors), (residual**2).sum(axis=(0, 1))
     )
 
 
 @dataclass(frozen=True)
-class _Projections:
+class Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
     A compact sum: blocks carry y_z, the deviation and its slopes.
@@ -439,6 +438,7 @@ class _Projections:
     weights: FloatArray | None
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → y_z of one group's model."""
         state = model.scatter(self.state[None, :])[0]
         directions = np.diag(self.basis.scale)
 
@@ -449,7 +449,8 @@ class _Projections:
         return rows
 
     def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
-        left = self.basis.values(parameters[None, :])
+        """Return A_zᵀ y_z and |y_z|² (P + 1, U) from the rows y_z (1 + d, U) or (1, U)."""
+        left = self.basis.at(parameters)[None, :]
         if self.gradients:
             left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
         total = np.vstack([left.T @ rows, (rows**2).sum(axis=0)])
@@ -493,22 +494,61 @@ def expand(
     """
     candidates = _candidates(inputs, max_order, len(points) * _rows(inputs, gradients=True), FIELD_DICTIONARY)
     largest = orthonormal(inputs, candidates.all)
-    wanted = _Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
-    data = _Data.of(evaluations, inputs, None)
-    fit = _fit(candidates, largest, data)
+    data = Data.of(evaluations, inputs, None)
+    fit = fit_best(candidates, largest, data)
     basis = largest.subset(fit.chosen.which)
     outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
     state = np.zeros((len(outputs), 0))
     if wanted is not None:
-        state = fit.of_fields(evaluations.fields[fit.chosen.which])
+        state = _solved(fit, evaluations.fields[fit.chosen.which])
     return Deviations(basis, outputs, state, fit.relative, evaluations.ok)
+
+
+@dataclass(frozen=True)
+class StateExpansion:
+    """A prediction of the whole state by its expansion, with the factor at a point near all samples.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    coefficients
+        (P, U), in canonical order.
+    point, state
+        Parameters (d,) of the factor, and the state (U,) there.
+    """
+
+    basis: Basis
+    coefficients: FloatArray
+    point: FloatArray
+    state: FloatArray
+
+    @classmethod
+    def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
+        """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
+        coefficients = _solved(fit, fields[fit.chosen.which])
+        coefficients[(basis.indices == 0).all(axis=1)] += centre.state
+        return cls(basis, coefficients, centre.point, centre.state)
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+        coefficients, state = model.scatter(self.coefficients), model.scatter(self.state[None, :])[0]
+        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state)
+
+
+def _solved(fit: Fit, projections: FloatArray) -> FloatArray:
+    """Coefficients (P, U) of the regression on what has these projections (P, U)."""
+    from scipy.linalg import cho_solve
+
+    return np.asarray(cho_solve((fit.triangle, False), projections))
 
 
 # --- what follows from an expansion --------------------------------------------------------------------------------
 
 
-def _moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArray]:
+def coefficient_moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArray]:
     """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
     squares = np.where((indices > 0).any(axis=1), coefficients**2, 0.0)
     variance = squares.sum(axis=-1)
@@ -524,7 +564,7 @@ def _moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArra
     }
 
 
-def _estimates(fit: _Fit, indices: IntArray, *, cautious: bool) -> dict[str, FloatArray]:
+def _estimates(fit: Fit, indices: IntArray, *, cautious: bool) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. To it comes what no coefficient can
@@ -534,8 +574,8 @@ def _estimates(fit: _Fit, indices: IntArray, *, cautious: bool) -> dict[str, Flo
     samples selected them: there, `cautious`, it is λ, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the mean. (Without,
     intervals of functions of normal and gamma parameters covered 60 % instead of 95 %.)
     """
-    central = _moments(fit.coefficients.T, indices)
-    left_out = _moments(np.swapaxes(fit.without, 1, 2), indices)
+    central = coefficient_moments(fit.coefficients.T, indices)
+    left_out = coefficient_moments(np.swapaxes(fit.without, 1, 2), indices)
     n = len(fit.without)
     share = _ratio(fit.loo**2, central["std"] ** 2)[:, None]
     mean = fit.loo / np.sqrt(n) if cautious else np.zeros_like(fit.loo)
@@ -552,20 +592,40 @@ def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 0.0))
 
 
-def _dataset(
-    method: Chaos,
+class Report(Protocol):
+    """Settings of a method that reports an expansion."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the points at which the expansion is drawn for quantiles and densities."""
+
+    @property
+    def quantiles(self) -> tuple[float, ...]:
+        """Probabilities of the quantiles."""
+
+    @property
+    def fields(self) -> bool:
+        """Whether the displacement field is reported."""
+
+
+def expansion_dataset(
+    method: Report,
     inputs: Inputs,
     evaluate: Evaluate,
     centre: Linearisation,
     evaluations: Evaluations,
     largest: Basis,
-    data: _Data,
-    fit: _Fit,
+    data: Data,
+    fit: Fit,
     stopped: str,
+    further: Mapping[str, FloatArray] | None = None,
 ) -> xr.Dataset:
+    """Return the results of a fit; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
     basis = largest.subset(fit.chosen.which)
     supports = [m.support for m in inputs.marginals.values()]
     estimates = _estimates(fit, basis.indices, cautious=None in supports or len(supports) > FULL)
+    for name, error in (further or {}).items():
+        estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
     lower, upper = (
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
@@ -597,7 +657,7 @@ def _dataset(
             "range_upper": (("parameter",), upper),
         }
     )
-    if evaluations.fields.size:
+    if evaluations.fields.size and method.fields:
         fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
         dataset = dataset.assign(fields)
     dataset.attrs["stopped"] = stopped
@@ -615,7 +675,7 @@ def _field_estimates(
     centre: Linearisation,
     count: int,
     basis: Basis,
-    fit: _Fit,
+    fit: Fit,
     estimates: dict[str, FloatArray],
 ) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
     """Coefficients, mean and standard deviation of the displacements.
@@ -623,10 +683,10 @@ def _field_estimates(
     Their errors are those of the outputs in proportion to the residuals, which come from the same rows.
     """
     projections = evaluations.fields[fit.chosen.which][:, :count]
-    coefficients = fit.of_fields(projections)
+    coefficients = _solved(fit, projections)
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
-    moments = _moments(coefficients.T, basis.indices)
+    moments = coefficient_moments(coefficients.T, basis.indices)
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
     for name in ("mean", "std"):
         share = np.sqrt(_ratio(estimates[f"{name}_error"] ** 2, fit.squares).max())

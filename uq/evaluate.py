@@ -47,6 +47,10 @@ class Evaluations:
         Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
     work
         Counts (n, k) of the operations `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
     fields
         Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
         `CompactSum`, the rows of these points themselves, one point after the other.
@@ -58,6 +62,8 @@ class Evaluations:
     failures: tuple[Failure, ...]
     seconds: FloatArray
     work: NDArray[np.int64]
+    residuals: FloatArray
+    converged: NDArray[np.bool_]
     fields: FloatArray
 
     @property
@@ -86,9 +92,19 @@ class CompactSum(FieldSum, Protocol):
         """Return what is summed (K, U), from the parameters (d,) of a realisation and its rows (k, U)."""
 
 
+class Start(Protocol):
+    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+
+    A dataclass, by whose fields the blocks that were started from it are found again.
+    """
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
+    """A linear prediction of the state, with the factor at `point`.
 
     Attributes
     ----------
@@ -124,6 +140,8 @@ class Request:
         What is summed of the states.
     start
         Where the solver starts.
+    iterations
+        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
     model
         Which of the models that the evaluation has; `Evaluate.on` sets it.
     """
@@ -131,7 +149,8 @@ class Request:
     points: FloatArray
     tangents: bool = False
     fields: FieldSum | None = None
-    start: Prediction | None = None
+    start: Start | None = None
+    iterations: int | None = None
     model: int = 0
 
     def blocks(self) -> list[Request]:
@@ -275,6 +294,7 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents = request.tangents
+        self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = isinstance(request.fields, CompactSum)
         self._predict: Callable[[FloatArray], FloatArray] | None = None
@@ -290,13 +310,14 @@ class BlockSolver:
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         failures: list[Failure] = []
         rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
         for i, point in enumerate(points):
             begin = time.process_time()
             try:
                 start = self._predict(point) if self._predict is not None else None
-                solution = model.solve(point, start, self._reference)
+                solution = model.solve(point, start, self._reference, self._iterations)
                 row = self._row(solution, point) if self._row is not None else None
                 if tangents is not None:
                     tangents[i] = solution.tangent(np.eye(d)).T
@@ -306,6 +327,7 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
+                residuals[i], converged[i] = solution.residual, solution.converged
                 if row is not None and (self._compact or not rows):
                     rows.append(row)
                 elif row is not None:
@@ -315,7 +337,7 @@ class BlockSolver:
         fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, fields)
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
@@ -384,5 +406,7 @@ class Merger:
             tuple(self._failures),
             np.concatenate(list(joined(lambda b: b.seconds))),
             np.concatenate([b.work for b in self._blocks]),
+            np.concatenate(list(joined(lambda b: b.residuals))),
+            np.concatenate([b.converged for b in self._blocks]),
             self._fields,
         )

@@ -86,6 +86,18 @@ seed = 1
 quantiles = [0.05, 0.5, 0.95]
 fields = true         # expand the displacement at every node
 """,
+    "multilevel-chaos": """\
+kind = "multilevel-chaos"
+iterations = 2        # of the solver for each sample of a level
+tolerance = 1e-3      # relative change of the moments from level to level
+order = 3             # of the expansion
+samples = 32          # of each level; by default three for each term and more
+max_levels = 10
+first = "tangent"     # where the first level starts; or "mean": the state at the mean parameters, as published
+seed = 1
+quantiles = [0.05, 0.5, 0.95]
+fields = true         # mean, standard deviation and expansion of the displacement at every node
+""",
     "local-sensitivity": """\
 kind = "local-sensitivity"
 """,
