@@ -473,6 +473,8 @@ class Deviations:
         Leave-one-out errors (m,) of the outputs over their standard deviation.
     ok
         Which samples (n,) had an answer and were fitted.
+    prediction
+        Of the state, from which the solver may start; nothing where the state was not wanted.
     """
 
     basis: Basis
@@ -480,6 +482,7 @@ class Deviations:
     state: FloatArray
     relative: FloatArray
     ok: NDArray[np.bool_]
+    prediction: StateExpansion | None
 
 
 def expand(
@@ -500,10 +503,11 @@ def expand(
     fit = fit_best(candidates, largest, data)
     basis = largest.subset(fit.chosen.which)
     outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
-    state = np.zeros((len(outputs), 0))
+    state, prediction = np.zeros((len(outputs), 0)), None
     if wanted is not None:
         state = _solved(fit, evaluations.fields[fit.chosen.which])
-    return Deviations(basis, outputs, state, fit.relative, evaluations.ok)
+        prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
 from uq.chaos import FULL, ROWS_PER_TERM, Deviations, expand
-from uq.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import (
@@ -62,7 +62,8 @@ class QuasiMonteCarlo(MonteCarlo):
     control
         Control variate: "none", the "tangent" at the mean parameters, the "quadratic" Taylor polynomial there, which
         takes two more solves, with tangents, for each parameter, or "chaos", an expansion fitted to values and
-        gradients at samples of its own: its errors cost efficiency and bias nothing. It needs independent parameters.
+        gradients at samples of its own: its errors cost efficiency and bias nothing. It needs independent parameters,
+        and with `fields` it is where the solver starts from too.
     control_samples
         Number of samples that the expansion is fitted to; if nothing is said, twice what order 3 needs (order 2 above
         eight parameters). Order and terms are chosen as `Chaos` does.
@@ -154,10 +155,11 @@ class QuasiMonteCarlo(MonteCarlo):
         elif self.control == "quadratic":
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
         expansion = None
+        start: Start | None = centre.prediction
         if self.control == "chaos":
             expansion = self._expand(inputs, evaluate, centre)
-            control = _orthonormal(expansion)
-        samples = _Samples(self, inputs, evaluate, centre, control)
+            control, start = _orthonormal(expansion), expansion.prediction or start
+        samples = _Samples(self, inputs, evaluate, centre, control, start)
         last = self.limit // self.scrambles
         first = min(last, _power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
         samples.extend(first)
@@ -297,9 +299,10 @@ class _Samples:
         evaluate: Evaluate,
         centre: Linearisation,
         control: Control | None,
+        start: Start | None,
     ) -> None:
         self._method, self._inputs, self._evaluate = method, inputs, evaluate
-        self._centre, self._control = centre, control
+        self._centre, self._control, self._start = centre, control, start
         R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
         self.each = 0
         self.points = np.empty((R, 0, d))
@@ -333,13 +336,13 @@ class _Samples:
         if method.fields and centre.state.size:
             wanted = _FieldProducts(centre.state, self._control)
             for r in range(R):
-                found = self._ask(Request(points[r], fields=wanted, start=centre.prediction))
+                found = self._ask(Request(points[r], fields=wanted, start=self._start))
                 outputs[r], ok[r] = found.outputs, found.ok
                 if found.fields.size:
                     kept = self._sums[r]
                     self._sums[r] = found.fields if kept is None else kept + found.fields
         else:
-            found = self._ask(Request(points.reshape(-1, d), start=centre.prediction))
+            found = self._ask(Request(points.reshape(-1, d), start=self._start))
             outputs, ok = found.outputs.reshape(outputs.shape), found.ok.reshape(ok.shape)
         self.each = each
         self.points = np.concatenate([self.points, points], axis=1)
