@@ -28,7 +28,7 @@ from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
 from forward.model import FloatArray, Reference, SolveError, Work
-from forward.newton import Residual, solve
+from forward.newton import Found, Residual, solve
 from forward.reference import ReferenceFactor, turn
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
@@ -556,7 +556,11 @@ class HyperelasticModel:
         return ReferenceFactor(self.body)
 
     def solve(
-        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
     ) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
 
@@ -567,6 +571,9 @@ class HyperelasticModel:
         reference
             A solution elsewhere, whose factor corrects the prediction. It is factorised when it is first given; the
             factor is kept until another is.
+        iterations
+            Stop after so many corrections with that factor (Newton steps without a reference, or with
+            ``solver = "newton"``). Derivatives are then those of the equations linearised at the state reached.
 
         Raises
         ------
@@ -587,10 +594,10 @@ class HyperelasticModel:
         body.work = Work()
         body.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters)
-        u = solve(body, self.spec.solver, np.zeros(body.size), start, way)
+        found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         corrected = body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, u, body.work, reference if corrected else None)
+        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -651,13 +658,14 @@ class FiniteElementSolution:
         self,
         model: HyperelasticModel,
         parameters: FloatArray,
-        state: FloatArray,
+        found: Found,
         work: Work,
         reference: Reference | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
-        self.state = np.array(state)
+        self.state = np.array(found.state)
+        self.residual, self.converged = found.residual, found.converged
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False

@@ -30,7 +30,8 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
 
 
 @pytest.mark.parametrize(
-    "kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos"]
+    "kind",
+    ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos", "multilevel-chaos"],
 )
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind
@@ -38,6 +39,10 @@ def test_starters_are_valid(kind):
 
 def test_chaos_needs_independent_parameters():
     names = list(blocks()["parameters"])
+    control = blocks() | {"method": {"kind": "quasi-monte-carlo", "samples": 32, "control": "chaos"}}
+    assert parse(control).planned == 1 + 7 + 32
+    with pytest.raises(StudyError, match=r"independent parameters.* for method\.control"):
+        parse(control | {"correlations": [{"between": names, "value": 0.3}]})
     document_ = blocks() | {"method": {"kind": "chaos", "samples": 9}}
     assert parse(document_).planned == 10
     assert parse(document_ | {"method": {"kind": "chaos", "fit": "projection", "max_order": 3}}).planned == 26

@@ -17,10 +17,12 @@ from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.multilevel_chaos import MultilevelChaos
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 
 Method = Annotated[
-    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos, Field(discriminator="kind")
+    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos | MultilevelChaos,
+    Field(discriminator="kind"),
 ]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
@@ -120,9 +122,14 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo
+            objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+        if isinstance(self.method, MultilevelChaos):
+            shortage = self.method.shortage(len(self.parameters))
+            if shortage is not None:
+                yield ("method", "samples"), shortage, self.method.samples
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
