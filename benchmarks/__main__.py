@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, realisation, stability, throughput, variance
+from benchmarks import bookkeeping, levels, realisation, stability, throughput, variance
 
 ALL = {
     "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,
+    "levels": levels.main,
     "stability": stability.main,
 }
 
