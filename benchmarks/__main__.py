@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, levels, realisation, stability, throughput, variance
+from benchmarks import bookkeeping, chaos, coverage, levels, realisation, stability, throughput, variance
 
 ALL = {
     "realisation": realisation.main,
@@ -13,6 +13,8 @@ ALL = {
     "variance": variance.main,
     "levels": levels.main,
     "stability": stability.main,
+    "chaos": chaos.main,
+    "coverage": coverage.main,
 }
 
 
