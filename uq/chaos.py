@@ -880,7 +880,7 @@ def load(source: str | Path | xr.Dataset) -> Expansion:
     Raises
     ------
     ValueError
-        If these are not results of `method.kind = "chaos"`.
+        If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
     """
     import xarray as xr
 
