@@ -51,9 +51,9 @@ def coverage(found, freedom):
     [
         (MonteCarlo(samples=200, fields=False), 199),
         (SensitivityMonteCarlo(samples=200, fields=False), 199),
-        (QuasiMonteCarlo(samples=64, fields=False, control="none"), 15),
-        (QuasiMonteCarlo(samples=64, fields=False, control="tangent"), 15),
-        (QuasiMonteCarlo(samples=64, fields=False, control="quadratic"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="none"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="tangent"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="quadratic"), 15),
     ],
     ids=("plain", "tangent", "Sobol", "Sobol tangent", "Sobol quadratic"),
 )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -109,8 +110,9 @@ def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
     return Basis(inputs.mean, inputs.std, alpha, beta, indices)
 
 
+@cache
 def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return α and β (degree + 1,) of the standardised parameter, with β_0 = 1.
+    """Return α and β (degree + 1,) of the standardised parameter, with β_0 = 1; not to be written to.
 
     Chaospy knows them in closed form for uniform, beta, normal, log-normal and gamma parameters. For the others its
     numbers hold to six digits only; theirs come from the Stieltjes procedure with Gauss–Legendre panels.

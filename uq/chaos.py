@@ -529,17 +529,19 @@ class Projections:
 
         return rows
 
-    def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return A_zᵀ y_z and |y_z|² (P + 1, U) from the rows y_z (1 + d, U) or (1, U)."""
-        left = self.basis.at(parameters)[None, :]
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return Σ A_zᵀ y_z and Σ |y_z|² (P + 1, U) from the rows y_z (n, 1 + d, U) or (n, 1, U)."""
+        left = self.basis.values(points)[:, None, :]
         if self.gradients:
-            left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
-        total = np.empty((left.shape[1] + 1, rows.shape[1]))
-        np.matmul(left.T, rows, out=total[:-1])
-        np.einsum("ru,ru->u", rows, rows, out=total[-1])
-        if self.points is None or self.weights is None:
-            return total
-        return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
+            left = np.concatenate([left, self.basis.derivatives(points)], axis=1)
+        weighted = rows
+        if self.points is not None and self.weights is not None:
+            which = [int(np.flatnonzero((self.points == point).all(axis=1))[0]) for point in points]
+            weighted = self.weights[which][:, None, None] * rows
+        total = np.empty((left.shape[2] + 1, rows.shape[2]))
+        np.matmul(left.reshape(-1, left.shape[2]).T, weighted.reshape(-1, rows.shape[2]), out=total[:-1])
+        np.einsum("zru,zru->u", rows, weighted, out=total[-1])
+        return total
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from forward.model import WORK, FloatArray, ForwardModel, Reference, Solution, SolveError
 
+TOGETHER = 16  # realisations whose part of a compact sum is formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks
 
 
@@ -85,11 +86,11 @@ class FieldSum(Protocol):
 class CompactSum(FieldSum, Protocol):
     """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
 
-    `on` returns the few; the terms are formed where blocks are added, so that files and messages stay small.
+    `on` returns the few; the sum is formed where blocks are added, so that files and messages stay small.
     """
 
-    def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return what is summed (K, U), from the parameters (d,) of a realisation and its rows (k, U)."""
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, k, U)."""
 
 
 class Start(Protocol):
@@ -367,31 +368,38 @@ class Merger:
         self._compact = fields if isinstance(fields, CompactSum) else None
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
+        self._waiting: list[tuple[FloatArray, FloatArray]] = []
         self._points = 0
         self.count = 0
         self._failures: list[Failure] = []
 
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
-        for term in self._terms(block):
-            self._fields = term if self._fields.size == 0 else self._fields + term
+        if block.fields.size and self._compact is None:
+            self._add(block.fields)
+        elif block.fields.size:
+            solved = block.points[block.ok]
+            self._waiting.append((solved, block.fields.reshape(len(solved), -1, block.fields.shape[1])))
+            if sum(len(points) for points, _ in self._waiting) >= TOGETHER:
+                self._form()
         self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
         self._points += len(block.points)
         self.count += 1
         self._blocks.append(replace(block, fields=np.zeros((0, 0))))
 
-    def _terms(self, block: Evaluations) -> Iterator[FloatArray]:
-        if block.fields.size == 0:
-            return
-        if self._compact is None:
-            yield block.fields
-            return
-        solved = block.points[block.ok]
-        for point, rows in zip(solved, np.split(block.fields, len(solved)), strict=True):
-            yield self._compact.term(point, rows)
+    def _form(self) -> None:
+        """Add what waits, in one product: the sum is read and written once for all of it."""
+        if self._compact is not None and self._waiting:
+            points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+            self._add(self._compact.total(points, rows))
+            self._waiting.clear()
+
+    def _add(self, part: FloatArray) -> None:
+        self._fields = part if self._fields.size == 0 else self._fields + part
 
     def result(self) -> Evaluations:
         """Return everything added so far as one."""
+        self._form()
 
         def joined(pick: Callable[[Evaluations], FloatArray | None]) -> Iterator[FloatArray]:
             for block in self._blocks:

@@ -46,7 +46,8 @@ class QuasiMonteCarlo(MonteCarlo):
     """Quasi-Monte Carlo: independent scrambles of Sobol' points, with a polynomial as control variate.
 
     Errors are one standard error from the scatter of the scrambles, without the factor of Student's distribution: a
-    95 % interval is ± 2.13 of them for 16 scrambles.
+    95 % interval is ± 2.13 of them for 16 scrambles. Those of the standard deviation cover 90 % with 4 points in each
+    scramble, whose means are skewed, and 93 to 95 % from 16 points on.
 
     Parameters
     ----------
