@@ -2,19 +2,8 @@
 
 from __future__ import annotations
 
+from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
-
-
-def seconds_per_solve(unknowns: int) -> float:
-    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so.
-
-    Fitted to 0.011, 0.067 and 0.98 s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core;
-    `python -m benchmarks realisation`). Inputs so wide that the prediction fails take several times as long.
-    """
-    return float(4e-3 + 1.2e-6 * unknowns**1.2)
-
-
-TEXTBOOK = 15  # times as long is a solve by the textbook, at 10⁴ unknowns
 
 
 def bytes_per_model(unknowns: int) -> float:
