@@ -95,8 +95,6 @@ class Term:
         Means of the controlled samples r₁ and r₂ of the two moments, each of the shape of the quantity.
     variance, covariance, second_variance
         Var r₁, Cov(r₁, r₂) and Var r₂.
-    coefficient
-        β₁.
     """
 
     n: int
@@ -105,15 +103,9 @@ class Term:
     variance: FloatArray
     covariance: FloatArray
     second_variance: FloatArray
-    coefficient: FloatArray
 
 
-def term(
-    first: FloatArray,
-    second: FloatArray,
-    controls: tuple[FloatArray, FloatArray] | None = None,
-    coefficient: Coefficient = "one",
-) -> Term:
+def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, FloatArray] | None = None) -> Term:
     """Reduce samples to the moments that estimates are made of.
 
     Parameters
@@ -121,22 +113,17 @@ def term(
     first, second
         Samples (n, …) that have the wanted moments as expectations, n ≥ 2.
     controls
-        Controls (n, …) of both, with expectation zero.
-    coefficient
-        β = 1, or the slopes of the regression over the samples.
+        Controls (n, …) of both, with expectation zero; their coefficients are 1.
     """
-    beta = np.zeros(first.shape[1:])
     if controls is not None:
-        beta = np.ones(first.shape[1:]) if coefficient == "one" else _regression(first, controls[0])[0]
-        beta2 = beta if coefficient == "one" else _regression(second, controls[1])[0]
-        first, second = first - beta * controls[0], second - beta2 * controls[1]
+        first, second = first - controls[0], second - controls[1]
     n = len(first)
     m1, m2 = first.mean(axis=0), second.mean(axis=0)
     covariance = ((first - m1) * (second - m2)).sum(axis=0) / (n - 1)
-    return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1), beta)
+    return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1))
 
 
-def combine(reference: FloatArray, terms: Sequence[Term]) -> Estimates:
+def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | FloatArray = 1.0) -> Estimates:
     """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each of samples of its own.
 
     Parameters
@@ -144,7 +131,9 @@ def combine(reference: FloatArray, terms: Sequence[Term]) -> Estimates:
     reference
         ψ̄ (…).
     terms
-        The terms; the coefficient of the result is that of the first.
+        The terms.
+    coefficient
+        β₁ of the terms, for the record.
     """
     m1, mean_variance, variance, variance_error = _sums(terms)
     std: FloatArray = np.sqrt(variance)
@@ -153,7 +142,7 @@ def combine(reference: FloatArray, terms: Sequence[Term]) -> Estimates:
         mean_error=np.sqrt(mean_variance),
         std=std,
         std_error=ratio(variance_error, 2.0 * std),
-        coefficient=terms[0].coefficient,
+        coefficient=np.broadcast_to(coefficient, std.shape),
     )
 
 
@@ -225,9 +214,9 @@ def estimate(
     var1 = np.maximum(m11 - m1**2, 0) * bessel
     cov12 = (m12 - m1 * q) * bessel
     var2 = np.maximum(m22 - q**2, 0) * bessel
-    one = Term(n, m1, q + beta2 * V, var1, cov12, var2, beta1)
+    one = Term(n, m1, q + beta2 * V, var1, cov12, var2)
     _, _, _, variance_error = _sums([one])
-    found = combine(reference, [one])
+    found = combine(reference, [one], beta1)
 
     plain1 = np.maximum(mean_of(2, 0) - mean_of(1, 0) ** 2, 0) * bessel
     w1, w2 = mean_of(1, 0), mean_of(2, 0)
@@ -237,7 +226,7 @@ def estimate(
         mean_error=found.mean_error,
         std=found.std,
         std_error=found.std_error,
-        coefficient=beta1,
+        coefficient=found.coefficient,
         variance_ratio=ratio(plain1, var1, empty=1.0),
         std_variance_ratio=ratio(plain_variance, n * variance_error**2, empty=1.0),
     )

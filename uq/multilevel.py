@@ -5,10 +5,10 @@ the same parameters, so that Var Y_l is small, and differences on fine meshes ne
 Numerica 24 (2015) 259–328). Each mesh is linearised at the mean parameters. With the deviation w_l = ψ_l − ψ̄_l, its
 tangent prediction T_l and V_l = E[T_l²], the terms of the mean and of the second moment of w_L are
 
-    ⟨w_l − w_{l−1} − β₁(T_l − T_{l−1})⟩
-    ⟨w_l² − w_{l−1}² − β₂(T_l² − V_l − T_{l−1}² + V_{l−1})⟩
+    ⟨w_l − w_{l−1} − (T_l − T_{l−1})⟩
+    ⟨w_l² − w_{l−1}² − (T_l² − V_l − T_{l−1}² + V_{l−1})⟩
 
-of which all controls have the expectation zero. `moments.combine` adds them up.
+of which the controls, in brackets, have the expectation zero. `moments.combine` adds them up.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from forward.model import FloatArray, SolveError
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
-from uq.moments import ESTIMATES, Coefficient, Estimates, Moments, Term, combine, estimate, monomials, ratio, term
+from uq.moments import ESTIMATES, Estimates, Moments, Term, combine, estimate, monomials, ratio, term
 from uq.monte_carlo import MOST_GROWTH, UNLIMITED
 from uq.sampling import random_points
 from uq.stopping import TEXTBOOK, Amount, seconds_per_solve
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 FIRST_MESHES = 3  # two differences, the fewest that show a rate
 ASSUMED_RATE = 1.0  # of convergence per mesh, where there is one difference only
-RATES = (0.5, 2.0)  # between which the rate is taken to lie: faster does not last where stresses are singular
+RATES = (0.5, 2.0)  # between which rates are taken to lie: faster does not last where stresses are singular
 SIZE = 10_000  # unknowns that a model without a state is taken to have on the coarsest mesh
 HEAVY_TAILED = 100.0  # kurtosis beyond which a variance from a few samples says little
 UNCOUPLED = 0.5  # of the variance on a mesh: a difference that varies more gains nothing from the coarser mesh
@@ -64,9 +64,8 @@ class MultilevelMonteCarlo(Amount):
     pilot
         Number of samples on each mesh before anything is known about it.
     control
-        Control variate on every mesh: "none", or the "tangent" at the mean parameters.
-    coefficient
-        "one", or "optimal": fitted to the samples of each mesh.
+        Control variate on every mesh: "none", or the "tangent" at the mean parameters, with the coefficient 1: there
+        are too few samples on fine meshes to fit another.
     seed
         Seed of the random points; every mesh has a stream of its own.
     """
@@ -75,7 +74,6 @@ class MultilevelMonteCarlo(Amount):
     levels: Annotated[int, Field(ge=2, le=10)] = 3
     pilot: Annotated[int, Field(ge=4)] = 8
     control: Literal["none", "tangent"] = "tangent"
-    coefficient: Coefficient = "one"
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -88,6 +86,12 @@ class MultilevelMonteCarlo(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves of the linearisations and pilots on all meshes: how many more, these decide."""
         return self.levels + self.pilot * (2 * self.levels - 1)
+
+    def seconds_to_begin(self, unknowns: Sequence[int]) -> float:
+        """Predict the time of these solves on meshes of so many unknowns."""
+        each = [seconds_per_solve(n) for n in unknowns]
+        coarser = [0.0, *each]
+        return sum(TEXTBOOK * here + self.pilot * (here + there) for here, there in zip(each, coarser, strict=False))
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -117,7 +121,7 @@ class MultilevelMonteCarlo(Amount):
         while True:
             found = _Found.of(meshes)
             reached = float(found.relative(found.total_error).max())
-            left = self.affordable(sum(mesh.predicted for mesh in meshes), recorder.seconds)
+            left = np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
             allocation = _allocate(self, meshes, found, left)
             if self.met(reached):
                 break
@@ -132,7 +136,8 @@ class MultilevelMonteCarlo(Amount):
 
     def _wants_finer(self, meshes: list[_Mesh], found: _Found, allocation: _Allocation, left: float) -> bool:
         """Whether a finer mesh is the next thing to do."""
-        if len(meshes) == self.levels or meshes[-1].cost_of_finer > left / 2:
+        last = meshes[-1]
+        if len(meshes) == self.levels or last.cost_of_finer * last.measured_cost / last.cost > left / 2:
             return False
         error = float(found.relative(found.bias_error).max())
         if self.tolerance is not None:
@@ -144,8 +149,10 @@ class MultilevelMonteCarlo(Amount):
         counts = " + ".join(str(len(mesh.points)) for mesh in meshes)
         mesh, sampling = (float(found.relative(e).max()) for e in (found.bias_error, found.estimates.mean_error))
         error = f"relative total error {reached:.3g} (mesh {mesh:.2g}, sampling {sampling:.2g})"
-        short = int(allocation.cut)
-        return self.why_stopped(reached, error, 1 - short, 1, f"{counts} samples on {len(meshes)} meshes")
+        amount = f"{counts} samples on {len(meshes)} meshes"
+        if self.tolerance is not None and mesh > self.tolerance and len(meshes) == self.levels:
+            amount += f" (levels = {self.levels} allows no finer one)"
+        return self.why_stopped(reached, error, 1 - int(allocation.cut), 1, amount)
 
     def _dataset(
         self, inputs: Inputs, evaluate: Evaluate, meshes: list[_Mesh], found: _Found, stopped: str
@@ -182,7 +189,6 @@ class MultilevelMonteCarlo(Amount):
                 "difference_mean_error": (both, np.sqrt(controlled / np.array([[t.n] for t in differences]))),
                 "difference_variance": (both, plain),
                 "difference_variance_ratio": (both, ratio(plain, controlled, empty=1.0)),
-                "difference_coefficient": (both, np.array([t.coefficient for t in differences])),
                 "difference_kurtosis": (both, kurtosis),
                 "consistency": (both, np.vstack([np.full_like(kurtosis[:1], np.nan), consistency])),
                 "points": (("sample", "parameter"), np.concatenate([mesh.points for mesh in meshes])),
@@ -246,8 +252,6 @@ class _Mesh:
     points, fine, coarse, ok
         Parameters (n, d), outputs (n, m) on this mesh and on the coarser one (zero where there is none), and which
         samples have both.
-    predicted
-        Predicted time (s) of all solves so far.
     """
 
     def __init__(self, method: MultilevelMonteCarlo, inputs: Inputs, evaluate: Evaluate, coarser: _Mesh | None) -> None:
@@ -256,7 +260,7 @@ class _Mesh:
         self._evaluate = evaluate.on(self.level)
         self.centre: Linearisation = linearise(inputs, self._evaluate)
         self.unknowns = self._evaluate.displacements or SIZE * 8**self.level
-        self.predicted = TEXTBOOK * self.seconds_per_solve
+        self._solves, self._seconds = 0, 0.0
         d, m = len(inputs.names), len(self.centre.outputs)
         self.points = np.empty((0, d))
         self.fine, self.coarse = np.empty((0, m)), np.empty((0, m))
@@ -278,7 +282,6 @@ class _Mesh:
             coarse, ok = there.outputs, ok & there.ok
             self._reasons |= {failure.reason for failure in there.failures}
         self._reasons |= {failure.reason for failure in here.failures}
-        self.predicted += (count - before) * self.cost
         self.points = np.concatenate([self.points, points])
         self.fine, self.coarse = np.concatenate([self.fine, fine]), np.concatenate([self.coarse, coarse])
         self.ok = np.concatenate([self.ok, ok])
@@ -288,7 +291,10 @@ class _Mesh:
             raise SolveError(message)
 
     def _solve(self, points: FloatArray) -> Evaluations:
-        return self._evaluate(Request(points, start=self.centre.prediction))
+        found = self._evaluate(Request(points, start=self.centre.prediction))
+        self._solves += len(points)
+        self._seconds += float(found.seconds.sum())
+        return found
 
     @property
     def seconds_per_solve(self) -> float:
@@ -299,6 +305,12 @@ class _Mesh:
     def cost(self) -> float:
         """Predicted time (s) of one sample, on both meshes."""
         return self.seconds_per_solve + (0 if self._coarser is None else self._coarser.seconds_per_solve)
+
+    @property
+    def measured_cost(self) -> float:
+        """Time (s) that one sample took on both meshes: what a budget pays for."""
+        here = self._seconds / self._solves
+        return here if self._coarser is None else here + self._coarser._seconds / self._coarser._solves
 
     @property
     def cost_of_finer(self) -> float:
@@ -330,7 +342,7 @@ class _Mesh:
     def term(self) -> Term:
         """This mesh's term of the telescoping sums."""
         first, second, c, d = self._moments()
-        return term(first, second, None if self._method.control == "none" else (c, d), self._method.coefficient)
+        return term(first, second, None if self._method.control == "none" else (c, d))
 
     @property
     def plain_variance(self) -> FloatArray:
@@ -340,8 +352,9 @@ class _Mesh:
     @property
     def kurtosis(self) -> FloatArray:
         """Fourth central moment over the squared variance (m,) of the controlled difference."""
-        first, _, control, _ = self._moments()
-        r = first - self.term.coefficient * control
+        r, _, control, _ = self._moments()
+        if self._method.control != "none":
+            r = r - control
         r = r - r.mean(axis=0)
         return ratio((r**4).mean(axis=0), (r**2).mean(axis=0) ** 2, empty=3.0)
 
@@ -352,7 +365,7 @@ class _Mesh:
         n, reference = len(w), self.centre.outputs
         if self._method.control == "none":
             return estimate(monomials(w, None).sum(axis=1), n, reference)
-        return estimate(monomials(w, T).sum(axis=1), n, reference, V, self._method.coefficient)
+        return estimate(monomials(w, T).sum(axis=1), n, reference, V)
 
 
 @dataclass(frozen=True)
@@ -384,7 +397,10 @@ class _Found:
         differences = np.array([mesh.reference + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
-        return cls(by_mesh, differences, bias(differences), bias(std_differences), consistency)
+        # The differences at the mean parameters converge at the same rate, and have no noise.
+        nominal = np.array([mesh.reference for mesh in meshes])[1:]
+        alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
+        return cls(by_mesh, differences, bias(differences, alpha), bias(std_differences, alpha), consistency)
 
     @property
     def estimates(self) -> Estimates:
@@ -423,13 +439,12 @@ def rate(values: FloatArray) -> FloatArray:
     return np.asarray(-(steps @ logs) / (steps @ steps))
 
 
-def bias(differences: FloatArray) -> FloatArray:
+def bias(differences: FloatArray, alpha: FloatArray) -> FloatArray:
     """Estimate the error (m,) on the finest mesh from the differences (L, m) between meshes: |E[Y_L]| / (2^α − 1).
 
-    With the rate α as observed, and |E[Y_L]| not below what the two differences before it let expect, which guards
+    |E[Y_L]| counts as not below what the two differences before it let expect with the rate α (m,), which guards
     against one that is small by chance (M. B. Giles, Acta Numerica 24 (2015), section 3.2).
     """
-    alpha = np.clip(rate(differences), *RATES)
     last = np.abs(differences[-3:])
     expected = last * 2.0 ** (-alpha * np.arange(len(last))[::-1, None])
     return np.asarray(expected.max(axis=0) / (2.0**alpha - 1))
@@ -484,12 +499,13 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Fou
     if method.tolerance is not None:
         wanted = min(wanted, 1 / _target(method, meshes, found, variances, costs))
     # What the budget pays for: cost grows with the multiple, so bisection finds the largest.
+    paid = np.array([mesh.measured_cost for mesh in meshes])
     low, high = 0.0, wanted
-    cut = (numbers(wanted) - counts) @ costs > left
+    cut = (numbers(wanted) - counts) @ paid > left
     if cut:
         for _ in range(60):
             middle = (low + high) / 2
-            low, high = (middle, high) if (numbers(middle) - counts) @ costs <= left else (low, middle)
+            low, high = (middle, high) if (numbers(middle) - counts) @ paid <= left else (low, middle)
     final = numbers(low if cut else high)
     now = np.minimum(final, np.ceil(MOST_GROWTH * counts))
     sampling = float(np.sqrt((variances / final).sum()))

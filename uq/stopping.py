@@ -55,7 +55,7 @@ class Amount(Settings):
         """Whether a tolerance was asked for and an error `reached` meets it."""
         return self.tolerance is not None and reached <= self.tolerance
 
-    def affordable(self, solves: float, seconds: float) -> float:
+    def affordable(self, solves: int, seconds: float) -> float:
         """Return the number of solves that the budget still pays for, if they take as long as those `solves` did."""
         if self.budget_seconds is None or seconds == 0:
             return np.inf
