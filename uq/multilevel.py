@@ -58,7 +58,7 @@ class MultilevelMonteCarlo(Amount):
         Stop when the total error of every mean, √(mesh² + sampling²), is below this fraction of the mean (of the
         standard deviation, where the mean is smaller than that).
     budget_seconds
-        As of `Amount`; a mesh is not added if that would take more than half of what is left.
+        As of `Amount`; a third mesh, or a finer one, is not added if that would take more than half of what is left.
     levels
         Largest number of meshes.
     pilot
@@ -87,11 +87,12 @@ class MultilevelMonteCarlo(Amount):
         """Number of solves of the linearisations and pilots on all meshes: how many more, these decide."""
         return self.levels + self.pilot * (2 * self.levels - 1)
 
-    def seconds_to_begin(self, unknowns: Sequence[int]) -> float:
-        """Predict the time of these solves on meshes of so many unknowns."""
+    def seconds_to_begin(self, unknowns: Sequence[int], slower: float = 1.0) -> float:
+        """Predict the time of these solves on meshes of so many unknowns, each so much slower than a predicted one."""
         each = [seconds_per_solve(n) for n in unknowns]
         coarser = [0.0, *each]
-        return sum(TEXTBOOK * here + self.pilot * (here + there) for here, there in zip(each, coarser, strict=False))
+        pairs = zip(each, coarser, strict=False)
+        return sum(TEXTBOOK * here + slower * self.pilot * (here + there) for here, there in pairs)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -117,11 +118,13 @@ class MultilevelMonteCarlo(Amount):
         recorder = Recorder(evaluate)
         meshes = [_Mesh(self, inputs, recorder, None)]
         while len(meshes) < min(self.levels, FIRST_MESHES):
+            if len(meshes) > 1 and not meshes[-1].affords_finer(self._left(recorder)):
+                break
             meshes.append(_Mesh(self, inputs, recorder, meshes[-1]))
         while True:
             found = _Found.of(meshes)
             reached = float(found.relative(found.total_error).max())
-            left = np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
+            left = self._left(recorder)
             allocation = _allocate(self, meshes, found, left)
             if self.met(reached):
                 break
@@ -134,10 +137,13 @@ class MultilevelMonteCarlo(Amount):
                     mesh.extend(int(n))
         return self._dataset(inputs, recorder, meshes, found, self._why(meshes, found, reached, allocation))
 
+    def _left(self, recorder: Recorder) -> float:
+        """What is left of the budget (s)."""
+        return np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
+
     def _wants_finer(self, meshes: list[_Mesh], found: _Found, allocation: _Allocation, left: float) -> bool:
         """Whether a finer mesh is the next thing to do."""
-        last = meshes[-1]
-        if len(meshes) == self.levels or last.cost_of_finer * last.measured_cost / last.cost > left / 2:
+        if len(meshes) == self.levels or not meshes[-1].affords_finer(left):
             return False
         error = float(found.relative(found.bias_error).max())
         if self.tolerance is not None:
@@ -317,6 +323,10 @@ class _Mesh:
         """Predicted time (s) of linearisation and pilot on the next finer mesh."""
         finer = seconds_per_solve(8 * self.unknowns)
         return TEXTBOOK * finer + self._method.pilot * (finer + self.seconds_per_solve)
+
+    def affords_finer(self, left: float) -> bool:
+        """Whether the next finer mesh takes no more than half of what is left (s), judging by the solves so far."""
+        return self.cost_of_finer * self.measured_cost / self.cost <= left / 2
 
     @property
     def reference(self) -> FloatArray:

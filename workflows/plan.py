@@ -24,7 +24,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     seconds = study.planned * each[0]
     if isinstance(method, MultilevelMonteCarlo):
         up_to, later = "", " for linearisations and pilots, which decide how many more"
-        seconds = method.seconds_to_begin(sizes) * textbook
+        seconds = method.seconds_to_begin(sizes, textbook)
     seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
     return [
         f"method      {method.kind}",
