@@ -62,7 +62,7 @@ class MultilevelMonteCarlo(Amount):
     levels
         Largest number of meshes.
     pilot
-        Number of samples on each mesh before anything is known about it.
+        Number of samples on each mesh before anything is known about it; no more groups of ranks have work with them.
     control
         Control variate on every mesh: "none", or the "tangent" at the mean parameters, with the coefficient 1: there
         are too few samples on fine meshes to fit another.
