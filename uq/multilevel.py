@@ -42,7 +42,7 @@ UNCOUPLED = 0.5  # of the variance on a mesh: a difference that varies more gain
 
 
 class MultilevelMonteCarlo(Amount):
-    """Multilevel Monte Carlo over meshes: mean and standard deviation without the error of the mesh.
+    """Multilevel Monte Carlo over meshes: mean and standard deviation to a total error, of mesh and sampling.
 
     The body of the study is the coarsest mesh; the cells of mesh l are divided by 2^l along each edge. Meshes are added
     as the estimated error of the finest asks for, each with a pilot, from which the number of samples on every mesh is
