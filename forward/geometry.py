@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
@@ -92,6 +92,17 @@ class _SixSided(Settings):
         corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
         edges = [np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() / n for a, n in enumerate(self.cells)]
         return float(max(edges))
+
+    def refined(self, level: int) -> Self:
+        """Return the same body with every cell divided by 2^level along each edge: its mesh is nested.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(n * 2**level for n in self.cells)
+        return self.model_validate(self.model_dump() | {"cells": cells})
 
     def corners_of(self, boundary: str) -> list[Vector]:
         """The four corners (m) of a boundary."""

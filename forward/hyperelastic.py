@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -169,6 +169,10 @@ class Hyperelastic(Settings):
     @property
     def _energy(self) -> str:
         return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
+
+    def refined(self, level: int) -> Self:
+        """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
+        return self.model_copy(update={"body": self.body.refined(level)})
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> HyperelasticModel:
         """Mesh the body and compile the forms on a communicator; collective.

@@ -31,7 +31,15 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
 
 @pytest.mark.parametrize(
     "kind",
-    ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos", "multilevel-chaos"],
+    [
+        "monte-carlo",
+        "sensitivity-monte-carlo",
+        "quasi-monte-carlo",
+        "multilevel-monte-carlo",
+        "local-sensitivity",
+        "chaos",
+        "multilevel-chaos",
+    ],
 )
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind

@@ -241,11 +241,15 @@ class Recorder:
     ----------
     log
         Every evaluation, in order, of all models; shared by the evaluations of the other models.
+    models
+        The number of the model of each.
     """
 
-    def __init__(self, evaluate: Evaluate, log: list[Evaluations] | None = None) -> None:
+    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: int = 0) -> None:
         self._evaluate = evaluate
-        self.log: list[Evaluations] = [] if log is None else log
+        self._model = model
+        self.log: list[Evaluations] = [] if whole is None else whole.log
+        self.models: list[int] = [] if whole is None else whole.models
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -272,11 +276,12 @@ class Recorder:
         evaluations = self._evaluate(request)
         # Derivatives and fields are the method's own business.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
+        self.models.append(self._model)
         return evaluations
 
     def on(self, model: int) -> Recorder:
         """Return the evaluation of another of the models, with the same log."""
-        return Recorder(self._evaluate.on(model), self.log)
+        return Recorder(self._evaluate.on(model), self, model)
 
     @property
     def solves(self) -> int:

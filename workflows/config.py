@@ -17,11 +17,18 @@ from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.multilevel import MultilevelMonteCarlo
 from uq.multilevel_chaos import MultilevelChaos
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 
 Method = Annotated[
-    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos | MultilevelChaos,
+    MonteCarlo
+    | SensitivityMonteCarlo
+    | QuasiMonteCarlo
+    | MultilevelMonteCarlo
+    | LocalSensitivity
+    | Chaos
+    | MultilevelChaos,
     Field(discriminator="kind"),
 ]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
@@ -83,8 +90,14 @@ class Study(Settings):
         return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
+    def models(self) -> tuple[Hyperelastic, ...]:
+        """The model, and the same on the finer meshes that the method may use."""
+        meshes = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
+        return self.model, *(self.model.refined(level) for level in range(1, meshes))
+
+    @property
     def planned(self) -> int:
-        """Number of solves, the largest where a tolerance may end the study earlier."""
+        """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
         return self.method.planned(len(self.parameters))
 
     @model_validator(mode="after")
@@ -103,6 +116,11 @@ class Study(Settings):
         return self
 
     def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        try:
+            _ = self.models
+        except ValidationError as error:
+            message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
+            yield ("method", "levels"), message, getattr(self.method, "levels", None)
         scalars = self.model.scalars
         for path, distribution in self.parameters.items():
             if path not in scalars:

@@ -15,7 +15,7 @@ import numpy as np
 from workflows import bodies, plots, tables
 from workflows.config import parse
 from workflows.results import read_dataset, read_summary, write_text
-from workflows.tables import Results
+from workflows.tables import Results, Table
 from workflows.words import model_in_words, number
 
 if TYPE_CHECKING:
@@ -103,9 +103,12 @@ def _context(results: Results) -> dict[str, Any]:
         "model": list(model_in_words(results.study)),
         "parameters": tables.parameters(results),
         "nominal": tables.nominal(results),
-        "moments": tables.moments(results) if sampled else None,
+        "moments": tables.moments(results) if "mean" in dataset else None,
         "gains": list(tables.gains(dataset)),
-        "quantiles": tables.quantiles(results) if sampled else None,
+        "quantiles": tables.quantiles(results) if "quantiles" in dataset else None,
+        "total_errors": tables.total_errors(results) if "total_error" in dataset else None,
+        "meshes": tables.meshes(results) if "mesh_samples" in dataset else None,
+        "differences": [_differences(results, o) for o in results.outputs] if "mesh_samples" in dataset else [],
         "expansion": tables.expansion(results) if "multi_index" in dataset else None,
         "levels": tables.levels(results) if "level" in dataset.dims else None,
         "controlled": tables.controlled(results) if "level" in dataset.dims else None,
@@ -139,6 +142,17 @@ def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
         _picture(plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
         _picture(plots.standard_error(dataset, output), f"Standard error of the mean of {output}."),
     ]
+
+
+def _differences(results: Results, output: str) -> tuple[str, str, Table, list[Picture]]:
+    dataset = results.dataset
+    pictures = [
+        _picture(plots.mesh_variance(dataset, output), f"Variance of {output} and of its difference between meshes."),
+        _picture(plots.mesh_mean(dataset, output), f"Mean of {output} and of its difference between meshes."),
+        _picture(plots.mesh_samples(dataset, output), "Samples on every mesh: taken, and best for other errors."),
+        _picture(plots.mesh_cost(dataset, output), "Predicted time of sampling, without linearisations."),
+    ]
+    return output, tables.rates(results, output), tables.differences(results, output), pictures
 
 
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:

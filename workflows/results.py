@@ -73,7 +73,9 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
     if "mean" in dataset:
-        names = [name for name in (*ESTIMATES, "variance_ratio", "std_variance_ratio", "loo_error") if name in dataset]
+        mesh = ("bias_error", "total_error", "std_bias_error", "std_total_error")
+        others = ("variance_ratio", "std_variance_ratio", "loo_error", *mesh)
+        names = [name for name in (*ESTIMATES, *others) if name in dataset]
         summary["outputs"] = {
             output: {name: float(dataset[name].sel(output=output)) for name in names} for output in outputs
         }

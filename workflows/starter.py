@@ -76,6 +76,15 @@ coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
 """,
+    "multilevel-monte-carlo": """\
+kind = "multilevel-monte-carlo"
+tolerance = 0.01      # total error (mesh and sampling) of means, relative; or budget_seconds = 600, or samples = 100 on
+                      # the coarsest mesh: whichever comes first
+levels = 3            # the body above is the coarsest of so many meshes: each has cells half as long as the one before
+pilot = 8             # samples on every mesh before the numbers are chosen
+control = "tangent"   # or "none"
+seed = 1
+""",
     "chaos": """\
 kind = "chaos"
 samples = 15          # or tolerance = 1e-3 (leave-one-out error / std), or budget_seconds = 600: whichever comes first

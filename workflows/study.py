@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,7 +91,8 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
         recorders.append(Recorder(evaluate))
         return study.method.run(inputs, recorders[0])
 
-    dataset = ensemble.run(model, task, checkpoint=checkpoint, progress=progress)
+    others = [partial(finer.build, ensemble.group, inputs.names) for finer in study.models[1:]]
+    dataset = ensemble.run(model, task, others=others, checkpoint=checkpoint, progress=progress)
     if dataset is None:
         return DONE
     progress.close()
@@ -100,6 +102,8 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     write_fields(directory / "fields", dataset)
     evaluations = merge(recorders[0].log)
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
+    if others:
+        summary["meshes"] = _meshes(study, recorders[0])
     checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
@@ -205,6 +209,17 @@ def _summary(
     }
 
 
+def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
+    """What was solved on each mesh, and what it took."""
+    found = []
+    for number in sorted(set(recorder.models)):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
+        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
+        solves = sum(len(part.points) for part in parts)
+        found.append({"unknowns": study.models[number].unknowns, "solves": solves, "cpu_seconds": seconds})
+    return found
+
+
 def _versions() -> dict[str, str]:
     names = ("tissuq", "fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
     found = {}
@@ -238,6 +253,10 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
             f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
             f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
         )
+        if "bias_error" in values:
+            lines[-1] += (
+                f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
+            )
     if not lines:
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)

@@ -131,6 +131,78 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         yield Gain(text, bool(worse))
 
 
+def total_errors(results: Results) -> Table:
+    """Errors of means and standard deviations by where they come from."""
+    rows = []
+    for output in results.outputs:
+        of_output = results.dataset.sel(output=output)
+        for word, first in (("mean", ""), ("standard deviation", "std_")):
+            names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
+            errors = [with_unit(number(float(of_output[name]), 2), results.unit(output)) for name in names]
+            rows.append((f"{word} of {output}", *errors))
+    return Table(("estimate", "sampling", "mesh", "total"), rows)
+
+
+def meshes(results: Results) -> Table:
+    """The meshes, and what was solved on them."""
+    dataset, rows = results.dataset, []
+    for level, found in zip(dataset["level"].to_numpy(), results.summary["meshes"], strict=True):
+        here = dataset.sel(level=level)
+        seconds = found["cpu_seconds"] / max(found["solves"], 1)
+        samples, failed = f"{int(here['mesh_samples']):,}", f"{int(here['mesh_failed']):,}"
+        cost = f"{float(here['mesh_cost']):.2g} s"
+        rows.append(
+            (f"{level}", f"{found['unknowns']:,}", samples, failed, f"{found['solves']:,}", cost, duration(seconds))
+        )
+    head = (
+        "level",
+        "unknowns",
+        "samples",
+        "failed",
+        "solves",
+        "a solve, predicted",
+        "a solve, measured (with the linearisation)",
+    )
+    return Table(head, rows)
+
+
+def differences(results: Results, output: str) -> Table:
+    """What every mesh adds to the mean of an output, and whether that can be trusted."""
+    rows = []
+    for level in results.dataset["level"].to_numpy():
+        here = results.dataset.sel(output=output, level=level)
+        text = with_error(float(here["difference_mean"]), float(here["difference_mean_error"]))
+        rest = (
+            "mesh_variance",
+            "difference_variance",
+            "difference_variance_ratio",
+            "difference_kurtosis",
+            "consistency",
+        )
+        rows.append((f"{level}", with_unit(text, results.unit(output)), *(number(float(here[n]), 3) for n in rest)))
+    head = (
+        "level",
+        "mean of the difference",
+        "variance",
+        "variance of the difference",
+        "÷ by the control",
+        "kurtosis",
+        "consistency",
+    )
+    return Table(head, rows)
+
+
+def rates(results: Results, output: str) -> str:
+    """The rates of convergence of an output, in words."""
+    of_output = results.dataset.sel(output=output)
+    weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
+    return (
+        f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "
+        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 says that the sum over the meshes "
+        "telescopes."
+    )
+
+
 def quantiles(results: Results) -> Table:
     """Quantiles of the outputs."""
     rows = []

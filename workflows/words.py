@@ -90,9 +90,10 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     model = study.model
     body = model.body
     cells = " × ".join(f"{n}" for n in body.cells)
-    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree})"]
+    coarsest = " on the coarsest mesh" if len(study.models) > 1 else ""
+    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
-    yield "unknowns", [f"{model.unknowns:,} displacements{pressures}"]
+    yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
     kind = str(model.material.model_dump()["kind"])
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
