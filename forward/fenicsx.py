@@ -149,15 +149,15 @@ def interpolate(values: Any, space: Any) -> FloatArray:
     return np.array(other.x.array[: owned_nodes(space)])
 
 
-def linear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
-    """Mesh a body in this process; return its linear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS as their matrices."""
+def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
+    """Mesh a body by hexahedra in this process; return trilinear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them."""
     from scipy.sparse import csr_matrix
 
-    msh, _ = mesh_body(MPI.COMM_SELF, body)
+    msh, _ = mesh_body(MPI.COMM_SELF, body.model_copy(update={"cell": "hexahedron"}))
     space = scalar_space(msh, 1)
     v, w = ufl.TestFunction(space), ufl.TrialFunction(space)
     parts = [constant(msh, 0.0) for _ in range(3)]
-    exact = {"quadrature_degree": 2 if body.cell == "tetrahedron" else 4}
+    exact = {"quadrature_degree": 3}
     dx, ds = ufl.dx(domain=msh, metadata=exact), ufl.ds(domain=msh, metadata=exact)
     form = compile_form(
         parts[0] * v * w * dx + parts[1] * ufl.inner(ufl.grad(v), ufl.grad(w)) * dx + parts[2] * v * w * ds,

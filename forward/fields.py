@@ -179,13 +179,14 @@ class Nodal:
 class Matern:
     """A Gaussian field on the vertices of a mesh, of variance one at every vertex.
 
-    With A = κ²M + K + βB and the lumped mass matrix L, the covariance of the solution of the SPDE is A⁻¹LA⁻¹ for α = 2
-    and A⁻¹LA⁻¹LA⁻¹LA⁻¹ for α = 4, up to a factor; B acts on the boundary, where ∂m/∂n + βm = 0.
+    With A = κ²M + K + βB, the covariance of the solution of the SPDE is A⁻¹MA⁻¹ for α = 2 and A⁻¹MA⁻¹MA⁻¹MA⁻¹ for α = 4;
+    B acts on the boundary, where ∂m/∂n + βm = 0. (A lumped M would leave the checkerboards of trilinear elements, which
+    K hardly sees, with far too much variance.)
 
     Parameters
     ----------
     mass, laplacian, surface
-        M, K and B (N, N), of linear elements.
+        M, K and B (N, N), of trilinear elements.
     length
         Correlation length √(8ν)/κ (m).
     smoothness
@@ -196,7 +197,7 @@ class Matern:
     Attributes
     ----------
     mass
-        Diagonal (N,) of L: the volume (m³) of each vertex.
+        Volume (m³) of each vertex (N,): the sums of the rows of M.
     """
 
     def __init__(
@@ -208,14 +209,11 @@ class Matern:
         smoothness: Smoothness = 2,
         robin: float = ROBIN,
     ) -> None:
-        from scipy.sparse.linalg import splu
-
         self._smoothness = smoothness
         self._kappa = inverse_length(length, smoothness)
-        operator = self._kappa**2 * mass + laplacian + robin * self._kappa * surface
+        self._matrix = mass
         self.mass = np.asarray(mass.sum(axis=1)).ravel()
-        symmetric = {"SymmetricMode": True}
-        self._factor = splu(operator.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        self._factor = _factorise(self._kappa**2 * mass + laplacian + robin * self._kappa * surface)
 
     @classmethod
     def on(cls, body: Body, length: float, smoothness: Smoothness = 2, robin: float = ROBIN) -> Matern:
@@ -224,28 +222,31 @@ class Matern:
 
         return cls(*vertex_matrices(body), length, smoothness, robin)
 
-    def _raw(self, noise: FloatArray) -> FloatArray:
-        m = self._factor.solve((np.sqrt(self.mass) * noise.T).T)
-        if self._smoothness == 4:
-            m = self._factor.solve((self.mass * m.T).T)
-        return np.asarray(m)
+    @cached_property
+    def _noise(self) -> csr_matrix:
+        """G (N, N) with GGᵀ = M: it makes white noise of independent numbers."""
+        from scipy.sparse import diags
 
-    def _raw_transposed(self, g: FloatArray) -> FloatArray:
-        x = self._factor.solve(g)
-        if self._smoothness == 4:
-            x = self._factor.solve((self.mass * x.T).T)
-        return np.asarray((np.sqrt(self.mass) * x.T).T)
+        # M = PᵀLUP with U = DLᵀ, since pivots stay on the diagonal.
+        factor = _factorise(self._matrix)
+        return (factor.L @ diags(np.sqrt(factor.U.diagonal()))).tocsr()[factor.perm_r]
+
+    def _smooth(self, x: FloatArray) -> FloatArray:
+        """Apply the symmetric operator A⁻¹, or A⁻¹MA⁻¹ for α = 4."""
+        x = self._factor.solve(x)
+        return np.asarray(self._factor.solve(self._matrix @ x) if self._smoothness == 4 else x)
 
     @cached_property
     def _raw_std(self) -> FloatArray:
-        """Point standard deviation (N,) of the solution of the SPDE: the rows of its root, by a solve each."""
+        """Point standard deviation (N,) of the solution of the SPDE, by a solve for each vertex."""
         n = len(self.mass)
         variance = np.empty(n)
         for first in range(0, n, BATCH):
             last = min(first + BATCH, n)
             units = np.zeros((n, last - first))
             units[np.arange(first, last), np.arange(last - first)] = 1
-            variance[first:last] = (self._raw_transposed(units) ** 2).sum(axis=0)
+            x = self._smooth(units)
+            variance[first:last] = (x * (self._matrix @ x)).sum(axis=0)
         return np.asarray(np.sqrt(variance))
 
     @property
@@ -255,15 +256,15 @@ class Matern:
 
     def root(self, noise: FloatArray) -> FloatArray:
         """Return the field (N,) of a standard normal noise (N,), or (N, k) for k of them."""
-        return np.asarray((self._raw(noise).T / self._raw_std).T)
+        return np.asarray((self._smooth(self._noise @ noise).T / self._raw_std).T)
 
     def root_transposed(self, g: FloatArray) -> FloatArray:
         """Apply the transpose of `root` to (N,) or (N, k)."""
-        return self._raw_transposed((g.T / self._raw_std).T)
+        return np.asarray(self._noise.T @ self._smooth((g.T / self._raw_std).T))
 
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply the covariance (N, N) with (N,) or (N, k)."""
-        return self.root(self.root_transposed(g))
+        return np.asarray((self._smooth(self._matrix @ self._smooth((g.T / self._raw_std).T)).T / self._raw_std).T)
 
     def modes(self, count: int) -> FloatArray:
         """Return the leading Karhunen–Loève modes (N, count), each times the square root of its eigenvalue.
@@ -309,6 +310,13 @@ def _settled(values: FloatArray, functions: FloatArray, mass: FloatArray) -> Flo
     large = np.abs(settled) >= 0.5 * np.abs(settled).max(axis=0)
     signs = np.sign(settled[large.argmax(axis=0), np.arange(len(values))])
     return settled * signs
+
+
+def _factorise(matrix: csr_matrix) -> Any:
+    """Factorise a symmetric positive definite matrix, with its pivots on the diagonal."""
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _nu(smoothness: Smoothness) -> float:

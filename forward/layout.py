@@ -92,11 +92,13 @@ def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64
 
 
 def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
-    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of linear elements on a body, vertices in canonical order.
+    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, vertices in canonical order.
 
+    They are of trilinear hexahedra, whatever the cells of the body: of tetrahedra with these vertices, correlations
+    would depend on how the hexahedra are cut.
     Each process that calls makes a mesh of its own: the numbers do not depend on how others share theirs.
     """
-    space, matrices = fenicsx.linear_elements(body)
+    space, matrices = fenicsx.trilinear_elements(body)
     _, canonical, _ = sorted_by_place(space, space.mesh.comm)
     order = np.argsort(canonical)
     mass, laplacian, surface = (matrix[order][:, order] for matrix in matrices)
