@@ -13,7 +13,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.chaos import Chaos
-from uq.distributions import Distribution
+from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
@@ -60,7 +60,8 @@ class Study(Settings):
     model
         The body.
     parameters
-        Distributions by the paths of the numbers of the model that they override.
+        Distributions by the paths of the numbers of the model that they override; may be left out where the model has
+        random fields, whose coefficients are parameters by themselves.
     correlations
         Correlations between them.
     method
@@ -70,20 +71,22 @@ class Study(Settings):
     """
 
     model: Hyperelastic
-    parameters: dict[str, Distribution] = Field(min_length=1)
+    parameters: dict[str, Distribution] = {}
     correlations: tuple[Correlation, ...] = ()
     method: Method
     parallel: Parallel = Parallel()
 
     @property
     def inputs(self) -> Inputs:
-        """The random parameters."""
-        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
+        standard = Normal(mean=0.0, std=1.0)
+        marginals = self.parameters | dict.fromkeys(self.model.coefficients, standard)
+        return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
     def planned(self) -> int:
         """Number of solves, the largest where a tolerance may end the study earlier."""
-        return self.method.planned(len(self.parameters))
+        return self.method.planned(len(self.parameters) + len(self.model.coefficients))
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -102,6 +105,12 @@ class Study(Settings):
 
     def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         scalars = self.model.scalars
+        if not self.parameters and not self.model.fields:
+            yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
+        for i, field in enumerate(self.model.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
         for path, distribution in self.parameters.items():
             if path not in scalars:
                 yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
