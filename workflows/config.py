@@ -249,7 +249,7 @@ def _path(key: str, blocks: Mapping[str, Any]) -> list[str]:
 
 def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     for i, item in enumerate(items):
-        if isinstance(item, dict) and name in (item.get("name"), item.get("kind"), item.get("on"), str(i)):
+        if isinstance(item, dict) and name in (*map(item.get, ("name", "kind", "on", "of")), str(i)):
             items[i] = item.copy()
             return items[i]  # type: ignore[no-any-return]
     message = f"--set {key}: no element is called '{name}'"
