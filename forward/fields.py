@@ -35,10 +35,10 @@ EQUAL = 1e-6  # relative distance of eigenvalues below which rounding decides on
 class RandomField(Settings):
     """A log-normal random factor over the body, on its stiffness or on its density.
 
-    The factor is exp(ln mean − v/2 + m) with a Gaussian Matérn field m of variance v at the vertices, and the exponential
-    of what is linear between them: at the vertices its expected value is `mean` (also with few modes, where v is that
-    of the modes). Its coefficients are d independent standard normal parameters, ``fields.NAME.0`` and so on, which
-    every study of this model has without naming them.
+    The factor is exp(ln mean − v/2 + m) with a Gaussian Matérn field m of variance v at the vertices, and the
+    exponential of what is linear between them: at the vertices its expected value is `mean` (also with few modes,
+    where v is that of the modes). Its coefficients are d independent standard normal parameters, ``fields.NAME.0`` and
+    so on, which every study of this model has without naming them.
 
     Parameters
     ----------
@@ -179,9 +179,9 @@ class Nodal:
 class Matern:
     """A Gaussian field on the vertices of a mesh, of variance one at every vertex.
 
-    With A = κ²M + K + βB, the covariance of the solution of the SPDE is A⁻¹MA⁻¹ for α = 2 and A⁻¹MA⁻¹MA⁻¹MA⁻¹ for α = 4;
-    B acts on the boundary, where ∂m/∂n + βm = 0. (A lumped M would leave the checkerboards of trilinear elements, which
-    K hardly sees, with far too much variance.)
+    With A = κ²M + K + βB, the covariance of the solution of the SPDE is A⁻¹MA⁻¹ for α = 2, and A⁻¹MA⁻¹MA⁻¹MA⁻¹ for
+    α = 4; B acts on the boundary, where ∂m/∂n + βm = 0. (A lumped M would leave the checkerboards of trilinear
+    elements, which K hardly sees, with far too much variance.)
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def _settled(values: FloatArray, functions: FloatArray, mass: FloatArray) -> Flo
         first = last
     large = np.abs(settled) >= 0.5 * np.abs(settled).max(axis=0)
     signs = np.sign(settled[large.argmax(axis=0), np.arange(len(values))])
-    return settled * signs
+    return np.asarray(settled * signs)
 
 
 def _factorise(matrix: csr_matrix) -> Any:

@@ -6,6 +6,7 @@ explicit partial derivative ∂ψ/∂ω. They read the state and the parameters 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Protocol, assert_never
 
 import numpy as np
@@ -169,7 +170,8 @@ class _Integral:
             slopes[body.scalars] = [form() for _ in body.unit_directions()]
         for field in body.fields:
             if field.inside(self._density):
-                slopes[field.positions] = field.pull(body.compiled(self, field.field.label, lambda f=field: self._by(f))())
+                form = body.compiled(self, f"by {field.field.label}", partial(self._by, field))
+                slopes[field.positions] = field.pull(form())
         return slopes / self.size
 
     def _by(self, field: VertexField) -> fenicsx.VectorAssembler:

@@ -51,7 +51,9 @@ class VertexField:
         self._count = len(numbers)
         self.positions = np.array([i for i, path in enumerate(parameters) if path in numbers], dtype=np.int64)
         self._numbers = np.array([numbers[parameters[i]] for i in self.positions], dtype=np.int64)
-        self._expansion: Expansion | None = field.on(body) if comm.rank == 0 else None  # on the other ranks of modes too
+        self._expansion: Expansion | None = (
+            field.on(body) if comm.rank == 0 else None
+        )  # on the other ranks of modes too
         offset, self.kept, modes = comm.bcast(
             None
             if self._expansion is None

@@ -71,7 +71,7 @@ class Study(Settings):
     """
 
     model: Hyperelastic
-    parameters: dict[str, Distribution] = {}
+    parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Method
     parallel: Parallel = Parallel()

@@ -32,10 +32,14 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
     up_to = "up to " if getattr(study.method, "tolerance", None) is not None else ""
+    names = [*study.parameters]
+    for field in study.model.fields:
+        paths = field.paths(body)
+        names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {study.method.kind}",
         f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
-        f"parameters  {', '.join(study.parameters)}",
+        f"parameters  {', '.join(names)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
         f"solves      {up_to}{solves:,}",
         f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
