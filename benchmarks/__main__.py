@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, realisation, stability, throughput, variance
+from benchmarks import bookkeeping, fields, realisation, stability, streaming, throughput, variance
 
 ALL = {
     "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,
+    "fields": fields.main,
+    "streaming": streaming.main,
     "stability": stability.main,
 }
 
