@@ -75,7 +75,7 @@ def test_the_mesh_does_not_matter():
         matern = Matern.on(body, 0.5)
         row = matern.covariance(np.eye(len(matern.mass))[at(body, 0.5, 0.5, 0)])
         rows.append([row[at(body, *place)] for place in vertices(coarse)])
-    assert np.abs(np.subtract(*rows)).max() < 0.04
+    assert np.abs(np.subtract(*rows)).max() < 0.05
 
 
 def test_a_root_of_the_covariance_makes_samples():
