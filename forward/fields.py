@@ -213,7 +213,8 @@ class Matern:
         self._kappa = inverse_length(length, smoothness)
         self._matrix = mass
         self.mass = np.asarray(mass.sum(axis=1)).ravel()
-        self._factor = _factorise(self._kappa**2 * mass + laplacian + robin * self._kappa * surface)
+        self._operator = (self._kappa**2 * mass + laplacian + robin * self._kappa * surface).tocsr()
+        self._factor = _factorise(self._operator)
 
     @classmethod
     def on(cls, body: Body, length: float, smoothness: Smoothness = 2, robin: float = ROBIN) -> Matern:
@@ -223,12 +224,16 @@ class Matern:
         return cls(*vertex_matrices(body), length, smoothness, robin)
 
     @cached_property
+    def _mass_factor(self) -> Any:
+        return _factorise(self._matrix)
+
+    @cached_property
     def _noise(self) -> csr_matrix:
         """G (N, N) with GGᵀ = M: it makes white noise of independent numbers."""
         from scipy.sparse import diags
 
         # M = PᵀLUP with U = DLᵀ, since pivots stay on the diagonal.
-        factor = _factorise(self._matrix)
+        factor = self._mass_factor
         return (factor.L @ diags(np.sqrt(factor.U.diagonal()))).tocsr()[factor.perm_r]
 
     def _smooth(self, x: FloatArray) -> FloatArray:
@@ -265,6 +270,13 @@ class Matern:
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply the covariance (N, N) with (N,) or (N, k)."""
         return np.asarray((self._smooth(self._matrix @ self._smooth((g.T / self._raw_std).T)).T / self._raw_std).T)
+
+    def precision(self, x: FloatArray) -> FloatArray:
+        """Multiply the inverse of the covariance with (N,) or (N, k)."""
+        y = self._operator @ (x.T * self._raw_std).T
+        for _ in range(self._smoothness - 1):
+            y = self._operator @ self._mass_factor.solve(y)
+        return np.asarray((y.T * self._raw_std).T)
 
     def modes(self, count: int) -> FloatArray:
         """Return the leading Karhunen–Loève modes (N, count), each times the square root of its eigenvalue.

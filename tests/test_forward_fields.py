@@ -78,14 +78,16 @@ def test_the_mesh_does_not_matter():
     assert np.abs(np.subtract(*rows)).max() < 0.05
 
 
-def test_a_root_of_the_covariance_makes_samples():
+@pytest.mark.parametrize("smoothness", [2, 4])
+def test_a_root_of_the_covariance_makes_samples(smoothness):
     corners = [(x, y, z + 0.2 * x * y) for z in (0.0, 0.7) for y in (0.0, 1.0) for x in (0.0, 1.3)]
-    matern = Matern.on(Block(corners=corners, cells=(3, 4, 3)), 0.5, 4)
+    matern = Matern.on(Block(corners=corners, cells=(3, 4, 3)), 0.5, smoothness)
     identity = np.eye(len(matern.mass))
     root = matern.root(identity)
     np.testing.assert_allclose(root @ root.T, matern.covariance(identity), atol=1e-12)
     np.testing.assert_allclose(root.T, matern.root_transposed(identity), atol=1e-12)
     np.testing.assert_allclose(np.diag(root @ root.T), 1, rtol=1e-12)
+    np.testing.assert_allclose(matern.precision(root @ root.T), identity, atol=1e-9)
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
