@@ -20,6 +20,8 @@ from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo, _JointMoments
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 from uq.sampling import random_points
 from workflows.config import StudyError, document, load, parse
+from workflows.results import read_dataset
+from workflows.study import run
 
 FIELDS = (
     {"of": "stiffness", "length": 0.6, "std": 0.3, "modes": 6},
@@ -400,3 +402,24 @@ def test_the_mean_is_a_thousand_times_better_than_by_plain_sampling():
     other = study.method.model_copy(update={"seed": 2}).run(study.inputs, evaluate).sel(output="uy")
     error = np.hypot(found["mean_error"], other["mean_error"])
     assert abs(found["mean"] - other["mean"]) < 4 * error
+
+
+def test_a_study_shows_its_fields(tmp_path, monkeypatch):
+    drawn = []
+
+    def pictures(dataset, shown):
+        drawn.extend(shown)
+        return dict.fromkeys(shown, b"")
+
+    monkeypatch.setattr("workflows.bodies.pictures", pictures)
+    study = parse(STUDY, ["method.samples=8", "method.seed=5"])
+    assert run(study, "field", tmp_path / "field", quiet=True) == 0
+    dataset = read_dataset(tmp_path / "field")
+    assert [f"factor stiffness {i}" for i in range(3)] == drawn[-3:]
+    expansion = study.model.fields[0].on(study.model.body)
+    assert float(dataset["variance_kept"].sel(random_field="stiffness")) == pytest.approx(expansion.kept, rel=1e-12)
+    first = np.exp(expansion.offset + expansion.values(dataset["points"].to_numpy()[0]))  # the first sample
+    np.testing.assert_allclose(dataset["factor"].sel(random_field="stiffness")[0], first, rtol=1e-12)
+    report = (tmp_path / "field" / "report.html").read_text(encoding="utf-8")
+    for words in ("fields.stiffness.0 to 4", "Matérn correlation of length 0.1 m", "of the variance of the field"):
+        assert words in report
