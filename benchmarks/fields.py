@@ -27,24 +27,26 @@ def main() -> None:
 
 
 def sampler() -> None:
-    """Print variance (before it is set to one) and correlations of the field on the unit cube."""
-    print("| smoothness | boundary | cells | variance at centre | at a face | at a corner | error of correlations |")
+    """Print variance (before it is set to one) and correlations of the field on the unit cube and on the thin beam."""
+    bodies = {f"cube, {n}³": (Box(size=(1.0, 1.0, 1.0), cells=(n, n, n), degree=1), LENGTH) for n in (8, 16)}
+    bodies["beam, 12 × 2 × 4"] = (Box(size=(0.28, 0.0215, 0.087), cells=(12, 2, 4), degree=1), 0.1)
+    print("| smoothness | boundary | body | variance at centre | at an end | at a corner | error of correlations |")
     print("|---|---|---|---|---|---|---|")
     smoothnesses: tuple[Smoothness, ...] = (2, 4)
     for smoothness in smoothnesses:
-        for name, robin in (("Robin", ROBIN), ("Neumann", 0.0)):
-            for n in (8, 16):
-                body = Box(size=(1.0, 1.0, 1.0), cells=(n, n, n), degree=1)
-                matern = Matern.on(body, LENGTH, smoothness, robin)
-                places = np.stack(np.meshgrid(*3 * [np.linspace(0, 1, n + 1)], indexing="ij"), axis=-1).reshape(-1, 3)
-                centre, face = (int(np.abs(places - p).sum(axis=1).argmin()) for p in ([0.5] * 3, [0, 0.5, 0.5]))
+        for condition, robin in (("Robin", ROBIN), ("Neumann", 0.0)):
+            for name, (body, length) in bodies.items():
+                matern = Matern.on(body, length, smoothness, robin)
+                lines = [np.linspace(0, edge, n + 1) for edge, n in zip(body.size, body.cells, strict=True)]
+                places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+                middle = np.array(body.size) / 2
+                centre, end = (int(np.abs(places - p).sum(axis=1).argmin()) for p in (middle, middle * [0, 1, 1]))
                 row = matern.covariance(np.eye(len(places))[centre])
-                distance = np.linalg.norm(places - 0.5, axis=1)
-                near = distance <= LENGTH
-                error = np.abs(row - correlation(distance, LENGTH, smoothness))[near].max()
-                variance = matern.inflation
-                shown = " | ".join(f"{variance[i]:.2f}" for i in (centre, face, 0))
-                print(f"| {smoothness} | {name} | {n}³ | {shown} | {error:.3f} |", flush=True)
+                distance = np.linalg.norm(places - middle, axis=1)
+                near = distance <= length
+                error = np.abs(row - correlation(distance, length, smoothness))[near].max()
+                shown = " | ".join(f"{matern.inflation[i]:.2f}" for i in (centre, end, 0))
+                print(f"| {smoothness} | {condition} | {name} | {shown} | {error:.3f} |", flush=True)
 
 
 def mean() -> None:
