@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, chaos, coverage, levels, realisation, stability, throughput, variance
+from benchmarks import (
+    bookkeeping,
+    chaos,
+    coverage,
+    fields,
+    levels,
+    realisation,
+    stability,
+    streaming,
+    throughput,
+    variance,
+)
 
 ALL = {
     "realisation": realisation.main,
@@ -12,6 +23,8 @@ ALL = {
     "throughput": throughput.main,
     "variance": variance.main,
     "levels": levels.main,
+    "fields": fields.main,
+    "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,
     "coverage": coverage.main,

@@ -76,6 +76,12 @@ class _SixSided(Settings):
         return a * b * c
 
     @property
+    def vertex_count(self) -> int:
+        """Number of vertices of the mesh."""
+        a, b, c = self.cells
+        return (a + 1) * (b + 1) * (c + 1)
+
+    @property
     def quadrature(self) -> int:
         """The degree of quadrature in force."""
         default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}

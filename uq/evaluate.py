@@ -114,7 +114,7 @@ class Prediction:
     state
         State (U,) there, in canonical order.
     slopes
-        Derivatives (d, U) of the state.
+        Derivatives (d, U) of the state, or none (0, U): then the solver starts from the state at `point`.
     """
 
     point: FloatArray
@@ -124,6 +124,8 @@ class Prediction:
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+        if len(slopes) == 0:
+            return lambda _: state, Reference(self.point, state)
         return lambda parameters: state + (parameters - self.point) @ slopes, Reference(self.point, state)
 
 
@@ -326,7 +328,8 @@ class BlockSolver:
                 solution = model.solve(point, start, self._reference, self._iterations)
                 row = self._row(solution, point) if self._row is not None else None
                 if tangents is not None:
-                    tangents[i] = solution.tangent(np.eye(d)).T
+                    # One derivative for each parameter or for each output, whichever are fewer.
+                    tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
                 work[i] = error.work.as_array()

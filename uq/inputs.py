@@ -41,7 +41,9 @@ class Inputs:
             if a == b or not -1 < rho < 1:
                 message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
                 raise ValueError(message)
-        smallest = np.linalg.eigvalsh(self._copula).min(initial=1.0)
+        if not self.correlations:
+            return
+        smallest = np.linalg.eigvalsh(self._copula).min()
         if smallest <= 0:
             message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
             raise ValueError(message)
@@ -60,6 +62,14 @@ class Inputs:
     def std(self) -> FloatArray:
         """Standard deviations (d,)."""
         return np.array([m.moments[1] for m in self.marginals.values()])
+
+    @cached_property
+    def _columns(self) -> dict[Distribution, list[int]]:
+        """Positions of the parameters of each distribution."""
+        columns: dict[Distribution, list[int]] = {}
+        for i, marginal in enumerate(self.marginals.values()):
+            columns.setdefault(marginal, []).append(i)
+        return columns
 
     @cached_property
     def _copula(self) -> FloatArray:
@@ -90,7 +100,10 @@ class Inputs:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
         marginals = self.marginals.values()
         if not self.correlations:
-            return np.column_stack([m.quantile(u) for m, u in zip(marginals, uniforms.T, strict=True)])
+            points = np.empty_like(uniforms)
+            for marginal, columns in self._columns.items():  # many parameters have few distributions
+                points[:, columns] = marginal.quantile(uniforms[:, columns])
+            return points
         from scipy.special import ndtri
 
         normals = ndtri(uniforms) @ np.linalg.cholesky(self._copula).T

@@ -133,7 +133,7 @@ def _sample(
 ) -> xr.Dataset:
     evaluate = Recorder(evaluate)
     centre = linearise(inputs, evaluate)
-    slopes = centre.slopes if control else None
+    slopes = centre.slopes if control and len(centre.slopes) else None
     fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
     limit = method.limit
@@ -184,7 +184,7 @@ def _field_moments(
     control: tuple[Coefficient, SecondMoment] | None,
 ) -> Moments:
     n = int(evaluations.ok.sum())
-    if control is None:
+    if control is None or len(centre.slopes) == 0:
         return estimate(evaluations.fields, n, centre.state)
     variance = np.einsum("iu,ij,ju->u", centre.slopes, inputs.covariance, centre.slopes)
     return estimate(evaluations.fields, n, centre.state, variance, *control)

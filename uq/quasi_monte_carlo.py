@@ -305,6 +305,7 @@ class _Samples:
         self._method, self._inputs, self._evaluate = method, inputs, evaluate
         self._centre, self._control, self._start = centre, control, start
         R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
+        self._field_control = control if control is not None and len(control.state) else None
         self.each = 0
         self.points = np.empty((R, 0, d))
         self.outputs = np.empty((R, 0, m))
@@ -335,7 +336,7 @@ class _Samples:
         points = self._inputs.points(np.concatenate(cubes)).reshape(R, new, d)
         outputs, ok = np.empty((R, new, self.outputs.shape[2])), np.empty((R, new), dtype=bool)
         if method.fields and centre.state.size:
-            wanted = _FieldProducts(centre.state, self._control)
+            wanted = _FieldProducts(centre.state, self._field_control)
             for r in range(R):
                 found = self._ask(Request(points[r], fields=wanted, start=self._start))
                 outputs[r], ok[r] = found.outputs, found.ok
@@ -385,6 +386,6 @@ class _Samples:
         means = [total / n for total, n in zip(self._sums, counts, strict=True) if total is not None]
         if not means:
             return None
-        expected = None if self._control is None else self._control.expected(self._control.state)
+        expected = None if self._field_control is None else self._field_control.expected(self._field_control.state)
         replicates = np.stack(means, axis=1)
         return estimate_from_replicates(replicates, self._centre.state, expected, self._method.coefficient)

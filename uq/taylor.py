@@ -53,7 +53,7 @@ class Control:
     polynomials
         The k features.
     outputs, state
-        Coefficients (k, m) and (k, U).
+        Coefficients (k, m) and (k, U); no state (0, U) where the slopes of the state are not known.
     features_mean
         E[φ] (k,).
     features_second
@@ -114,7 +114,7 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     pairs = tuple((i, j) for i in range(d) for j in range(i, d))
     steps = _steps(inputs)
     displaced = centre.point + np.concatenate([np.diag(steps), -np.diag(steps)])
-    wanted = _SecondDerivatives(centre.point, pairs) if fields and centre.state.size else None
+    wanted = _SecondDerivatives(centre.point, pairs) if fields and centre.slopes.size else None
     found = evaluate(Request(displaced, tangents=True, fields=wanted, start=centre.prediction))
     for failure in found.failures:
         message = (
@@ -125,7 +125,7 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     # (d, m, d): ∂/∂ω_i of ∂ψ/∂ω_j
     differences = (found.tangents[:d] - found.tangents[d:]) / (2 * steps[:, None, None])
     hessian = np.array([(differences[i, :, j] + differences[j, :, i]) / 2 for i, j in pairs])
-    state = np.concatenate([centre.slopes, found.fields]) if wanted is not None else centre.slopes[:, :0]
+    state = np.concatenate([centre.slopes, found.fields]) if wanted is not None else centre.slopes[:0]
     exponents = np.concatenate([np.eye(d, dtype=int), [np.eye(d, dtype=int)[[i, j]].sum(axis=0) for i, j in pairs]])
     factors = np.array([1.0] * d + [0.5 if i == j else 1.0 for i, j in pairs])
     covariance = inputs.covariance

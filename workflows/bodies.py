@@ -34,7 +34,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     shown
         "mean", "std", "mean_error", "std_error", "nominal", or "derivative PARAMETER" (times the standard deviation
         of that parameter): the field whose magnitude is the colour. With "std", lines show the edges of the body
-        where all components are one standard deviation larger, and smaller, than their mean.
+        where all components are one standard deviation larger, and smaller, than their mean. "factor FIELD i" is
+        realisation i of the factor of a random field, on the undeformed body.
 
     Returns
     -------
@@ -48,6 +49,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     parameter = shown.removeprefix("derivative ") if shown.startswith("derivative ") else None
     factor = 1.0 if parameter is None else float(dataset["parameter_std"].sel(parameter=parameter))
     grid.point_data["colour"] = factor * grid.point_data[shown]
+    scalar = grid.point_data[shown].ndim == 1
+    displacement = np.zeros_like(grid.points) if scalar else grid.point_data[motion]
 
     # Two panels, so that the scale of the colours never covers the body.
     plotter: Any = pyvista.Plotter(
@@ -59,21 +62,23 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         for sign in (-1, 1):
             edge = grid.point_data[motion] + sign * np.sign(grid.point_data[motion]) * grid.point_data["std"]
             plotter.add_mesh(_edges(grid, edge), color=SECOND, line_width=2)
-    surface = _surface(grid, grid.point_data[motion])
+    surface = _surface(grid, displacement)
     # The magnitude after the subdivision: between the nodes it is that of the interpolated vector, never negative.
-    surface.point_data["magnitude"] = np.linalg.norm(surface.point_data["colour"], axis=1)
+    colour = surface.point_data["colour"]
+    surface.point_data["magnitude"] = colour if scalar else np.linalg.norm(colour, axis=1)
     coloured = plotter.add_mesh(
         surface,
         scalars="magnitude",
-        cmap="plasma" if shown == "std" else "viridis",
+        cmap="cividis" if scalar else "plasma" if shown == "std" else "viridis",
+        clim=_range(dataset, shown) if scalar else None,
         ambient=0.45,
         diffuse=0.6,
         smooth_shading=True,
         split_sharp_edges=True,
         show_scalar_bar=False,
     )
-    plotter.add_mesh(_edges(grid, grid.point_data[motion]), color=DARK, line_width=1.5)
-    _show_lengths(plotter, np.concatenate([grid.points, grid.points + grid.point_data[motion]]))
+    plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
+    _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)
     _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter))
@@ -99,6 +104,12 @@ def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | No
         return dict(pickle.loads(done.stdout))
     except (OSError, subprocess.SubprocessError, pickle.UnpicklingError, EOFError):
         return None
+
+
+def _range(dataset: xr.Dataset, shown: str) -> list[float]:
+    """Smallest and largest factor over all realisations of a random field, which share one scale of colours."""
+    factors = dataset["factor"].sel(random_field=shown.split()[1])
+    return [float(factors.min()), float(factors.max())]
 
 
 def _surface(grid: Any, displacement: FloatArray | None = None) -> Any:
@@ -186,6 +197,9 @@ def _colour_title(shown: str, parameter: str | None) -> str:
     if parameter is not None:
         parameter = parameter.replace("$", "")  # which VTK would read as the beginning of a formula
         return f"displacement by one standard deviation of {parameter} (m)"
+    if shown.startswith("factor "):
+        _, field, _ = shown.split()
+        return f"random factor {field} (1)".replace("$", "")
     words = {
         "mean": "magnitude of the mean displacement (m)",
         "std": "magnitude of the standard deviation of the displacement (m)",

@@ -13,7 +13,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.chaos import Chaos
-from uq.distributions import Distribution
+from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
@@ -69,7 +69,8 @@ class Study(Settings):
     model
         The body.
     parameters
-        Distributions by the paths of the numbers of the model that they override.
+        Distributions by the paths of the numbers of the model that they override; may be left out where the model has
+        random fields, whose coefficients are parameters by themselves.
     correlations
         Correlations between them.
     method
@@ -79,15 +80,17 @@ class Study(Settings):
     """
 
     model: Hyperelastic
-    parameters: dict[str, Distribution] = Field(min_length=1)
+    parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Method
     parallel: Parallel = Parallel()
 
     @property
     def inputs(self) -> Inputs:
-        """The random parameters."""
-        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
+        standard = Normal(mean=0.0, std=1.0)
+        marginals = self.parameters | dict.fromkeys(self.model.coefficients, standard)
+        return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
     def models(self) -> tuple[Hyperelastic, ...]:
@@ -98,7 +101,7 @@ class Study(Settings):
     @property
     def planned(self) -> int:
         """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
-        return self.method.planned(len(self.parameters))
+        return self.method.planned(len(self.parameters) + len(self.model.coefficients))
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -121,7 +124,32 @@ class Study(Settings):
         except ValidationError as error:
             message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
+        yield from self._mistakes_of_parameters()
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo
+            objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
+            if objection is not None:
+                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+        if isinstance(self.method, MultilevelChaos):
+            shortage = self.method.shortage(len(self.parameters) + len(self.model.coefficients))
+            if shortage is not None:
+                yield ("method", "samples"), shortage, self.method.samples
+
+    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         scalars = self.model.scalars
+        if not self.parameters and not self.model.fields:
+            yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
+        if self.model.fields and isinstance(self.method, MultilevelMonteCarlo):
+            message = "random fields have other coefficients on every mesh, expected a method with one mesh"
+            yield ("model", "fields"), message, self.method.kind
+        for i, field in enumerate(self.model.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
         for path, distribution in self.parameters.items():
             if path not in scalars:
                 yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
@@ -135,19 +163,6 @@ class Study(Settings):
                     message = f"reaches {end:.4g}, where the model is impossible ({objection})"
                     yield ("parameters", path), message, distribution.model_dump()
                     break
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo
-            objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
-            if objection is not None:
-                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
-        if isinstance(self.method, MultilevelChaos):
-            shortage = self.method.shortage(len(self.parameters))
-            if shortage is not None:
-                yield ("method", "samples"), shortage, self.method.samples
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
@@ -265,7 +280,7 @@ def _path(key: str, blocks: Mapping[str, Any]) -> list[str]:
 
 def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     for i, item in enumerate(items):
-        if isinstance(item, dict) and name in (item.get("name"), item.get("kind"), item.get("on"), str(i)):
+        if isinstance(item, dict) and name in (*map(item.get, ("name", "kind", "on", "of")), str(i)):
             items[i] = item.copy()
             return items[i]  # type: ignore[no-any-return]
     message = f"--set {key}: no element is called '{name}'"

@@ -28,6 +28,10 @@ def plan(study: Study, groups: int = 1) -> list[str]:
         up_to, later = "", " for linearisations and pilots, which decide how many more"
         seconds = method.seconds_to_begin(sizes, textbook)
     seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
+    names = [*study.parameters]
+    for field in study.model.fields:
+        paths = field.paths(body)
+        names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {method.kind}",
         f"unknowns    {sizes[0]:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
@@ -36,7 +40,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
             for k, (size, s) in enumerate(zip(sizes, each, strict=True))
             if k
         ),
-        f"parameters  {', '.join(study.parameters)}",
+        f"parameters  {', '.join(names)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
         f"memory      about {sum(map(bytes_per_model, sizes)) / 2**20:,.0f} MiB for each group of ranks",

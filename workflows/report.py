@@ -191,6 +191,13 @@ def _body_captions(dataset: xr.Dataset) -> dict[str, str]:
         strongest = dataset["parameter"].to_numpy()[np.argsort(-effects.to_numpy())][:DERIVATIVES_DRAWN]
         for name in strongest:
             captions[f"derivative {name}"] = f"What one standard deviation of {name} moves, to first order."
+    if "factor" in dataset:
+        for field in dataset["random_field"].to_numpy():
+            for i, factor in enumerate(dataset["factor"].sel(random_field=field).to_numpy()):
+                ends = f"{number(float(factor.min()), 3)} to {number(float(factor.max()), 3)}"
+                captions[f"factor {field} {i}"] = (
+                    f"Realisation {i + 1} of the random factor '{field}', {ends}, on the undeformed body."
+                )
     return captions
 
 

@@ -114,6 +114,20 @@ def _number(value: Any) -> float | None:
     return number if np.isfinite(number) else None
 
 
+def with_random_fields(
+    dataset: xr.Dataset, factors: Mapping[str, NDArray[np.float64]], variance_kept: Mapping[str, float]
+) -> xr.Dataset:
+    """Add what random fields look like, realisation by realisation (n, nodes), where fields are kept at the nodes."""
+    if not factors:
+        return dataset
+    dataset = dataset.assign_coords(random_field=list(variance_kept))
+    dataset = dataset.assign(variance_kept=(("random_field",), list(variance_kept.values())))
+    if "node" in dataset.dims:
+        values = np.array([factors[name] for name in variance_kept])
+        dataset = dataset.assign(factor=(("random_field", "realisation", "node"), values))
+    return dataset
+
+
 def body_grid(dataset: xr.Dataset) -> Any:
     """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
     import pyvista
@@ -140,7 +154,7 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
 
 
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return the fields (n_nodes, 3) of the results by a name that tells what they are."""
+    """Return the fields (n_nodes, 3), or (n_nodes,), of the results by a name that tells what they are."""
     arrays = {}
     for name, variable in dataset.data_vars.items():
         if set(variable.dims) == {"node", "component"}:
@@ -148,6 +162,10 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
         elif variable.dims == ("parameter", "node", "component"):
             for parameter in dataset.parameter.values:
                 arrays[f"{str(name).removeprefix('field_')} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
+        elif variable.dims == ("random_field", "realisation", "node"):
+            for field in dataset.random_field.values:
+                for i, values in enumerate(variable.sel(random_field=field).to_numpy()):
+                    arrays[f"{name} {field} {i}"] = values
     return arrays
 
 

@@ -21,6 +21,8 @@ material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 # formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]
+# A random factor on the stiffness (or the density), log-normal, that varies over the body; its modes are parameters:
+# fields = [{ of = "stiffness", length = 0.03, std = 0.3, modes = 10 }]
 clamp = ["x-min"]
 # Boundaries that are moved by a given amount (m), component by component:
 # displacements = [{ on = "x-max", x = 0.01 }]

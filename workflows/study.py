@@ -15,14 +15,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
+from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
-from workflows.results import label, read_summary, summarise, write_dataset, write_fields, write_text
+from workflows.results import (
+    label,
+    read_summary,
+    summarise,
+    with_random_fields,
+    write_dataset,
+    write_fields,
+    write_text,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.finite_element import HyperelasticModel
+    from forward.model import FloatArray
+    from uq.inputs import Inputs
+
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
+REALISATIONS = 3  # of random fields, to look at
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
@@ -86,6 +100,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     recorders: list[Recorder] = []
     # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
     cells, kind = model.layout.cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders.append(Recorder(evaluate))
@@ -97,6 +112,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
         return DONE
     progress.close()
     dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
+    dataset = with_random_fields(dataset, factors, model.variance_kept)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     write_dataset(directory / "results.nc", dataset)
     write_fields(directory / "fields", dataset)
@@ -159,6 +175,17 @@ def _prepare(study: Study, directory: Path, ranks: int) -> int | None:
     if summary is None:
         return None
     return PARTIAL if summary["failed"] else DONE
+
+
+def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
+    """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
+
+    They are the first samples of Monte Carlo with the seed of the study.
+    """
+    if not study.model.fields:
+        return {}
+    seed = getattr(study.method, "seed", 0)
+    return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
 def _units(study: Study) -> dict[str, str]:

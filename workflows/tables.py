@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+ROWS = 40  # parameters that a table lists
+
+
 @dataclass(frozen=True)
 class Table:
     """A table; the columns `text` are flushed left, and those of them in `long` are wrapped."""
@@ -43,6 +46,13 @@ class Results:
         """Names of the parameters."""
         return [str(name) for name in self.dataset["parameter"].values]
 
+    def leading(self, effects: xr.DataArray) -> list[str]:
+        """Names of the parameters, or of those with the largest effects (parameter,) where there are many."""
+        if len(self.parameters) <= ROWS:
+            return self.parameters
+        largest = (-abs(effects)).argsort().to_numpy()[:ROWS]
+        return [str(name) for name in effects["parameter"].to_numpy()[largest]]
+
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
@@ -62,6 +72,11 @@ def parameters(results: Results) -> Table:
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
         rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, unit_of(name)))
+    for field in results.study.model.fields:
+        paths = field.paths(results.study.model.body)
+        kept = float(results.dataset["variance_kept"].sel(random_field=field.label))
+        law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
+        rows.append((f"fields.{field.label}.0 to {len(paths) - 1}", law, "0", "1", "1"))
     rows += [
         (" and ".join(c.between), f"joined by a Gaussian copula with correlation {c.value:g}", "", "", "")
         for c in results.study.correlations
@@ -267,7 +282,7 @@ def sobol(results: Results, output: str) -> Table:
     """Sobol' indices of an output."""
     of_output = results.dataset.sel(output=output)
     rows = []
-    for name in results.parameters:
+    for name in results.leading(of_output["sobol_total"]):
         of_parameter = of_output.sel(parameter=name)
         pairs = [(of_parameter[f"sobol_{which}"], of_parameter[f"sobol_{which}_error"]) for which in ("first", "total")]
         rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
@@ -278,7 +293,7 @@ def sensitivities(results: Results, output: str) -> Table:
     """Derivatives of an output, in physical units and times the spread of the parameter."""
     unit, slopes = results.unit(output), results.dataset.sel(output=output)
     rows = []
-    for name in results.parameters:
+    for name in results.leading(slopes["derivative_per_std"]):
         of_parameter = slopes.sel(parameter=name)
         slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
@@ -290,7 +305,7 @@ def field_norms(results: Results) -> Table:
     """Norms of the derivatives of the displacement field."""
     dataset = results.dataset
     rows = []
-    for name in results.parameters:
+    for name in results.leading(dataset["field_derivative_norm"] * dataset["parameter_std"]):
         of_parameter = dataset.sel(parameter=name)
         norm, std = float(of_parameter["field_derivative_norm"]), float(of_parameter["parameter_std"])
         over_range = float(of_parameter["field_derivative_norm_per_range"])
@@ -300,8 +315,8 @@ def field_norms(results: Results) -> Table:
 
 
 def failures(results: Results) -> Table:
-    """The solves that failed: parameters and reason."""
-    names = results.parameters
+    """The solves that failed: parameters (without the coefficients of random fields) and reason."""
+    names = list(results.study.parameters)
     rows = [
         (*(with_unit(number(f["parameters"][name], 6), unit_of(name)) for name in names), f["reason"])
         for f in results.summary["failures"]
