@@ -13,15 +13,12 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.chaos import Chaos
+from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.quasi_monte_carlo import QuasiMonteCarlo
 
-Method = Annotated[
-    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos, Field(discriminator="kind")
-]
+Method = Annotated[Sampling | LocalSensitivity | Compare, Field(discriminator="kind")]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -85,6 +82,22 @@ class Study(Settings):
         """Number of solves, the largest where a tolerance may end the study earlier."""
         return self.method.planned(len(self.parameters))
 
+    @property
+    def other_models(self) -> list[Hyperelastic]:
+        """The models that the method may ask for beside `model`, in the order of their numbers."""
+        if not isinstance(self.method, Compare):
+            return []
+        solver, body = self.model.solver, self.model.body
+        tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
+        return [
+            self.model.model_copy(update=change)
+            for change in (
+                {"solver": solver.model_copy(update=tolerances)},
+                {"solver": solver.model_copy(update={"kind": "newton"})},
+                {"body": body.model_copy(update={"cells": tuple(2 * n for n in body.cells)})},
+            )
+        ]
+
     @model_validator(mode="after")
     def _check(self) -> Study:
         mistakes = list(self._mistakes())
@@ -120,9 +133,14 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            objection = self.method.objection(inputs) if isinstance(self.method, Chaos | Compare) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+        if isinstance(self.method, Compare) and isinstance(self.method.reference, Given):
+            given, outputs = self.method.reference.values, [output.name for output in self.model.outputs]
+            if set(given) != set(outputs):
+                message = f"expected values of every output: {', '.join(outputs)}"
+                yield ("method", "reference", "values"), message, list(given)
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
@@ -274,7 +292,7 @@ def _kinds() -> set[str]:
 
     unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
+    return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 
 
-_TAGS = _kinds()
+_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from uq.moments import Coefficient, Moments, estimate, monomials
+from uq.moments import Coefficient, Moments, estimate, half_width, monomials
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,21 +56,12 @@ def running_estimates(
     return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
 
 
-def band(dataset: xr.Dataset) -> float:
-    """Standard errors on either side of a 95 % confidence band: more where they come from a few scrambles."""
-    if "scramble" not in dataset:
-        return 1.96
-    from scipy.special import stdtrit
-
-    return float(stdtrit(int(dataset["scramble"].max()), 0.975))
-
-
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
     ax = ax or _axes()
     series = _series(dataset, output)
     for label, colour, counts, mean, error in series:
-        half = band(dataset) * error
+        half = half_width(dataset) * error
         ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
         ax.plot(counts, mean, color=colour, label=label)
     _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
@@ -166,7 +157,7 @@ def comparison(
     ax = ax or _axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
-    errors = [band(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
+    errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
     ax.set_yticks(places, [_text(name) for name in shown])
     ax.set_ylim(-0.6, len(shown) - 0.4)

@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,7 +91,8 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
         recorders.append(Recorder(evaluate))
         return study.method.run(inputs, recorders[0])
 
-    dataset = ensemble.run(model, task, checkpoint=checkpoint, progress=progress)
+    others = [partial(spec.build, ensemble.group, inputs.names) for spec in study.other_models]
+    dataset = ensemble.run(model, task, others=others, checkpoint=checkpoint, progress=progress)
     if dataset is None:
         return DONE
     progress.close()

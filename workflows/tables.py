@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from uq.moments import half_width
 from workflows.config import Study
-from workflows.plots import band
 from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
         yield Gain(
             f"Errors are from the scatter of {R} independent scrambles, and so known to {spread} % or so when squared; "
-            f"a 95 % interval is ± {number(band(dataset), 3)} of them.",
+            f"a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
             hurts=False,
         )
     for output in dataset["output"].values:
