@@ -30,7 +30,7 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
 
 
 @pytest.mark.parametrize(
-    "kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos"]
+    "kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos", "compare"]
 )
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind

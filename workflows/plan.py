@@ -27,6 +27,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     unknowns = study.model.unknowns
     solves = study.planned
     each = seconds_per_solve(unknowns) * (TEXTBOOK if study.model.solver.kind == "newton" else 1)
+    memory = sum(bytes_per_model(model.unknowns) for model in (study.model, *study.other_models))
     seconds = min(solves * each, getattr(study.method, "budget_seconds", None) or float("inf")) / groups
     body = study.model.body
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
@@ -38,7 +39,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
         f"parameters  {', '.join(study.parameters)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
         f"solves      {up_to}{solves:,}",
-        f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
+        f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each:.2g} s a solve)",
     ]

@@ -102,6 +102,8 @@ def _context(results: Results) -> dict[str, Any]:
         "model": list(model_in_words(results.study)),
         "parameters": tables.parameters(results),
         "nominal": tables.nominal(results),
+        "references": tables.references(results) if "row_method" in dataset else None,
+        "errors": [(o, _errors(results, o)) for o in results.outputs] if "row_method" in dataset else [],
         "moments": tables.moments(results) if sampled else None,
         "gains": list(tables.gains(dataset)),
         "quantiles": tables.quantiles(results) if sampled else None,
@@ -135,6 +137,23 @@ def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
         _picture(plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
         _picture(plots.standard_error(dataset, output), f"Standard error of the mean of {output}."),
     ]
+
+
+def _errors(results: Results, output: str) -> list[tuple[str, tables.Table, list[Picture]]]:
+    """Tables and pictures of a comparison of methods."""
+    costs: dict[str, plots.Cost] = {"the number of solves": "solves", "processor time": "cpu_seconds"}
+    words: dict[str, plots.Estimated] = {"mean": "mean", "standard deviation": "std"}
+    shown = []
+    for word, estimated in words.items():
+        pictures = [
+            _picture(
+                plots.errors(results.dataset, output, estimated, against),
+                f"Error of the {word} of {output} against {cost}.",
+            )
+            for cost, against in costs.items()
+        ]
+        shown.append((word, tables.errors(results, output, estimated), pictures))
+    return shown
 
 
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:
