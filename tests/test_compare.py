@@ -237,11 +237,12 @@ def study(**settings):
 
 
 def test_a_study_survives_its_own_dump():
-    case = study(reference={"kind": "given", "values": {n: {"mean": 1.0, "std": 0.1} for n in ("uy_max", "ux_max")}})
+    given = {"kind": "given", "values": {name: {"mean": 1.0, "std": 0.1} for name in ("uy_max", "ux_max")}}
+    case = study(reference=given, mesh_error=True)
     assert parse(tomllib.loads(dump(case))) == case
     assert document(case)["method"]["methods"][0] == {"name": "", "kind": "monte-carlo", "budgets": [16, 32]}
-    assert case.planned == 1 + 20 * (32 + 32) + 2 * 8
-    assert "solves      up to 1,297" in plan(case)
+    assert case.planned == 2 + 20 * (32 + 32) + 2 * 8
+    assert "solves      up to 1,298" in plan(case)
     assert [model.solver.kind for model in case.other_models] == ["predict-correct", "newton", "predict-correct"]
     assert case.other_models[0].solver.tolerance == pytest.approx(1e-11)
     assert case.other_models[2].body.cells == (8, 2, 4)

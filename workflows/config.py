@@ -89,14 +89,13 @@ class Study(Settings):
             return []
         solver, body = self.model.solver, self.model.body
         tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
-        return [
-            self.model.model_copy(update=change)
-            for change in (
-                {"solver": solver.model_copy(update=tolerances)},
-                {"solver": solver.model_copy(update={"kind": "newton"})},
-                {"body": body.model_copy(update={"cells": tuple(2 * n for n in body.cells)})},
-            )
+        changes: list[dict[str, Settings]] = [
+            {"solver": solver.model_copy(update=tolerances)},
+            {"solver": solver.model_copy(update={"kind": "newton"})},
         ]
+        if self.method.mesh_error:
+            changes.append({"body": body.model_copy(update={"cells": tuple(2 * n for n in body.cells)})})
+        return [self.model.model_copy(update=change) for change in changes]
 
     @model_validator(mode="after")
     def _check(self) -> Study:
