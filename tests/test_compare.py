@@ -1,14 +1,16 @@
 """Comparisons of methods on analytic models: errors, rates, coverage, charges, restarts."""
 
 import json
+import sys
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from forward.model import FunctionModel, SolveError
+from tests.launch import ROOT, run
 from uq.checkpoint import Checkpoint
 from uq.compare import TIMES, Compare, gains, plain_samples
 from uq.distributions import Uniform
@@ -22,6 +24,7 @@ from workflows.plan import plan
 from workflows.report import write_report
 from workflows.results import label, summarise, write_dataset
 
+CONFIGS = ROOT / "configs"
 UNIT = Uniform(lower=0.0, upper=1.0)
 INPUTS = Inputs({"a": UNIT, "b": UNIT})
 GROWTH = np.array([0.5, 0.8])
@@ -204,7 +207,7 @@ def test_a_restart_finds_its_blocks_and_gives_the_same(tmp_path):
     method = comparison(PLAIN, SOBOL, repeats=3)
     solved = []
 
-    def run(most):
+    def attempt(most):
         def limited(p):
             if len(solved) >= most:
                 raise StoppedError
@@ -219,8 +222,8 @@ def test_a_restart_finds_its_blocks_and_gives_the_same(tmp_path):
 
     for most in (300, 1500):
         with pytest.raises(StoppedError):
-            run(most)
-    found, whole = run(10**6), method.run(INPUTS, serial())
+            attempt(most)
+    found, whole = attempt(10**6), method.run(INPUTS, serial())
     assert len(solved) < 1.1 * (1 + 3 * (256 + 512))
     for name in found.variables:
         if name not in TIMES:
@@ -231,7 +234,7 @@ def test_a_restart_finds_its_blocks_and_gives_the_same(tmp_path):
 
 
 def study(**settings):
-    blocks = tomllib.loads((Path(__file__).parent.parent / "configs" / "tiny.toml").read_text())
+    blocks = tomllib.loads((CONFIGS / "tiny.toml").read_text())
     methods = [{"kind": "monte-carlo", "budgets": [16, 32]}, {"name": "q", **SOBOL, "budgets": [32]}]
     return parse(blocks | {"method": {"kind": "compare", "methods": methods} | settings})
 
@@ -359,3 +362,33 @@ def test_summary_and_report(results, monkeypatch):
     assert "monte-carlo, textbook solver" in against_time.get_legend_handles_labels()[1]
     assert against_time.get_xlabel() == "processor time (s), set-up charged"
     assert against_time.get_ylabel() == "RMSE of the mean of uy_max (m)"
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_same_comparison_on_any_number_of_groups(tmp_path):
+    methods = """[
+        { kind = "monte-carlo", budgets = [8, 16] },
+        { kind = "quasi-monte-carlo", control = "quadratic", scrambles = 4, budgets = [8, 16] },
+        { kind = "chaos", max_order = 3, budgets = [4, 6] },
+    ]"""
+    reference = '{ kind = "chaos", fit = "projection", max_order = 2 }'
+    text = (CONFIGS / "tiny.toml").read_text()
+    numbers = "repeats = 3\ntextbook = 2\nmesh_error = true"
+    method = f'kind = "compare"\n{numbers}\nreference = {reference}\nmethods = {methods}\n'
+    path = tmp_path / "mini.toml"
+    path.write_text(text[: text.index("[method]")] + f"[method]\n{method}")
+    found = []
+    for ranks in (None, 2):
+        out = tmp_path / f"on-{ranks}"
+        done = run(ranks, sys.executable, "-m", "workflows", "run", path, "--out", out, "--quiet")
+        assert done.returncode == 0, done.stderr
+        found.append(xr.load_dataset(out / "results.nc"))
+    one, two = found
+    for name in one.variables:
+        if name not in TIMES:
+            assert one[name].to_numpy().tobytes() == two[name].to_numpy().tobytes(), name
+    assert (one["solver_error"] < 1e-7).all()
+    assert (one["mesh_error"] > 1e-4).all()
+    assert float(one["textbook_seconds"]) > float(one["plain_seconds"])
