@@ -102,7 +102,7 @@ class Entry(Settings):
             raise ValueError(message)
         refused = [name for name in _NOT_ITS_OWN if name in value]
         if refused:
-            message = f"gives {' and '.join(refused)}, expected none: budgets and method.seed say it for all methods"
+            message = f"gives {' and '.join(refused)}, expected none: a comparison says it for all methods"
             raise ValueError(message)
         own = {name: value[name] for name in ("name", "budgets") if name in value}
         rest = {name: item for name, item in value.items() if name not in own}

@@ -240,6 +240,13 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
             f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
             f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
         )
+    first = next(iter(dataset.output.values))
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
+        )
     if not lines:
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
