@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, realisation, stability, throughput, variance
+from benchmarks import bookkeeping, chaos, coverage, levels, realisation, stability, throughput, variance
 
 ALL = {
     "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,
+    "levels": levels.main,
     "stability": stability.main,
+    "chaos": chaos.main,
+    "coverage": coverage.main,
 }
 
 

@@ -30,7 +30,11 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
 
 
 @pytest.mark.parametrize(
-    "kind", ["monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos", "compare"]
+    "kind",
+    [
+        *("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "local-sensitivity", "chaos"),
+        *("multilevel-chaos", "compare"),
+    ],
 )
 def test_starters_are_valid(kind):
     assert parse(tomllib.loads(starter(kind))).method.kind == kind
@@ -38,6 +42,10 @@ def test_starters_are_valid(kind):
 
 def test_chaos_needs_independent_parameters():
     names = list(blocks()["parameters"])
+    control = blocks() | {"method": {"kind": "quasi-monte-carlo", "samples": 32, "control": "chaos"}}
+    assert parse(control).planned == 1 + 7 + 32
+    with pytest.raises(StudyError, match=r"independent parameters.* for method\.control"):
+        parse(control | {"correlations": [{"between": names, "value": 0.3}]})
     document_ = blocks() | {"method": {"kind": "chaos", "samples": 9}}
     assert parse(document_).planned == 10
     assert parse(document_ | {"method": {"kind": "chaos", "fit": "projection", "max_order": 3}}).planned == 26
@@ -162,6 +170,20 @@ def test_the_plan_says_the_form():
     plain, mixed = (plan(parse(blocks(), [f"model.material.D1={bulk}"])) for bulk in (3e5, 3e8))
     assert "displacement form" in plain[1]
     assert "mixed form: displacements and pressures" in mixed[1]
+
+
+def test_the_plan_warns_of_a_transition_narrower_than_a_cell():
+    document_ = blocks()
+    body = document_["model"]["body"]
+    edge = max(size / n for size, n in zip(body["size"], body["cells"], strict=True))
+    inclusion = {"name": "tumour", "kind": "sphere", "x": 0, "y": 0, "z": 0, "radius": 0.01, "contrast": 10.0}
+    warned = []
+    for width in (0.99 * edge, 1.01 * edge):
+        document_["model"]["inclusions"] = [inclusion | {"width": width}]
+        warned.append([line for line in plan(parse(document_)) if line.startswith("warning")])
+    assert len(warned[0]) == 1
+    assert "inclusions.tumour.width" in warned[0][0]
+    assert warned[1] == []
 
 
 def test_overrides():

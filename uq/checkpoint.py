@@ -103,6 +103,8 @@ def _write(path: Path, block: Evaluations) -> None:
         file["seconds"] = block.seconds
         file["work"] = block.work
         file["work"].attrs["columns"] = list(WORK)
+        file["residuals"] = block.residuals
+        file["converged"] = block.converged
         file["failures"] = json.dumps([asdict(failure) for failure in block.failures])
         if block.tangents is not None:
             file["tangents"] = block.tangents
@@ -128,5 +130,7 @@ def load(path: Path) -> Evaluations:
             failures,
             np.asarray(file["seconds"]),
             np.asarray(file["work"]),
+            np.asarray(file["residuals"]),
+            np.asarray(file["converged"]),
             np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
         )

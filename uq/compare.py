@@ -26,13 +26,15 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, half_width, ratio
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.multilevel_chaos import MultilevelChaos
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 from uq.sampling import random_points
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Sampling = MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | Chaos  # methods that estimate moments from samples
+# Methods that estimate moments from samples.
+Sampling = MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | Chaos | MultilevelChaos
 ESTIMATED = ("mean", "std")
 TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # of results, what no restart gives again
 RESOLVED = 2.0  # an error is measured where it is so many times the reference's own
@@ -84,6 +86,12 @@ class Entry(Settings):
         """Return the method with so many samples, for its moments only."""
         kept = {"samples": budget, "seed": seed, **_MOMENTS_ONLY}
         return type(self.sampling).model_validate(self.sampling.model_dump() | kept)
+
+    def shortage(self, dimension: int) -> str | None:
+        """Say that there are too few samples for what is fitted to them, or nothing."""
+        if not isinstance(self.sampling, MultilevelChaos):
+            return None
+        return self.sampling.model_copy(update={"samples": min(self.budgets)}).shortage(dimension)
 
     @model_validator(mode="before")
     @classmethod
@@ -195,7 +203,8 @@ class Compare(Settings):
     def objection(self, inputs: Inputs) -> str | None:
         """Say why one of the methods cannot take these parameters, or nothing."""
         methods = [self.reference, *(entry.sampling for entry in self.methods)]
-        objections = (method.objection(inputs) for method in methods if isinstance(method, Chaos))
+        restricted = [method for method in methods if isinstance(method, Chaos | MultilevelChaos | QuasiMonteCarlo)]
+        objections = (method.objection(inputs) for method in restricted)
         return next((objection for objection in objections if objection), None)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:

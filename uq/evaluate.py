@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +47,13 @@ class Evaluations:
         Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
     work
         Counts (n, k) of the operations `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
     fields
-        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
+        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
+        `CompactSum`, the rows of these points themselves, one point after the other.
     """
 
     points: FloatArray
@@ -57,6 +62,8 @@ class Evaluations:
     failures: tuple[Failure, ...]
     seconds: FloatArray
     work: NDArray[np.int64]
+    residuals: FloatArray
+    converged: NDArray[np.bool_]
     fields: FloatArray
 
     @property
@@ -74,9 +81,30 @@ class FieldSum(Protocol):
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
 
 
+@runtime_checkable
+class CompactSum(FieldSum, Protocol):
+    """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
+
+    `on` returns the few; the terms are formed where blocks are added, so that files and messages stay small.
+    """
+
+    def term(self, parameters: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return what is summed (K, U), from the parameters (d,) of a realisation and its rows (k, U)."""
+
+
+class Start(Protocol):
+    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+
+    A dataclass, by whose fields the blocks that were started from it are found again.
+    """
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
+    """A linear prediction of the state, with the factor at `point`.
 
     Attributes
     ----------
@@ -112,6 +140,8 @@ class Request:
         What is summed of the states.
     start
         Where the solver starts.
+    iterations
+        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
     model
         Which of the models that the evaluation has; `Evaluate.on` sets it.
     """
@@ -119,7 +149,8 @@ class Request:
     points: FloatArray
     tangents: bool = False
     fields: FieldSum | None = None
-    start: Prediction | None = None
+    start: Start | None = None
+    iterations: int | None = None
     model: int = 0
 
     def blocks(self) -> list[Request]:
@@ -199,7 +230,7 @@ class SerialEvaluate:
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
         solver = BlockSolver(self.model, request)
-        return merge([solver(block.points, self.progress) for block in request.blocks()])
+        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
 
 
 class Recorder:
@@ -263,7 +294,9 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents = request.tangents
+        self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
+        self._compact = isinstance(request.fields, CompactSum)
         self._predict: Callable[[FloatArray], FloatArray] | None = None
         self._reference: Reference | None = None
         if request.start is not None:
@@ -277,13 +310,14 @@ class BlockSolver:
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         failures: list[Failure] = []
-        total: FloatArray | None = None
+        rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
         for i, point in enumerate(points):
             begin = time.process_time()
             try:
                 start = self._predict(point) if self._predict is not None else None
-                solution = model.solve(point, start, self._reference)
+                solution = model.solve(point, start, self._reference, self._iterations)
                 row = self._row(solution, point) if self._row is not None else None
                 if tangents is not None:
                     tangents[i] = solution.tangent(np.eye(d)).T
@@ -293,19 +327,23 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
-                if row is not None:
-                    total = row if total is None else total + row
+                residuals[i], converged[i] = solution.residual, solution.converged
+                if row is not None and (self._compact or not rows):
+                    rows.append(row.copy())
+                elif row is not None:
+                    # In place: these are the largest arrays there are, and a new one for each sample takes longer.
+                    rows[0] += row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
-        fields = np.zeros((0, 0)) if total is None else model.gather(total)
+        fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, fields)
 
 
-def merge(blocks: Sequence[Evaluations]) -> Evaluations:
-    """Put the blocks of a request together, in their order."""
-    merger = Merger()
+def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
+    """Put the blocks of a request for these fields together, or several evaluations, in their order."""
+    merger = Merger(fields)
     for block in blocks:
         merger.add(block)
     return merger.result()
@@ -314,13 +352,19 @@ def merge(blocks: Sequence[Evaluations]) -> Evaluations:
 class Merger:
     """Adds blocks in their order, keeping one sum of fields.
 
+    Parameters
+    ----------
+    fields
+        The sum that the blocks are parts of; none where each of them is complete.
+
     Attributes
     ----------
     count
         Number of blocks added so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fields: FieldSum | None = None) -> None:
+        self._compact = fields if isinstance(fields, CompactSum) else None
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
         self._points = 0
@@ -329,12 +373,22 @@ class Merger:
 
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
-        if block.fields.size:
-            self._fields = block.fields if self._fields.size == 0 else self._fields + block.fields
+        for term in self._terms(block):
+            self._fields = term if self._fields.size == 0 else self._fields + term
         self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
         self._points += len(block.points)
         self.count += 1
         self._blocks.append(replace(block, fields=np.zeros((0, 0))))
+
+    def _terms(self, block: Evaluations) -> Iterator[FloatArray]:
+        if block.fields.size == 0:
+            return
+        if self._compact is None:
+            yield block.fields
+            return
+        solved = block.points[block.ok]
+        for point, rows in zip(solved, np.split(block.fields, len(solved)), strict=True):
+            yield self._compact.term(point, rows)
 
     def result(self) -> Evaluations:
         """Return everything added so far as one."""
@@ -353,5 +407,7 @@ class Merger:
             tuple(self._failures),
             np.concatenate(list(joined(lambda b: b.seconds))),
             np.concatenate([b.work for b in self._blocks]),
+            np.concatenate(list(joined(lambda b: b.residuals))),
+            np.concatenate([b.converged for b in self._blocks]),
             self._fields,
         )

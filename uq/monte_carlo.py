@@ -82,7 +82,9 @@ class SensitivityMonteCarlo(MonteCarlo):
     Parameters
     ----------
     coefficient
-        "one", or "optimal": β = Cov(ψ, L)/Var L estimated on the samples.
+        "one", or "optimal": β = Cov(ψ, L)/Var L estimated on the samples that it corrects, which has a bias of order
+        1/n: on a product of three functions 95 % intervals of the variance cover 89, 92, 93 and 95 % with 100, 200, 400
+        and 1000 samples (those of "one": 93 to 95 %).
     second_moment
         "quadratic" controls it by the square of the tangent, "linear" is the published form.
     """

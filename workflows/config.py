@@ -17,6 +17,8 @@ from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
+from uq.multilevel_chaos import MultilevelChaos
+from uq.quasi_monte_carlo import QuasiMonteCarlo
 
 Method = Annotated[Sampling | LocalSensitivity | Compare, Field(discriminator="kind")]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
@@ -132,11 +134,24 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            objection = self.method.objection(inputs) if isinstance(self.method, Chaos | Compare) else None
+            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo | Compare
+            objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
-        if isinstance(self.method, Compare) and isinstance(self.method.reference, Given):
-            given, outputs = self.method.reference.values, [output.name for output in self.model.outputs]
+        if isinstance(self.method, MultilevelChaos):
+            shortage = self.method.shortage(len(self.parameters))
+            if shortage is not None:
+                yield ("method", "samples"), shortage, self.method.samples
+        if isinstance(self.method, Compare):
+            yield from self._compare_mistakes(self.method)
+
+    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        for i, entry in enumerate(method.methods):
+            shortage = entry.shortage(len(self.parameters))
+            if shortage is not None:
+                yield ("method", "methods", i, "budgets"), shortage, list(entry.budgets)
+        if isinstance(method.reference, Given):
+            given, outputs = method.reference.values, [output.name for output in self.model.outputs]
             if set(given) != set(outputs):
                 message = f"expected values of every output: {', '.join(outputs)}"
                 yield ("method", "reference", "values"), message, list(given)

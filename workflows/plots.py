@@ -140,6 +140,26 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw the residuals of the samples and the change of the moments, level by level."""
+    ax = ax or _axes()
+    places = dataset["level"].to_numpy()
+    for name, label, colour, dash in (
+        ("level_residual", "largest residual", CONTROLLED, "-"),
+        ("level_residual_median", "median residual", CONTROLLED, ":"),
+        ("level_change", "change of the moments", HIGH, "-"),
+    ):
+        values = dataset[name].to_numpy()
+        ax.plot(places, np.where(values > 0, values, np.nan), dash, color=colour, marker="o", markersize=4, label=label)
+    if bool((dataset["level_residual"] > 0).any() | (dataset["level_change"] > 0).any()):
+        ax.set_yscale("log")
+    ax.set_xticks(places)
+    ax.set_xlabel("level")
+    ax.set_ylabel("relative residual, relative change")
+    ax.legend()
+    return ax
+
+
 def comparison(
     datasets: Mapping[str, xr.Dataset], output: str, estimated: Estimated = "mean", ax: Axes | None = None
 ) -> Axes:

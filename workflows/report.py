@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
@@ -108,6 +109,9 @@ def _context(results: Results) -> dict[str, Any]:
         "gains": list(tables.gains(dataset)),
         "quantiles": tables.quantiles(results) if sampled else None,
         "expansion": tables.expansion(results) if "multi_index" in dataset else None,
+        "levels": tables.levels(results) if "level" in dataset.dims else None,
+        "controlled": tables.controlled(results) if "level" in dataset.dims else None,
+        "levels_drawn": [_picture(plots.levels(dataset), LEVELS_DRAWN)] if "level" in dataset.dims else [],
         "sobol": [(o, tables.sobol(results, o)) for o in results.outputs] if "sobol_first" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
         "field_lines": field_lines,

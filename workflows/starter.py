@@ -71,7 +71,7 @@ fields = true         # mean and standard deviation of the displacement at every
 kind = "quasi-monte-carlo"
 samples = 256         # scrambles × a power of two; or tolerance = 0.001, or budget_seconds = 600: whichever comes first
 scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
-control = "tangent"   # or "none", or "quadratic": two more solves for each parameter
+control = "tangent"   # or "none"; "quadratic": two more solves for each parameter; "chaos": a fit to samples of its own
 coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
@@ -85,6 +85,18 @@ fit = "regression"    # or "projection": (max_order + 2)^d Gauss points and no s
 seed = 1
 quantiles = [0.05, 0.5, 0.95]
 fields = true         # expand the displacement at every node
+""",
+    "multilevel-chaos": """\
+kind = "multilevel-chaos"
+iterations = 2        # of the solver for each sample of a level
+tolerance = 1e-3      # relative change of the moments from level to level
+order = 3             # of the expansion
+samples = 32          # of each level; by default three for each term and more
+max_levels = 10
+first = "tangent"     # where the first level starts; or "mean": the state at the mean parameters, as published
+seed = 1
+quantiles = [0.05, 0.5, 0.95]
+fields = true         # mean, standard deviation and expansion of the displacement at every node
 """,
     "compare": """\
 kind = "compare"

@@ -115,6 +115,13 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
             f"a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
             hurts=False,
         )
+    if "control_samples" in dataset:
+        error, fitted = number(float(dataset["loo_error"].max()), 2), int(dataset["control_samples"])
+        yield Gain(
+            f"The control variate is an expansion fitted to {fitted} samples of its own, with a leave-one-out "
+            f"error of at most {error} standard deviations.",
+            hurts=False,
+        )
     for output in dataset["output"].values:
         mean, std = (float(dataset[name].sel(output=output)) for name in ("variance_ratio", "std_variance_ratio"))
         text = (
@@ -152,6 +159,39 @@ def expansion(results: Results) -> Table:
         for output in results.outputs
     ]
     return Table(("output", "order", "terms", "samples", "leave-one-out error / standard deviation"), rows)
+
+
+def levels(results: Results) -> Table:
+    """What the levels of multilevel chaos have cost and reached."""
+    rows = []
+    for k in results.dataset["level"].to_numpy():
+        level = results.dataset.sel(level=k)
+        work = {str(name): int(level["level_work"].sel(operation=name)) for name in level["operation"].to_numpy()}
+        iterations = int(level["level_iterations"])
+        rows.append(
+            (
+                f"{k}",
+                f"{iterations}" if iterations else "to the tolerance",
+                f"{int(level['level_solves'])}",
+                f"{int(level['level_converged'])}",
+                number(float(level["level_residual"]), 2),
+                number(float(level["level_residual_median"]), 2),
+                number(float(level["level_change"]), 2),
+                *(f"{work[name]:,}" for name in ("residuals", "back_substitutions", "factorisations")),
+            )
+        )
+    head = (
+        *("level", "iterations", "samples", "at equilibrium", "largest residual", "median residual"),
+        *("change of the moments", "residuals", "back-substitutions", "factorisations"),
+    )
+    return Table(head, rows)
+
+
+def controlled(results: Results) -> Table:
+    """Moments from the samples of the last level, with the expansion of the level before as control variate."""
+    names = ("control_mean", "control_std")
+    rows = [(output, *(results.estimate(output, name) for name in names)) for output in results.outputs]
+    return Table(("output", "mean", "standard deviation"), rows)
 
 
 def sobol(results: Results, output: str) -> Table:
