@@ -143,6 +143,20 @@ def test_a_method_makes_the_reference():
     assert abs(float(found["std"][0]) - STD) < 1e-9
 
 
+def test_every_sampling_method_can_be_compared():
+    method = comparison(
+        {**SOBOL, "name": "with chaos", "control": "chaos", "budgets": (32, 64)},
+        {"kind": "chaos", "gradients": False, "budgets": (10, 20)},
+        {"kind": "multilevel-chaos", "order": 4, "budgets": (32, 64)},
+        repeats=2,
+    )
+    recorder = Recorder(serial())
+    found = method.run(INPUTS, recorder)
+    assert recorder.solves <= method.planned(2)
+    assert (found["mean_rmse"].sel(output="f") < 0.05).all()
+    assert set(found["estimator"].to_numpy()) == {"with chaos", "chaos", "multilevel-chaos"}
+
+
 def test_points_are_solved_once_and_charged_to_all():
     points = []
 
@@ -265,6 +279,10 @@ def test_a_study_survives_its_own_dump():
         ({"methods": [{"kind": "chaos", "budgets": [16], "ordr": 3}]}, "method.methods[0].ordr: unknown key"),
         ({"methods": [{"kind": "chas", "budgets": [16]}]}, "method.methods[0]: input tag 'chas'"),
         ({"methods": [{"kind": "chaos", "fit": "projection", "budgets": [9]}]}, "expected none: a projection takes"),
+        (
+            {"methods": [{"kind": "multilevel-chaos", "order": 4, "budgets": [8, 32]}]},
+            "method.methods[0].budgets: an expansion of order 4 in 2 parameters has 15 terms, expected more samples",
+        ),
         ({"methods": []}, "method: gives no methods, expected at least one"),
         ({"methods": [PLAIN, PLAIN]}, "method: 2 methods are called 'monte-carlo', expected different names"),
         (
