@@ -39,6 +39,7 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
         "local-sensitivity",
         "chaos",
         "multilevel-chaos",
+        "compare",
     ],
 )
 def test_starters_are_valid(kind):

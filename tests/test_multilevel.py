@@ -366,8 +366,8 @@ def test_same_numbers_as_in_one_process_and_after_an_interruption(tmp_path):
 
 def test_the_plan_names_every_mesh():
     planned = load(ROOT / "configs" / "beam-multilevel.toml")
-    assert [model.unknowns for model in planned.models] == [585, 3375, 22491]
-    assert planned.models[1].body.cells == (12, 2, 4)
+    assert [model.unknowns for model in planned.meshes] == [585, 3375, 22491]
+    assert planned.meshes[1].body.cells == (12, 2, 4)
     text = "\n".join(plan(planned))
     assert "3,375 on mesh 1" in text
     assert "22,491 on mesh 2" in text
@@ -458,7 +458,7 @@ def test_estimates_are_those_of_solves_on_both_meshes(small):
 
     data = read_dataset(small / "out")
     case = load(small / "small.toml", ["model.body.cells=[2,1,1]"])
-    coarse, fine = (model.build(MPI.COMM_SELF, case.inputs.names) for model in case.models)
+    coarse, fine = (model.build(MPI.COMM_SELF, case.inputs.names) for model in case.meshes)
     assert fine.spec.body.cells == (4, 2, 2)
     mean = case.inputs.mean
     at_mean = [model.solve(mean) for model in (coarse, fine)]

@@ -73,7 +73,7 @@ class Chaos(Amount):
     seed
         Seed of the design; sample z of a seed is the same in every study.
     quantiles
-        Probabilities of the quantiles of the outputs.
+        Probabilities of the quantiles of the outputs; without any there are no densities either.
     fields
         Whether the displacement field is expanded too, node by node.
     """
@@ -733,20 +733,12 @@ def expansion_dataset(
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
     )
-    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
-    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
-    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
     by_output, by_pair = ("output",), ("output", "parameter")
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
     dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
         {
             **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
-            "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
-            # No quantile moves by more than the function does.
-            "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
-            "density": (("output", "bin"), np.array([density for density, _ in counts])),
-            "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
             "ok": (("sample",), evaluations.ok),
@@ -760,6 +752,8 @@ def expansion_dataset(
             "range_upper": (("parameter",), upper),
         }
     )
+    if method.quantiles:
+        dataset = dataset.assign(_distribution(method, inputs, basis, fit))
     if evaluations.fields.size and method.fields:
         fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
         dataset = dataset.assign(fields)
@@ -771,6 +765,22 @@ def expansion_dataset(
             "continues them to where the model has no answer"
         )
     return dataset
+
+
+def _distribution(
+    method: Report, inputs: Inputs, basis: Basis, fit: Fit
+) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Quantiles and densities of the outputs, from many points of the expansion."""
+    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
+    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
+    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
+    return {
+        "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
+        # No quantile moves by more than the function does.
+        "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
+        "density": (("output", "bin"), np.array([density for density, _ in counts])),
+        "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
+    }
 
 
 def _field_estimates(

@@ -17,12 +17,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Coefficient = Literal["one", "optimal"]
 SecondMoment = Literal["quadratic", "linear"]
@@ -350,3 +353,12 @@ def _around(values: FloatArray, p: FloatArray, spread: FloatArray) -> FloatArray
     upper = np.quantile(values, np.minimum(p + spread, 1), axis=0)
     lower = np.quantile(values, np.maximum(p - spread, 0), axis=0)
     return np.asarray((upper - lower) / 2)
+
+
+def half_width(dataset: xr.Dataset) -> float:
+    """Standard errors on either side of a 95 % interval of results: more where they come from a few scrambles."""
+    if "scramble" not in dataset:
+        return 1.96
+    from scipy.special import stdtrit
+
+    return float(stdtrit(int(dataset["scramble"].max()), 0.975))

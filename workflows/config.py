@@ -13,24 +13,15 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.chaos import Chaos
+from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 from uq.multilevel import MultilevelMonteCarlo
 from uq.multilevel_chaos import MultilevelChaos
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 
-Method = Annotated[
-    MonteCarlo
-    | SensitivityMonteCarlo
-    | QuasiMonteCarlo
-    | MultilevelMonteCarlo
-    | LocalSensitivity
-    | Chaos
-    | MultilevelChaos,
-    Field(discriminator="kind"),
-]
+Method = Annotated[Sampling | MultilevelMonteCarlo | LocalSensitivity | Compare, Field(discriminator="kind")]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -93,10 +84,21 @@ class Study(Settings):
         return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
+    def meshes(self) -> tuple[Hyperelastic, ...]:
+        """The model, and the same on the finer meshes that a multilevel method may use."""
+        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
+        return self.model, *(self.model.refined(level) for level in range(1, levels))
+
+    @property
     def models(self) -> tuple[Hyperelastic, ...]:
-        """The model, and the same on the finer meshes that the method may use."""
-        meshes = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
-        return self.model, *(self.model.refined(level) for level in range(1, meshes))
+        """The models that the method may ask for, in the order of their numbers."""
+        if not isinstance(self.method, Compare):
+            return self.meshes
+        solver = self.model.solver
+        tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
+        tight, textbook = (solver.model_copy(update=change) for change in (tolerances, {"kind": "newton"}))
+        others = [self.model.model_copy(update={"solver": changed}) for changed in (tight, textbook)]
+        return self.model, *others, *([self.model.refined(1)] if self.method.mesh_error else [])
 
     @property
     def planned(self) -> int:
@@ -130,7 +132,7 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo
+            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo | Compare
             objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
@@ -138,6 +140,8 @@ class Study(Settings):
             shortage = self.method.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:
                 yield ("method", "samples"), shortage, self.method.samples
+        if isinstance(self.method, Compare):
+            yield from self._compare_mistakes(self.method)
 
     def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         scalars = self.model.scalars
@@ -163,6 +167,17 @@ class Study(Settings):
                     message = f"reaches {end:.4g}, where the model is impossible ({objection})"
                     yield ("parameters", path), message, distribution.model_dump()
                     break
+
+    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        for i, entry in enumerate(method.methods):
+            shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
+            if shortage is not None:
+                yield ("method", "methods", i, "budgets"), shortage, list(entry.budgets)
+        if isinstance(method.reference, Given):
+            given, outputs = method.reference.values, [output.name for output in self.model.outputs]
+            if set(given) != set(outputs):
+                message = f"expected values of every output: {', '.join(outputs)}"
+                yield ("method", "reference", "values"), message, list(given)
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
@@ -314,7 +329,7 @@ def _kinds() -> set[str]:
 
     unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
+    return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 
 
-_TAGS = _kinds()
+_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

@@ -16,8 +16,9 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     method, body = study.method, study.model.body
     textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
-    sizes = [model.unknowns for model in study.models]
+    sizes = [model.unknowns for model in study.meshes]
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
+    memory = sum(bytes_per_model(model.unknowns) for model in study.models)
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
     edge = body.longest_edge
@@ -43,7 +44,7 @@ def plan(study: Study, groups: int = 1) -> list[str]:
         f"parameters  {', '.join(names)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
-        f"memory      about {sum(map(bytes_per_model, sizes)) / 2**20:,.0f} MiB for each group of ranks",
+        f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
         *(

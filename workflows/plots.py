@@ -13,16 +13,19 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from uq.moments import Coefficient, Moments, estimate, monomials
+from uq.moments import Coefficient, Moments, estimate, half_width, monomials
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+Estimated = Literal["mean", "std"]
+Cost = Literal["solves", "cpu_seconds"]
 FIRST_SHOWN = 8  # estimates from fewer samples say nothing
 BARS = 15  # parameters that a tornado chart shows
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
+METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6b", "#b08900", "#1d9aa8", "#5b4636")
 LOW, HIGH = "#0b6bb8", "#d1622b"
 
 
@@ -56,21 +59,12 @@ def running_estimates(
     return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
 
 
-def band(dataset: xr.Dataset) -> float:
-    """Standard errors on either side of a 95 % confidence band: more where they come from a few scrambles."""
-    if "scramble" not in dataset:
-        return 1.96
-    from scipy.special import stdtrit
-
-    return float(stdtrit(int(dataset["scramble"].max()), 0.975))
-
-
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
     ax = ax or _axes()
     series = _series(dataset, output)
     for label, colour, counts, mean, error in series:
-        half = band(dataset) * error
+        half = half_width(dataset) * error
         ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
         ax.plot(counts, mean, color=colour, label=label)
     _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
@@ -167,7 +161,7 @@ def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
 
 
 def comparison(
-    datasets: Mapping[str, xr.Dataset], output: str, estimated: Literal["mean", "std"] = "mean", ax: Axes | None = None
+    datasets: Mapping[str, xr.Dataset], output: str, estimated: Estimated = "mean", ax: Axes | None = None
 ) -> Axes:
     """Draw an estimate of several studies, each with its 95 % confidence interval.
 
@@ -186,7 +180,7 @@ def comparison(
     ax = ax or _axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
-    errors = [band(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
+    errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
     ax.set_yticks(places, [_text(name) for name in shown])
     ax.set_ylim(-0.6, len(shown) - 0.4)
@@ -300,6 +294,81 @@ def _log2(
     ax.plot(levels[some], np.log2(np.abs(values[some])), color=colour, marker="o", linestyle=linestyle, label=label)
 
 
+def errors(
+    dataset: xr.Dataset,
+    output: str,
+    estimated: Estimated = "mean",
+    against: Cost = "solves",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the root mean square error of each method of a comparison against its cost, both logarithmic.
+
+    Hollow markers are errors that the reference cannot resolve; dashed lines over the solves are the fitted rates.
+
+    Parameters
+    ----------
+    dataset
+        Results of ``method.kind = "compare"``.
+    output
+        Name of the output.
+    estimated
+        The mean or the standard deviation.
+    against
+        The number of solves, or the processor time, which has the plain method by the textbook too.
+    ax
+        Where to draw.
+    """
+    ax = ax or _axes(height=4.2, width=8.6)
+    of_output = dataset.sel(output=output)
+    costs, rmse, rows = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
+    resolved, scatter = (of_output[f"{estimated}_{name}"].to_numpy() for name in ("resolved", "rmse_error"))
+    names = [
+        name
+        for name in of_output["estimator"].to_numpy().tolist()
+        if against == "cpu_seconds" or not of_output["derived"].to_numpy()[rows == name].all()
+    ]
+    for i, name in enumerate(names):
+        colour = METHOD_COLOURS[i % len(METHOD_COLOURS)]
+        mine = (rows == name) & (rmse > 0)
+        good = mine & resolved
+        ax.errorbar(costs[mine], rmse[mine], yerr=scatter[mine], fmt="none", ecolor=colour, capsize=2)
+        ax.plot(costs[mine], rmse[mine], color=colour, linewidth=0, marker="o", markerfacecolor="white")
+        label = _text(name)
+        if against == "cpu_seconds":
+            ax.plot(costs[mine], rmse[mine], color=colour, linewidth=1)
+        elif good.sum() > 1:
+            rate = float(of_output[f"{estimated}_rate"].sel(estimator=name))
+            logarithms = np.log(costs[good])
+            fitted = np.exp(np.log(rmse[good]).mean() + rate * (logarithms - logarithms.mean()))
+            ax.plot(costs[good], fitted, color=colour, linestyle="--", linewidth=1)
+            label += f" (rate {rate:.2f})".replace("-", "−")
+        ax.plot(costs[good], rmse[good], color=colour, linewidth=0, marker="o", label=label)
+    shown = costs[np.isin(rows, names)]
+    ends = np.array([shown.min() / 1.3, shown.max() * 1.3])
+    each = 1.0 if against == "solves" else float(of_output["plain_seconds"])
+    if np.isfinite(each):
+        line = float(of_output[f"{estimated}_single"]) * np.sqrt(each / ends)
+        ax.plot(ends, line, color=DARK, linewidth=0.8, linestyle=":", label="plain Monte Carlo, exactly")
+    reference = float(of_output[f"{estimated}_error"])
+    lowest = min([*rmse[rmse > 0], *([reference] if reference > 0 else [])], default=1.0) / 3
+    if reference > 0:
+        ax.axhspan(lowest, reference, color=PLAIN, alpha=0.25, linewidth=0, label="error of the reference")
+    floors = {"solver_error": "error of the solver", "mesh_error": "error of the mesh, of the mean"}
+    for (floor, label), style in zip(floors.items(), ("-.", "-"), strict=True):
+        size = float(of_output[floor])
+        if size > lowest and (estimated == "mean" or floor == "solver_error"):
+            ax.axhline(size, color=DARK, linewidth=1, linestyle=style, label=label)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(*ends)
+    ax.set_ylim(bottom=lowest)
+    ax.set_xlabel({"solves": "solves, set-up charged", "cpu_seconds": "processor time (s), set-up charged"}[against])
+    word = {"mean": "mean", "std": "standard deviation"}[estimated]
+    ax.set_ylabel(f"RMSE of the {word} of {_quantity(dataset, output)}")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1), frameon=False, fontsize="small")
+    return ax
+
+
 def png(ax: Axes) -> bytes:
     """Return the whole figure of axes as a PNG file."""
     file = io.BytesIO()
@@ -309,12 +378,12 @@ def png(ax: Axes) -> bytes:
     return file.getvalue()
 
 
-def _axes(height: float = 3.2) -> Axes:
+def _axes(height: float = 3.2, width: float = 5.4) -> Axes:
     """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.4, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     ax: Axes = figure.add_subplot()
     ax.spines[["top", "right"]].set_visible(False)

@@ -103,6 +103,8 @@ def _context(results: Results) -> dict[str, Any]:
         "model": list(model_in_words(results.study)),
         "parameters": tables.parameters(results),
         "nominal": tables.nominal(results),
+        "references": tables.references(results) if "row_method" in dataset else None,
+        "errors": [(o, _errors(results, o)) for o in results.outputs] if "row_method" in dataset else [],
         "moments": tables.moments(results) if "mean" in dataset else None,
         "gains": list(tables.gains(dataset)),
         "quantiles": tables.quantiles(results) if "quantiles" in dataset else None,
@@ -153,6 +155,23 @@ def _differences(results: Results, output: str) -> tuple[str, str, Table, list[P
         _picture(plots.mesh_cost(dataset, output), "Predicted time of sampling, without linearisations."),
     ]
     return output, tables.rates(results, output), tables.differences(results, output), pictures
+
+
+def _errors(results: Results, output: str) -> list[tuple[str, tables.Table, list[Picture]]]:
+    """Tables and pictures of a comparison of methods."""
+    costs: dict[str, plots.Cost] = {"the number of solves": "solves", "processor time": "cpu_seconds"}
+    words: dict[str, plots.Estimated] = {"mean": "mean", "standard deviation": "std"}
+    shown = []
+    for word, estimated in words.items():
+        pictures = [
+            _picture(
+                plots.errors(results.dataset, output, estimated, against),
+                f"Error of the {word} of {output} against {cost}.",
+            )
+            for cost, against in costs.items()
+        ]
+        shown.append((word, tables.errors(results, output, estimated), pictures))
+    return shown
 
 
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the part of summary.json that follows from the results: `outputs` and `local`."""
+    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`."""
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
     if "mean" in dataset:
@@ -105,7 +106,46 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
                 }
                 for output in outputs
             }
+    if "row_method" in dataset:
+        summary["methods"] = _methods(dataset)
     return summary
+
+
+def _methods(dataset: xr.Dataset) -> dict[str, list[dict[str, Any]]]:
+    """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
+    gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
+    methods: dict[str, list[dict[str, Any]]] = {}
+    for i, name in enumerate(dataset["row_method"].to_numpy().tolist()):
+        row = dataset.isel(row=i)
+        outputs = {
+            str(output): {
+                estimated: {
+                    "rmse": _number(of_output[f"{estimated}_rmse"]),
+                    "rmse_error": _number(of_output[f"{estimated}_rmse_error"]),
+                    "resolved": bool(of_output[f"{estimated}_resolved"]),
+                    "claimed": _number(of_output[f"{estimated}_claimed"]),
+                    "coverage": _number(of_output[f"{estimated}_coverage"]),
+                    "understated": bool(of_output[f"{estimated}_understated"]),
+                    **{
+                        f"gain_{key}": _number(g.isel(row=i).sel(output=output)) for key, g in gained[estimated].items()
+                    },
+                }
+                for estimated in ESTIMATED
+            }
+            for output in dataset.output.values
+            for of_output in [row.sel(output=output)]
+        }
+        methods.setdefault(name, []).append(
+            {
+                "cost": int(row["solves"]),
+                "cpu_seconds": float(row["cpu_seconds"]),
+                "error": next(iter(outputs.values()))["mean"]["rmse"],
+                "budget": int(row["budget"]),
+                "derived": bool(row["derived"]),
+                "outputs": outputs,
+            }
+        )
+    return methods
 
 
 def _number(value: Any) -> float | None:

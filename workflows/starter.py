@@ -109,6 +109,23 @@ seed = 1
 quantiles = [0.05, 0.5, 0.95]
 fields = true         # mean, standard deviation and expansion of the displacement at every node
 """,
+    "compare": """\
+kind = "compare"
+repeats = 20          # independent repeats of every method: errors are known to 16 %
+seed = 1
+textbook = 8          # draws that are also solved by Newton's method from zero: what plain Monte Carlo would cost so
+mesh_error = false    # true: solve once with twice the cells in each direction
+# A method, solved to tighter tolerances, or { kind = "given", values = { sag = { mean = ..., std = ... }, ... } }:
+reference = { kind = "chaos", fit = "projection", max_order = 8 }
+# Blocks of methods, with the numbers of samples that they are run with:
+methods = [
+    { kind = "monte-carlo", budgets = [16, 64, 256] },
+    { kind = "sensitivity-monte-carlo", budgets = [16, 64, 256] },
+    { name = "tangent", kind = "quasi-monte-carlo", control = "tangent", budgets = [64, 256] },
+    { name = "quadratic", kind = "quasi-monte-carlo", control = "quadratic", budgets = [64, 256] },
+    { kind = "chaos", max_order = 4, budgets = [5, 10, 15] },
+]
+""",
     "local-sensitivity": """\
 kind = "local-sensitivity"
 """,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from forward.finite_element import HyperelasticModel
     from forward.model import FloatArray
+    from uq.checkpoint import Checkpoint
     from uq.inputs import Inputs
 
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
@@ -68,8 +69,6 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     """
     from mpi4py import MPI
 
-    from workflows.report import write_report
-
     world = MPI.COMM_WORLD
     begin = time.monotonic()
     refusal, finished = None, None
@@ -84,7 +83,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     if finished is not None:
         if world.rank == 0:
             if not (directory / "report.html").exists():
-                write_report(directory)
+                _report(directory)
             if not quiet:
                 sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
@@ -106,7 +105,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
         recorders.append(Recorder(evaluate))
         return study.method.run(inputs, recorders[0])
 
-    others = [partial(finer.build, ensemble.group, inputs.names) for finer in study.models[1:]]
+    others = [partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]]
     dataset = ensemble.run(model, task, others=others, checkpoint=checkpoint, progress=progress)
     if dataset is None:
         return DONE
@@ -114,20 +113,33 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
     dataset = with_random_fields(dataset, factors, model.variance_kept)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
-    write_dataset(directory / "results.nc", dataset)
-    write_fields(directory / "fields", dataset)
     evaluations = merge(recorders[0].log)
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
-    if others:
+    if len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, recorders[0])
+    _leave(directory, dataset, evaluations, summary, checkpoint)
+    if not quiet:
+        sys.stdout.write(_closing_words(directory, dataset, summary))
+    return PARTIAL if summary["failed"] else DONE
+
+
+def _leave(
+    directory: Path, dataset: xr.Dataset, evaluations: Evaluations, summary: dict[str, Any], checkpoint: Checkpoint
+) -> None:
+    """Write all results, in an order that a kill cannot spoil."""
+    write_dataset(directory / "results.nc", dataset)
+    write_fields(directory / "fields", dataset)
     checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
+    _report(directory)
+
+
+def _report(directory: Path) -> None:
+    from workflows.report import write_report
+
     write_report(directory)
-    if not quiet:
-        sys.stdout.write(_closing_words(directory, dataset, summary))
-    return PARTIAL if summary["failed"] else DONE
 
 
 def _identity(study: Study) -> dict[str, Any]:
@@ -243,7 +255,7 @@ def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
         parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
         seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
         solves = sum(len(part.points) for part in parts)
-        found.append({"unknowns": study.models[number].unknowns, "solves": solves, "cpu_seconds": seconds})
+        found.append({"unknowns": study.meshes[number].unknowns, "solves": solves, "cpu_seconds": seconds})
     return found
 
 
@@ -284,6 +296,13 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
             lines[-1] += (
                 f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
             )
+    first = next(iter(dataset.output.values))
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
+        )
     if not lines:
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)

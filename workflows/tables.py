@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from uq.compare import gains as gains_of
+from uq.compare import plain_samples
+from uq.moments import half_width
 from workflows.config import Study
-from workflows.plots import band
 from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
 
 if TYPE_CHECKING:
@@ -124,7 +127,7 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
         yield Gain(
             f"Errors are from the scatter of {R} independent scrambles, and so known to {spread} % or so when squared; "
-            f"a 95 % interval is ± {number(band(dataset), 3)} of them.",
+            f"a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
             hurts=False,
         )
     if "control_samples" in dataset:
@@ -352,6 +355,68 @@ def provenance(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     ranks, groups = found["ranks"], found["groups"]
     yield "ranks", f"{ranks} in {groups} group{'s' if groups > 1 else ''}, {found['processor']}"
     yield "versions", ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+
+
+def references(results: Results) -> Table:
+    """What methods are compared with, and what the solver and the mesh leave of it."""
+    rows = []
+    for output in results.outputs:
+        of_output, unit = results.dataset.sel(output=output), results.unit(output)
+        floors = (with_unit(number(float(of_output[f"{name}_error"]), 2), unit) for name in ("solver", "mesh"))
+        rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
+    return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
+
+
+def errors(results: Results, output: str, estimated: str) -> Table:
+    """What each method errs and costs at each budget, for one estimate of an output."""
+    dataset = results.dataset.sel(output=output)
+    scale = abs(float(dataset[estimated]))
+    plain, gained = plain_samples(dataset, estimated).to_numpy(), gains_of(dataset, estimated)
+    methods = dataset["row_method"].to_numpy().tolist()
+    rates = {}
+    for name in dataset["estimator"].to_numpy().tolist():
+        of_method = dataset.sel(estimator=name)
+        rates[name] = with_error(*(float(of_method[f"{estimated}_rate{end}"]) for end in ("", "_error")))
+    rows = []
+    for i, name in enumerate(methods):
+        row = dataset.isel(row=i)
+        rmse, resolved = float(row[f"{estimated}_rmse"]), bool(row[f"{estimated}_resolved"])
+        coverage = NONE
+        if resolved:
+            coverage = f"{100 * float(row[f'{estimated}_coverage']):.0f} %"
+            coverage += " (understated)" if bool(row[f"{estimated}_understated"]) else ""
+        bound = "" if resolved else "≥ "
+        ratios = [plain[i], *(float(gain[i]) for gain in gained.values())]
+        rows.append(
+            (
+                name,
+                f"{int(row['budget']):,}",
+                f"{int(row['solves']):,}",
+                duration(float(row["cpu_seconds"])),
+                number(rmse, 2) + ("" if resolved else " (not resolved)"),
+                number(rmse / scale if scale else float("nan"), 2),
+                number(float(row[f"{estimated}_claimed"]), 2),
+                coverage,
+                *(NONE if math.isnan(ratio) else bound + number(ratio, 2) for ratio in ratios),
+                rates[name] if name not in methods[i + 1 :] else "",
+            )
+        )
+    head = (
+        "method",
+        "samples",
+        "solves",
+        "CPU time",
+        with_unit("RMSE", f"({results.unit(output)})"),
+        "relative",
+        "claimed",
+        "coverage",
+        "plain samples for this error",
+        "gain in solves",
+        "gain in CPU time",
+        "gain over the textbook",
+        "rate",
+    )
+    return Table(head, rows)
 
 
 def costs(studies: dict[str, Results]) -> Table:

@@ -93,7 +93,7 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     model = study.model
     body = model.body
     cells = " × ".join(f"{n}" for n in body.cells)
-    coarsest = " on the coarsest mesh" if len(study.models) > 1 else ""
+    coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
