@@ -7,7 +7,6 @@ import sys
 from benchmarks import (
     bookkeeping,
     chaos,
-    coverage,
     fields,
     levels,
     realisation,
@@ -27,7 +26,6 @@ ALL = {
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,
-    "coverage": coverage.main,
 }
 
 
