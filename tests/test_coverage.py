@@ -15,7 +15,6 @@ from uq.inputs import Inputs
 from uq.linearisation import linearise
 from uq.moments import estimate, monomials
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.quasi_monte_carlo import QuasiMonteCarlo
 
 INPUTS = Inputs({name: Uniform(lower=0.0, upper=1.0) for name in "abc"})
 MODEL = FunctionModel(
@@ -51,11 +50,8 @@ def coverage(found, freedom):
     [
         (MonteCarlo(samples=200, fields=False), 199),
         (SensitivityMonteCarlo(samples=200, fields=False), 199),
-        (QuasiMonteCarlo(samples=256, fields=False, control="none"), 15),
-        (QuasiMonteCarlo(samples=256, fields=False, control="tangent"), 15),
-        (QuasiMonteCarlo(samples=256, fields=False, control="quadratic"), 15),
     ],
-    ids=("plain", "tangent", "Sobol", "Sobol tangent", "Sobol quadratic"),
+    ids=("plain", "tangent"),
 )
 def test_intervals_cover(method, freedom):
     mean, variance = coverage(repeats(method), freedom)
@@ -118,9 +114,9 @@ def test_a_running_mean_in_the_second_moment_is_noticed(monkeypatch):
         found = exact(sums, n, *rest)
         return replace(found, std=np.sqrt(np.maximum(found.std**2 - found.mean_error**2, 0)))
 
-    assert is_unbiased(repeats(method, 1000)[1])
+    assert is_unbiased(repeats(method, 400)[1])
     monkeypatch.setattr(monte_carlo, "estimate", running)
-    assert not is_unbiased(repeats(method, 1000)[1])
+    assert not is_unbiased(repeats(method, 400)[1])
 
 
 def test_a_coefficient_fitted_to_the_samples_it_corrects_is_noticed():

@@ -346,6 +346,7 @@ if data is not None:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.mpi
 def test_same_numbers_as_in_one_process_and_after_an_interruption(tmp_path):
     """On 1, 2 and 3 groups; between them, the last blocks are lost: all others are found again."""
