@@ -114,9 +114,9 @@ def test_a_running_mean_in_the_second_moment_is_noticed(monkeypatch):
         found = exact(sums, n, *rest)
         return replace(found, std=np.sqrt(np.maximum(found.std**2 - found.mean_error**2, 0)))
 
-    assert is_unbiased(repeats(method, 400)[1])
+    assert is_unbiased(repeats(method, 1000)[1])
     monkeypatch.setattr(monte_carlo, "estimate", running)
-    assert not is_unbiased(repeats(method, 400)[1])
+    assert not is_unbiased(repeats(method, 1000)[1])
 
 
 def test_a_coefficient_fitted_to_the_samples_it_corrects_is_noticed():
