@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -29,6 +29,7 @@ from forward.model import FloatArray, ForwardModel, Solution, SolveError
 from forward.settings import Settings
 from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
 from uq.evaluate import Evaluate, Evaluations, Request, merge
+from uq.indices import Analysis, moments_and_indices
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.sampling import sobol_points
@@ -124,6 +125,10 @@ class Chaos(Settings):
         ValueError
             If the parameters are correlated.
         """
+        return self.dataset(inputs, evaluate, self.expand(inputs, evaluate))
+
+    def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
+        """Solve at the points of the design and fit; errors as of `run`."""
         objection = self.objection(inputs)
         if objection is not None:
             raise ValueError(objection)
@@ -169,7 +174,22 @@ class Chaos(Settings):
                 stopped = f"tolerance {self.tolerance:g} not met after all {count} samples: {stopped}"
                 break
             target = min(limit, int(np.ceil(GROWTH * count)))
-        return _dataset(self, inputs, evaluate, centre, evaluations, largest, data, fitted, stopped)
+        return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
+
+    def dataset(self, inputs: Inputs, evaluate: Evaluate, expanded: Expanded) -> xr.Dataset:
+        """Return what `run` does, from an expansion by this method."""
+        regression = expanded.regression
+        return _dataset(
+            self,
+            inputs,
+            evaluate,
+            expanded.centre,
+            expanded.evaluations,
+            regression.largest,
+            regression.data,
+            regression.fit,
+            expanded.stopped,
+        )
 
 
 # --- design and candidates -----------------------------------------------------------------------------------------
@@ -416,6 +436,73 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
 
 
 @dataclass(frozen=True)
+class Regression:
+    """A fit to samples and what it was chosen from.
+
+    Attributes
+    ----------
+    inputs
+        The parameters.
+    candidates, largest
+        The sets of functions that were tried, and the basis of all of them.
+    data
+        The samples that have an answer.
+    fit
+        The fit.
+    """
+
+    inputs: Inputs
+    candidates: _Candidates
+    largest: Basis
+    data: _Data
+    fit: _Fit
+
+    @classmethod
+    def of(
+        cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int
+    ) -> Regression:
+        """Fit to values (n, m) and, where they are given, tangents (n, m, d) at points (n, d).
+
+        Raises
+        ------
+        SolveError
+            If there are not enough samples.
+        """
+        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
+        data = _Data(points, values, slopes, np.ones(len(points)))
+        rows = len(points) * _rows(inputs, gradients=slopes is not None)
+        candidates = _candidates(inputs, max_order, rows, DICTIONARY)
+        largest = orthonormal(inputs, candidates.all)
+        return cls(inputs, candidates, largest, data, _fit(candidates, largest, data))
+
+    def first(self, count: int) -> Regression:
+        """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
+        d = self.data
+        slopes = None if d.slopes is None else d.slopes[:count]
+        data = _Data(d.points[:count], d.values[:count], slopes, d.weights[:count])
+        return replace(self, data=data, fit=_fit(self.candidates, self.largest, data))
+
+    @property
+    def indices(self) -> IntArray:
+        """Multi-indices (P, d) of the fit."""
+        return self.largest.subset(self.fit.chosen.which).indices
+
+    def estimates(self, of: Analysis = moments_and_indices) -> dict[str, FloatArray]:
+        """Return what follows from the coefficients, by output, with standard errors."""
+        return _estimates(self.fit, self.indices, cautious=_cautious(self.inputs), of=of)
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """An expansion with the evaluations that it was made from, and why they were enough."""
+
+    centre: Linearisation
+    evaluations: Evaluations
+    regression: Regression
+    stopped: str
+
+
+@dataclass(frozen=True)
 class _Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
@@ -458,23 +545,14 @@ class _Projections:
 # --- what follows from an expansion --------------------------------------------------------------------------------
 
 
-def _moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArray]:
-    """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
-    squares = np.where((indices > 0).any(axis=1), coefficients**2, 0.0)
-    variance = squares.sum(axis=-1)
-    used = (indices > 0).astype(float)
-    alone = used * (used.sum(axis=1) == 1)[:, None]
-    safe = np.where(variance > 0, variance, 1.0)[..., None]
-    constant = (indices == 0).all(axis=1)
-    return {
-        "mean": coefficients[..., constant].sum(axis=-1),
-        "std": np.sqrt(variance),
-        "sobol_first": squares @ alone / safe,
-        "sobol_total": squares @ used / safe,
-    }
+def _cautious(inputs: Inputs) -> bool:
+    """Whether the samples may hide what the expansion misses, see `_estimates`."""
+    return None in [m.support for m in inputs.marginals.values()] or len(inputs.names) > FULL
 
 
-def _estimates(fit: _Fit, indices: IntArray, *, cautious: bool) -> dict[str, FloatArray]:
+def _estimates(
+    fit: _Fit, indices: IntArray, *, cautious: bool, of: Analysis = moments_and_indices
+) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. To it comes what no coefficient can
@@ -484,16 +562,17 @@ def _estimates(fit: _Fit, indices: IntArray, *, cautious: bool) -> dict[str, Flo
     samples selected them: there, `cautious`, it is λ, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the mean. (Without,
     intervals of functions of normal and gamma parameters covered 60 % instead of 95 %.)
     """
-    central = _moments(fit.coefficients.T, indices)
-    left_out = _moments(np.swapaxes(fit.without, 1, 2), indices)
+    central = of(fit.coefficients.T, indices)
+    left_out = of(np.swapaxes(fit.without, 1, 2), indices)
     n = len(fit.without)
-    share = _ratio(fit.loo**2, central["std"] ** 2)[:, None]
+    share = _ratio(fit.loo**2, central["std"] ** 2)
     mean = fit.loo / np.sqrt(n) if cautious else np.zeros_like(fit.loo)
     std = fit.loo if cautious else fit.loo / np.sqrt(n)
-    missing = {"mean": mean, "std": std, "sobol_first": share, "sobol_total": share}
+    missing = {"mean": mean, "std": std}
     for name, values in left_out.items():
         spread = np.sqrt((n - 1) / n * ((values - central[name]) ** 2).sum(axis=0))
-        central[f"{name}_error"] = np.hypot(spread, missing[name])
+        unseen = missing.get(name, share)
+        central[f"{name}_error"] = np.hypot(spread, unseen.reshape(-1, *(1,) * (spread.ndim - 1)))
     return central
 
 
@@ -515,7 +594,7 @@ def _dataset(
 ) -> xr.Dataset:
     basis = largest.subset(fit.chosen.which)
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = _estimates(fit, basis.indices, cautious=None in supports or len(supports) > FULL)
+    estimates = _estimates(fit, basis.indices, cautious=_cautious(inputs))
     lower, upper = (
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
@@ -578,7 +657,7 @@ def _field_estimates(
     coefficients = cho_solve((fit.triangle, False), projections)
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
-    moments = _moments(coefficients.T, basis.indices)
+    moments = moments_and_indices(coefficients.T, basis.indices)
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
     for name in ("mean", "std"):
         share = np.sqrt(_ratio(estimates[f"{name}_error"] ** 2, fit.squares).max())

@@ -74,6 +74,20 @@ class FieldSum(Protocol):
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
 
 
+class JointSum(Protocol):
+    """A quantity of the states of several points that follow each other, summed as these rows of points stream by.
+
+    A row is never cut by blocks; one in which a solve failed adds nothing.
+    """
+
+    @property
+    def size(self) -> int:
+        """Number K of points in a row."""
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        """Return the function states (K, U_local) → rows (k, U_local) to be summed, for one group's model."""
+
+
 @dataclass(frozen=True)
 class Prediction:
     """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
@@ -106,10 +120,12 @@ class Request:
     tangents: bool = False
     fields: FieldSum | None = None
     start: Prediction | None = None
+    joint: JointSum | None = None  # in place of `fields`
 
     def blocks(self) -> list[Request]:
-        """Cut into blocks that depend on the number of points only."""
-        size = max(1, -(-len(self.points) // BLOCKS))
+        """Cut into blocks that depend on the number of points, and of those that belong together, only."""
+        together = 1 if self.joint is None else self.joint.size
+        size = together * max(1, -(-len(self.points) // (together * BLOCKS)))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 
 
@@ -184,6 +200,8 @@ class BlockSolver:
         self._model = model
         self._tangents = request.tangents
         self._row = request.fields.on(model) if request.fields is not None else None
+        self._joint = request.joint.on(model) if request.joint is not None else None
+        self._together = 1 if request.joint is None else request.joint.size
         self._predict: Callable[[FloatArray], FloatArray] | None = None
         self._reference: Reference | None = None
         if request.start is not None:
@@ -199,22 +217,30 @@ class BlockSolver:
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         failures: list[Failure] = []
         total: FloatArray | None = None
+        states: list[FloatArray] = []
         for i, point in enumerate(points):
             begin = time.process_time()
+            row = None
             try:
                 start = self._predict(point) if self._predict is not None else None
                 solution = model.solve(point, start, self._reference)
-                row = self._row(solution, point) if self._row is not None else None
+                if self._row is not None:
+                    row = self._row(solution, point)
                 if tangents is not None:
                     tangents[i] = solution.tangent(np.eye(d)).T
             except SolveError as error:
+                row = None
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
                 work[i] = error.work.as_array()
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
-                if row is not None:
-                    total = row if total is None else total + row
+                states += [solution.state] if self._joint is not None else []
+            if self._joint is not None and (i + 1) % self._together == 0:
+                row = self._joint(np.array(states)) if len(states) == self._together else None
+                states = []
+            if row is not None:
+                total = row if total is None else total + row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
         fields = np.zeros((0, 0)) if total is None else model.gather(total)

@@ -30,7 +30,7 @@ from uq.moments import (
     ratio,
 )
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, why_stopped
-from uq.sampling import sobol_points
+from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.taylor import Taylor, quadratic, tangent
 
 if TYPE_CHECKING:
@@ -73,11 +73,7 @@ class QuasiMonteCarlo(MonteCarlo):
     @model_validator(mode="after")
     def _check_scrambles(self) -> QuasiMonteCarlo:
         R = self.scrambles
-        if self.samples is not None and self.samples != R * _power_of_two(self.samples // R):
-            below = R * _power_of_two(self.samples // R)
-            nearest = f"{below} or {2 * below}" if self.samples > R else str(R)
-            message = f"samples = {self.samples}, expected scrambles = {R} times a power of two, such as {nearest}"
-            raise ValueError(message)
+        check_scrambles(self.samples, R)
         if self.coefficient == "optimal" and R < 4:
             message = f"scrambles = {R}, expected at least 4 for coefficient = 'optimal', which is fitted to them"
             raise ValueError(message)
@@ -86,7 +82,7 @@ class QuasiMonteCarlo(MonteCarlo):
     @property
     def limit(self) -> int:
         """Number of samples, the largest where a tolerance may end the study earlier."""
-        return self.samples or self.scrambles * _power_of_two(UNLIMITED // self.scrambles)
+        return self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles)
 
     def planned(self, dimension: int) -> int:
         """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
@@ -121,7 +117,7 @@ class QuasiMonteCarlo(MonteCarlo):
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
         samples = _Samples(self, inputs, evaluate, centre, control)
         last = self.limit // self.scrambles
-        first = last if self.tolerance is None else min(last, _power_of_two(FIRST_ROUND // self.scrambles))
+        first = last if self.tolerance is None else min(last, power_of_two(FIRST_ROUND // self.scrambles))
         samples.extend(first)
         scalars = samples.scalars(first)
         while self.tolerance is not None and scalars.relative_error.max() > self.tolerance and samples.each < last:
@@ -169,11 +165,6 @@ class QuasiMonteCarlo(MonteCarlo):
             which = "all estimates" if self.control == "none" else "quantiles"
             dataset.attrs["note"] = failure_note(ok, which, followed)
         return dataset
-
-
-def _power_of_two(limit: int) -> int:
-    """Return the largest power of two up to `limit`, at least 1."""
-    return 1 << max(limit.bit_length() - 1, 0)
 
 
 def _products(deviation: FloatArray, controls: tuple[FloatArray, FloatArray] | None) -> FloatArray:
