@@ -49,6 +49,15 @@ if case == "many":
             evaluations = evaluate(Request(block))
             assert (evaluations.outputs[:, 0] == [function(p) for p in block]).all()
         return MonteCarlo(samples=2).run(inputs, evaluate)
+elif case == "models":
+    def task(evaluate):
+        points = np.random.default_rng(0).random((50, 2))
+        one = evaluate(Request(points)).outputs
+        two = evaluate.on(1)
+        assert two.outputs == ("g",)
+        assert (two(Request(points)).outputs == 2 * one).all()
+        assert (evaluate(Request(points)).outputs == one).all()
+        return MonteCarlo(samples=2).run(inputs, evaluate)
 elif case == "method":
     def task(evaluate):
         raise SolveError("the method gave up")
@@ -57,12 +66,16 @@ else:
         return SensitivityMonteCarlo(samples=300, seed=3).run(inputs, evaluate)
 
 try:
-    data = ensemble.run(model, task, progress=count)
+    other = FunctionModel(lambda p: 2 * function(p), ("a", "b"), ("g",))
+    data = ensemble.run(model, task, others=[lambda: other], progress=count)
 except SolveError as error:
     print("caught", error)
     sys.exit(1)
 if data is not None and case == "many":
     assert counts == [3 + sum(1 + i % 7 for i in range(900)), 0], counts
+    print("same", counts)
+elif data is not None and case == "models":
+    assert counts == [153, 0], counts
     print("same", counts)
 elif data is not None:
     assert data.identical(SensitivityMonteCarlo(samples=300, seed=3).run(inputs, SerialEvaluate(model)))
@@ -71,7 +84,7 @@ elif data is not None:
 """
 
 
-@pytest.mark.parametrize("case", ["plain", "fails", "uneven", "many"])
+@pytest.mark.parametrize("case", ["plain", "fails", "uneven", "many", "models"])
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 def test_same_numbers_as_in_one_process(ranks, case):
     done = run_script(ranks, STUDY, case)

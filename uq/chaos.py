@@ -23,16 +23,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from forward.settings import Settings
 from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
-from uq.evaluate import Evaluate, Evaluations, Request, merge
+from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.indices import Analysis, moments_and_indices
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.sampling import sobol_points
+from uq.stopping import Amount
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,13 +50,13 @@ DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
 BINS = 80
 
 
-class Chaos(Settings):
+class Chaos(Amount):
     """Polynomial chaos, by regression on values and gradients or by Gauss quadrature.
 
     Parameters
     ----------
-    samples
-        Number of solves (and one at the mean parameters); with a tolerance, the largest number.
+    samples, budget_seconds
+        As of `Amount`; there is one solve more, at the mean parameters.
     tolerance
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
     max_order
@@ -76,8 +76,6 @@ class Chaos(Settings):
     """
 
     kind: Literal["chaos"] = "chaos"
-    samples: Annotated[int, Field(ge=2)] | None = None
-    tolerance: Annotated[float, Field(gt=0)] | None = None
     max_order: Annotated[int, Field(ge=1, le=20)] = 6
     gradients: bool = True
     fit: Literal["regression", "projection"] = "regression"
@@ -85,16 +83,15 @@ class Chaos(Settings):
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
 
-    @model_validator(mode="after")
-    def _check_amount(self) -> Chaos:
-        asked = self.samples is not None or self.tolerance is not None
-        if self.fit == "regression" and not asked:
-            message = "gives neither samples nor tolerance, expected at least one of them"
+    def check_amount(self) -> None:
+        """Raise a ValueError where no amount is given, or where one is that a projection cannot heed."""
+        if self.fit == "regression":
+            super().check_amount()
+        elif self.asked:
+            message = (
+                "gives samples, tolerance or budget_seconds, expected none: a projection takes (max_order + 2)^d points"
+            )
             raise ValueError(message)
-        if self.fit == "projection" and asked:
-            message = "gives samples or a tolerance, expected neither: a projection takes (max_order + 2)^d points"
-            raise ValueError(message)
-        return self
 
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
@@ -132,6 +129,7 @@ class Chaos(Settings):
         objection = self.objection(inputs)
         if objection is not None:
             raise ValueError(objection)
+        evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         projection = self.fit == "projection"
         gradients = self.gradients and evaluate.differentiable and not projection
@@ -148,7 +146,7 @@ class Chaos(Settings):
         if expand_fields:
             fields = _Projections(largest, centre.state, gradients, grid, weights)
         rounds: list[Evaluations] = []
-        count, target = 0, limit if self.tolerance is None else min(limit, _first(inputs, gradients=gradients))
+        count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
         while True:
             points = (
                 grid
@@ -161,19 +159,12 @@ class Chaos(Settings):
             data = _Data.of(evaluations, inputs, weights)
             fitted = _fit(bases, largest, data)
             reached = float(fitted.relative.max())
-            stopped = (
-                f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
-            )
-            if self.tolerance is None:
-                stopped = f"{count} samples, as asked: {stopped}"
+            paid = count + self.affordable(evaluate.solves, evaluate.seconds)
+            target = int(min(limit, np.ceil(GROWTH * count), paid))
+            if self.met(reached) or target <= count:
                 break
-            if reached <= self.tolerance:
-                stopped = f"tolerance {self.tolerance:g} met after {count} samples: {stopped}"
-                break
-            if count >= limit:
-                stopped = f"tolerance {self.tolerance:g} not met after all {count} samples: {stopped}"
-                break
-            target = min(limit, int(np.ceil(GROWTH * count)))
+        error = f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
+        stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
         return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
 
     def dataset(self, inputs: Inputs, evaluate: Evaluate, expanded: Expanded) -> xr.Dataset:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -64,6 +64,7 @@ class Ensemble:
         model: ForwardModel,
         task: Callable[[EnsembleEvaluate], T],
         *,
+        others: Sequence[Callable[[], ForwardModel]] = (),
         checkpoint: Checkpoint | None = None,
         progress: Callable[[int, int], None] = lambda done, failed: None,
     ) -> T | None:
@@ -75,6 +76,8 @@ class Ensemble:
             This group's model.
         task
             Called on rank 0 only, with the evaluation.
+        others
+            Make this group's models number 1, 2, … (`Evaluate.on`), each when it is first asked for.
         checkpoint
             Where finished blocks are kept and found.
         progress
@@ -86,17 +89,13 @@ class Ensemble:
             What the task returned, on rank 0; nothing on the other ranks.
         """
         with _counter(self.world) as counter:
-            worker = _Worker(self, model, checkpoint, counter)
+            worker = _Worker(self, _Models(model, others), checkpoint, counter)
             if self.world.rank > 0:
                 while (order := self.world.bcast(None)) is not None:
                     worker.work(order)
                 return None
             try:
-                return task(
-                    EnsembleEvaluate(
-                        worker, model.parameters, model.outputs, model.differentiable, model.displacements, progress
-                    )
-                )
+                return task(EnsembleEvaluate(worker, 0, progress))
             finally:
                 self.world.bcast(None)
 
@@ -110,19 +109,55 @@ class _Order:
     keys: tuple[str, ...]
 
 
+class _Models:
+    """The models of this group, each made when it is first asked for; making one is collective over the group."""
+
+    def __init__(self, first: ForwardModel, others: Sequence[Callable[[], ForwardModel]]) -> None:
+        self._makers = others
+        self._made = {0: first}
+
+    def __getitem__(self, number: int) -> ForwardModel:
+        if number not in self._made:
+            self._made[number] = self._makers[number - 1]()
+        return self._made[number]
+
+
 @dataclass(frozen=True)
 class EnsembleEvaluate:
-    """The evaluation that a method sees on rank 0."""
+    """The evaluation that a method sees on rank 0, of one of the models."""
 
     worker: _Worker
-    parameters: tuple[str, ...]
-    outputs: tuple[str, ...]
-    differentiable: bool
-    displacements: int
+    number: int
     progress: Callable[[int, int], None]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.worker.models[self.number].parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.worker.models[self.number].outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.worker.models[self.number].differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.worker.models[self.number].displacements
+
+    def on(self, model: int) -> EnsembleEvaluate:
+        """Return the evaluation of another of the models; all groups make it now."""
+        self.worker.prepare(model)
+        return replace(self, number=model)
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request on all groups; blocks that are on disk are read."""
+        request = replace(request, model=self.number)
         blocks = request.blocks()
         checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
@@ -153,13 +188,17 @@ class EnsembleEvaluate:
 class _Worker:
     """What every rank does with an order."""
 
-    def __init__(
-        self, ensemble: Ensemble, model: ForwardModel, checkpoint: Checkpoint | None, counter: _Counter
-    ) -> None:
+    def __init__(self, ensemble: Ensemble, models: _Models, checkpoint: Checkpoint | None, counter: _Counter) -> None:
         self._ensemble = ensemble
-        self._model = model
+        self.models = models
         self.checkpoint = checkpoint
         self._counter = counter
+
+    def prepare(self, model: int) -> None:
+        """Rank 0: have all groups make a model, this one too."""
+        with _abort_all(self._ensemble.world):
+            self._ensemble.world.bcast(model)
+            self.models[model]
 
     def dispatch(
         self, order: _Order, receive: Callable[[int, Evaluations], None], progress: Callable[[int, int], None]
@@ -199,10 +238,13 @@ class _Worker:
         # Only when everyone has seen that no turn is left may the counter start again for the next order.
         world.barrier()
 
-    def work(self, order: _Order) -> None:
-        """Compute blocks of an order until none is left, and send them to rank 0."""
+    def work(self, order: _Order | int) -> None:
+        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its number."""
         world, sent = self._ensemble.world, []
         with _abort_all(world):
+            if isinstance(order, int):
+                self.models[order]
+                return
             for result in self._blocks(order, lambda done, failed: None):
                 if self._ensemble.group.rank == 0 and self._ensemble.index > 0:
                     sent.append(world.isend(result, dest=0, tag=_RESULT))
@@ -221,7 +263,7 @@ class _Worker:
                 turn = group.bcast(turn)
             if turn >= len(order.pending):
                 return
-            solver = solver or BlockSolver(self._model, order.request)
+            solver = solver or BlockSolver(self.models[order.request.model], order.request)
             i = order.pending[turn]
             block = solver(blocks[i].points, progress)
             if self.checkpoint is not None and group.rank == 0:

@@ -114,13 +114,30 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of an evaluation."""
+    """What is asked of an evaluation.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    tangents
+        Whether the derivatives of the outputs are wanted.
+    fields
+        What is summed of the states.
+    start
+        Where the solver starts.
+    model
+        Which of the models that the evaluation has; `Evaluate.on` sets it.
+    joint
+        What is summed, in place of `fields`, of the states of points that follow each other.
+    """
 
     points: FloatArray
     tangents: bool = False
     fields: FieldSum | None = None
     start: Prediction | None = None
-    joint: JointSum | None = None  # in place of `fields`
+    model: int = 0
+    joint: JointSum | None = None
 
     def blocks(self) -> list[Request]:
         """Cut into blocks that depend on the number of points, and of those that belong together, only."""
@@ -151,6 +168,9 @@ class Evaluate(Protocol):
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
 
+    def on(self, model: int) -> Evaluate:
+        """Return the evaluation of another of the models (meshes, solvers), by its number; this one has number 0."""
+
 
 @dataclass(frozen=True)
 class SerialEvaluate:
@@ -162,10 +182,17 @@ class SerialEvaluate:
         The model.
     progress
         Told the numbers of points that were done and that failed since it was last told.
+    others
+        Models number 1, 2, … that a method may ask for.
     """
 
     model: ForwardModel
     progress: Callable[[int, int], None] = lambda done, failed: None
+    others: tuple[ForwardModel, ...] = ()
+
+    def on(self, model: int) -> SerialEvaluate:
+        """Return the evaluation of another of the models."""
+        return replace(self, model=(self.model, *self.others)[model])
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -191,6 +218,61 @@ class SerialEvaluate:
         """Evaluate all points of a request."""
         solver = BlockSolver(self.model, request)
         return merge([solver(block.points, self.progress) for block in request.blocks()])
+
+
+class Recorder:
+    """An evaluation that keeps what it returned, and says what that has cost.
+
+    Attributes
+    ----------
+    log
+        Every evaluation, in order, of all models; shared by the evaluations of the other models.
+    """
+
+    def __init__(self, evaluate: Evaluate, log: list[Evaluations] | None = None) -> None:
+        self._evaluate = evaluate
+        self.log: list[Evaluations] = [] if log is None else log
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self._evaluate.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self._evaluate.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self._evaluate.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self._evaluate.displacements
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+        evaluations = self._evaluate(request)
+        # Derivatives and fields are the method's own business.
+        self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
+        return evaluations
+
+    def on(self, model: int) -> Recorder:
+        """Return the evaluation of another of the models, with the same log."""
+        return Recorder(self._evaluate.on(model), self.log)
+
+    @property
+    def solves(self) -> int:
+        """Number of points so far."""
+        return sum(len(evaluations.points) for evaluations in self.log)
+
+    @property
+    def seconds(self) -> float:
+        """Processor time (s) of all points so far."""
+        return float(sum(evaluations.seconds.sum() for evaluations in self.log))
 
 
 class BlockSolver:

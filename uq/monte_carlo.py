@@ -8,31 +8,32 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from forward.settings import Settings
-from uq.evaluate import Evaluate, Evaluations, Request, merge
+from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, Coefficient, Estimates, Moments, SecondMoment, estimate, monomials, quantiles
 from uq.sampling import random_points
+from uq.stopping import Amount
 
 if TYPE_CHECKING:
     import xarray as xr
 
-FIRST_ROUND = 64  # samples before a tolerance is first looked at
-UNLIMITED = 100_000  # samples that a tolerance may take where no limit is given
+FIRST_ROUND = 64  # samples before a tolerance or a budget is first looked at
+MOST_GROWTH = 4.0  # of the number of samples, from one look to the next
+UNLIMITED = 100_000  # samples that a tolerance or a budget may take where no limit is given
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
-class MonteCarlo(Settings):
+class MonteCarlo(Amount):
     """Plain Monte Carlo.
 
     Parameters
     ----------
-    samples
-        Number of samples; with a tolerance, the largest number.
+    samples, budget_seconds
+        As of `Amount`.
     tolerance
         Stop when the standard error of every mean is below this fraction of the mean (of the standard deviation,
         where the mean is smaller than that).
@@ -45,18 +46,9 @@ class MonteCarlo(Settings):
     """
 
     kind: Literal["monte-carlo"] = "monte-carlo"
-    samples: Annotated[int, Field(ge=2)] | None = None
-    tolerance: Annotated[float, Field(gt=0)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
-
-    @model_validator(mode="after")
-    def _check_amount(self) -> MonteCarlo:
-        if self.samples is None and self.tolerance is None:
-            message = "gives neither samples nor tolerance, expected at least one of them"
-            raise ValueError(message)
-        return self
 
     @property
     def limit(self) -> int:
@@ -137,12 +129,13 @@ class _JointMoments:
 def _sample(
     method: MonteCarlo, inputs: Inputs, evaluate: Evaluate, control: tuple[Coefficient, SecondMoment] | None
 ) -> xr.Dataset:
+    evaluate = Recorder(evaluate)
     centre = linearise(inputs, evaluate)
     slopes = centre.slopes if control else None
     fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
     limit = method.limit
-    target = limit if method.tolerance is None else min(limit, FIRST_ROUND)
+    target = min(limit, FIRST_ROUND) if method.open_ended else limit
     count = 0
     while True:
         points = inputs.points(random_points(method.seed, count, target, len(inputs.names)))
@@ -151,21 +144,15 @@ def _sample(
         evaluations = merge(rounds)
         scalars = _scalar_moments(evaluations, inputs, centre, control)
         reached = float(scalars.relative_error.max())
-        if method.tolerance is None or reached <= method.tolerance or count >= limit:
+        growth = MOST_GROWTH
+        if method.tolerance is not None:
+            growth = min(MOST_GROWTH, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
+        paid = count + method.affordable(evaluate.solves, evaluate.seconds)
+        target = int(min(limit, int(count * growth) + 1, paid))
+        if method.met(reached) or target <= count:
             break
-        growth = min(4.0, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
-        target = min(limit, int(count * growth) + 1)
-    stopped = why_stopped(method.tolerance, reached, f"{count} samples")
+    stopped = method.why_stopped(reached, f"relative error {reached:.3g}", count, limit, f"{count} samples")
     return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
-
-
-def why_stopped(tolerance: float | None, reached: float, amount: str) -> str:
-    """Say whether sampling stopped at the tolerance of the relative errors, or after the amount that was asked for."""
-    if tolerance is None:
-        return f"{amount}, as asked"
-    if reached <= tolerance:
-        return f"tolerance {tolerance:g} met: relative error {reached:.3g} after {amount}"
-    return f"tolerance {tolerance:g} not met: relative error {reached:.3g} after all {amount}"
 
 
 def _scalar_moments(

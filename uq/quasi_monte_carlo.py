@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluate import Evaluate, Evaluations, Request
+from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import (
@@ -29,7 +29,7 @@ from uq.moments import (
     quantiles_from_replicates,
     ratio,
 )
-from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note, why_stopped
+from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.taylor import Taylor, quadratic, tangent
 
@@ -109,6 +109,7 @@ class QuasiMonteCarlo(MonteCarlo):
         if self.control != "none" and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ValueError(message)
+        evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         control = None
         if self.control == "tangent":
@@ -117,10 +118,12 @@ class QuasiMonteCarlo(MonteCarlo):
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
         samples = _Samples(self, inputs, evaluate, centre, control)
         last = self.limit // self.scrambles
-        first = last if self.tolerance is None else min(last, power_of_two(FIRST_ROUND // self.scrambles))
+        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
         samples.extend(first)
         scalars = samples.scalars(first)
-        while self.tolerance is not None and scalars.relative_error.max() > self.tolerance and samples.each < last:
+        while not self.met(float(scalars.relative_error.max())) and samples.each < last:
+            if self.scrambles * samples.each > self.affordable(evaluate.solves, evaluate.seconds):
+                break
             samples.extend(2 * samples.each)
             scalars = samples.scalars(samples.each)
         return self._dataset(inputs, evaluate, centre, samples, scalars)
@@ -159,7 +162,9 @@ class QuasiMonteCarlo(MonteCarlo):
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
         amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
-        dataset.attrs["stopped"] = why_stopped(self.tolerance, float(scalars.relative_error.max()), amount)
+        reached = float(scalars.relative_error.max())
+        error = f"relative error {reached:.3g}"
+        dataset.attrs["stopped"] = self.why_stopped(reached, error, ok.size, self.limit, amount)
         if not ok.all():
             followed = None if self.control == "none" else f"the {self.control} control"
             which = "all estimates" if self.control == "none" else "quantiles"

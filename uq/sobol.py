@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
-from forward.settings import Settings, nearest
+from forward.settings import nearest
 from uq.chaos import LARGEST, Chaos, Regression
-from uq.evaluate import Evaluate, Evaluations, Request
+from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import (
     Analysis,
     ExchangedVariances,
@@ -43,6 +43,7 @@ from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
 from uq.sampling import check_scrambles, power_of_two, sobol_points
+from uq.stopping import Amount
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,7 +60,7 @@ RUNNING = ("sobol_first", "sobol_total")
 Variables = dict[str, tuple[tuple[str, ...], Any]]
 
 
-class Sobol(Settings):
+class Sobol(Amount):
     """Sobol' indices: the shares of the variance that parameters have alone, and with their interactions.
 
     Parameters
@@ -70,10 +71,13 @@ class Sobol(Settings):
         model and parameters, of its expansion or of one that is fitted to its samples; no sample is solved.
     samples
         Number of solves ("chaos"), or of rows of solves ("saltelli"): `scrambles` times a power of two, each of d + 2
-        solves, of one more for every group, and of d more for the second order. With a tolerance, the largest number.
+        solves, of one more for every group, and of d more for the second order; with a tolerance or a budget, the
+        largest number.
     tolerance
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation ("chaos"),
         or when the standard error of every index of first order and total is below it ("saltelli").
+    budget_seconds
+        As of `Amount`.
     second_order
         Whether the shares of products of two parameters are estimated too.
     groups
@@ -94,8 +98,6 @@ class Sobol(Settings):
 
     kind: Literal["sobol"] = "sobol"
     design: Literal["chaos", "saltelli", "given-data"] = "chaos"
-    samples: Annotated[int, Field(ge=2)] | None = None
-    tolerance: Annotated[float, Field(gt=0)] | None = None
     second_order: bool = False
     groups: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = {}
     source: str | None = None
@@ -106,23 +108,22 @@ class Sobol(Settings):
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
 
-    @model_validator(mode="after")
-    def _check_design(self) -> Sobol:
-        asked = self.samples is not None or self.tolerance is not None
+    def check_amount(self) -> None:
+        """Raise a ValueError where design, amount and source do not go together."""
         if self.design == "given-data":
-            if self.source is None or asked:
-                message = "expected source, the results to take, and neither samples nor tolerance for 'given-data'"
+            if self.source is None or self.asked:
+                message = (
+                    "expected source, the results to take, and neither samples nor tolerance nor budget_seconds with "
+                    "design = 'given-data'"
+                )
                 raise ValueError(message)
-            return self
-        if not asked:
-            message = "gives neither samples nor tolerance, expected at least one of them"
-            raise ValueError(message)
+            return
+        super().check_amount()
         if self.source is not None:
             message = f"source = '{self.source}', expected design = 'given-data' with it"
             raise ValueError(message)
         if self.design == "saltelli":
             check_scrambles(self.samples, self.scrambles)
-        return self
 
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
@@ -211,6 +212,7 @@ class Sobol(Settings):
         method = Chaos(
             samples=self.samples,
             tolerance=self.tolerance,
+            budget_seconds=self.budget_seconds,
             max_order=self.max_order,
             gradients=self.gradients,
             seed=self.seed,
@@ -275,29 +277,24 @@ class Sobol(Settings):
     # --- from exchanged samples ----------------------------------------------------------------------------------
 
     def _exchange(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         members = np.vstack([np.eye(len(inputs.names), dtype=bool), self._members(inputs)])
         rows = _Rows(self, inputs, evaluate, centre, members)
-        last = (self.planned(len(inputs.names)) - 1) // rows.products.size // self.scrambles
-        rows.extend(last if self.tolerance is None else min(last, power_of_two(FIRST_ROUND // self.scrambles)))
+        K, R = rows.products.size, self.scrambles
+        last = (self.planned(len(inputs.names)) - 1) // K // R
+        rows.extend(min(last, power_of_two(FIRST_ROUND // R)) if self.open_ended else last)
         while True:
             found = rows.indices(rows.each)
             reached = max(float(found[f"{name}_error"].max()) for name in RUNNING)
-            amount = f"{rows.ok.size} rows of {rows.products.size} solves ({self.scrambles} scrambles)"
-            if self.tolerance is None:
-                stopped = f"{amount}, as asked: error of the indices up to {reached:.2g}"
-                break
-            if reached <= self.tolerance:
-                stopped = f"tolerance {self.tolerance:g} met: error of the indices up to {reached:.2g} after {amount}"
-                break
-            if rows.each >= last:
-                stopped = (
-                    f"tolerance {self.tolerance:g} not met: error of the indices up to {reached:.2g} after all {amount}"
-                )
+            solves = K * R * rows.each
+            if self.met(reached) or rows.each >= last or solves > self.affordable(evaluate.solves, evaluate.seconds):
                 break
             rows.extend(2 * rows.each)
         dataset = rows.dataset(found)
-        dataset.attrs["stopped"] = stopped
+        amount = f"{R * rows.each} rows of {K} solves ({R} scrambles of Sobol' points)"
+        error = f"errors of the indices up to {reached:.2g}"
+        dataset.attrs["stopped"] = self.why_stopped(reached, error, rows.each, last, amount)
         return dataset
 
 

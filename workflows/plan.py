@@ -27,11 +27,11 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     unknowns = study.model.unknowns
     solves = study.planned
     each = seconds_per_solve(unknowns) * (TEXTBOOK if study.model.solver.kind == "newton" else 1)
-    seconds = solves * each / groups
+    seconds = min(solves * each, getattr(study.method, "budget_seconds", None) or float("inf")) / groups
     body = study.model.body
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
-    up_to = "up to " if getattr(study.method, "tolerance", None) is not None else ""
+    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
     return [
         f"method      {study.method.kind}",
         f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",

@@ -54,14 +54,14 @@ outputs = [
 _METHODS = {
     "monte-carlo": """\
 kind = "monte-carlo"
-samples = 200         # or tolerance = 0.01: relative standard error of the means; both: whichever comes first
+samples = 200         # or tolerance = 0.01 (standard errors over means), or budget_seconds = 600: whichever comes first
 seed = 1
 quantiles = [0.05, 0.5, 0.95]
 fields = true         # mean and standard deviation of the displacement at every node
 """,
     "sensitivity-monte-carlo": """\
 kind = "sensitivity-monte-carlo"
-samples = 100         # or tolerance = 0.01: relative standard error of the means; both: whichever comes first
+samples = 100         # or tolerance = 0.01 (standard errors over means), or budget_seconds = 600: whichever comes first
 seed = 1
 coefficient = "one"   # or "optimal": estimated on the samples
 second_moment = "quadratic"   # or "linear": the published form
@@ -69,7 +69,7 @@ fields = true         # mean and standard deviation of the displacement at every
 """,
     "quasi-monte-carlo": """\
 kind = "quasi-monte-carlo"
-samples = 256         # scrambles × a power of two; or tolerance = 0.001: relative standard error of the means; or both
+samples = 256         # scrambles × a power of two; or tolerance = 0.001, or budget_seconds = 600: whichever comes first
 scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
 control = "tangent"   # or "none", or "quadratic": two more solves for each parameter
 coefficient = "one"   # or "optimal": regression over the scrambles
@@ -78,7 +78,7 @@ fields = true         # mean and standard deviation of the displacement at every
 """,
     "chaos": """\
 kind = "chaos"
-samples = 15          # or tolerance = 1e-3: leave-one-out error over standard deviation; both: whichever comes first
+samples = 15          # or tolerance = 1e-3 (leave-one-out error / std), or budget_seconds = 600: whichever comes first
 max_order = 6         # order and terms up to it are chosen by the leave-one-out error
 gradients = true      # fit the derivatives too: d + 1 rows for every solve
 fit = "regression"    # or "projection": (max_order + 2)^d Gauss points and no samples

@@ -8,13 +8,12 @@ import platform
 import sys
 import time
 import tomllib
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from uq.evaluate import BLOCKS, Evaluate, Evaluations, Request
+from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
 from workflows.results import label, read_summary, summarise, write_dataset, write_fields, write_text
@@ -83,15 +82,15 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     model = study.model.build(ensemble.group, inputs.names)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
-    log = _Log()
+    recorders: list[Recorder] = []
     # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
     cells, kind = model.layout.cells()
-    dataset = ensemble.run(
-        model,
-        lambda evaluate: study.method.run(inputs, _Recorded(evaluate, log)),
-        checkpoint=checkpoint,
-        progress=progress,
-    )
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders.append(Recorder(evaluate))
+        return study.method.run(inputs, recorders[0])
+
+    dataset = ensemble.run(model, task, checkpoint=checkpoint, progress=progress)
     if dataset is None:
         return DONE
     progress.close()
@@ -99,8 +98,9 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     write_dataset(directory / "results.nc", dataset)
     write_fields(directory / "fields", dataset)
-    summary = _summary(study, name, dataset, log, world.size, ensemble.groups, time.monotonic() - begin)
-    checkpoint.consolidate(log.all())
+    evaluations = merge(recorders[0].log)
+    summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
+    checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
@@ -108,50 +108,6 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
     return PARTIAL if summary["failed"] else DONE
-
-
-@dataclass
-class _Log:
-    """Every evaluation of a study, in order."""
-
-    evaluations: list[Evaluations] = field(default_factory=list)
-
-    def all(self) -> Evaluations:
-        """All of them as one, without derivatives and fields."""
-        from dataclasses import replace
-
-        from uq.evaluate import merge
-
-        return merge([replace(e, tangents=None, fields=e.fields[:0]) for e in self.evaluations])
-
-
-@dataclass(frozen=True)
-class _Recorded:
-    """An evaluation that keeps what it returns in a log."""
-
-    evaluate: Evaluate
-    log: _Log
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        return self.evaluate.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return self.evaluate.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        return self.evaluate.differentiable
-
-    @property
-    def displacements(self) -> int:
-        return self.evaluate.displacements
-
-    def __call__(self, request: Request) -> Evaluations:
-        evaluations = self.evaluate(request)
-        self.log.evaluations.append(evaluations)
-        return evaluations
 
 
 def _identity(study: Study) -> dict[str, Any]:
@@ -213,11 +169,10 @@ def _version() -> str:
 
 
 def _summary(
-    study: Study, name: str, dataset: xr.Dataset, log: _Log, ranks: int, groups: int, wall: float
+    study: Study, name: str, dataset: xr.Dataset, evaluations: Evaluations, ranks: int, groups: int, wall: float
 ) -> dict[str, Any]:
     from forward.model import WORK
 
-    evaluations = log.all()
     failed = len(evaluations.failures)
     return {
         "study": name,
