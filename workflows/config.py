@@ -13,14 +13,17 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.chaos import Chaos
+from uq.derivative_based import DerivativeBased
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.linearisation import LocalSensitivity
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 from uq.quasi_monte_carlo import QuasiMonteCarlo
+from uq.sobol import Sobol
 
 Method = Annotated[
-    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos, Field(discriminator="kind")
+    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos | Sobol | DerivativeBased,
+    Field(discriminator="kind"),
 ]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
@@ -120,9 +123,13 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            objection = self.method.objection(inputs) if isinstance(self.method, Chaos) else None
+            restricted = isinstance(self.method, Chaos | Sobol | DerivativeBased)
+            objection = self.method.objection(inputs) if restricted else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+            stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None
+            if stranger is not None:
+                yield ("method", "groups"), stranger, self.method.model_dump()["groups"]
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
