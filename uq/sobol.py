@@ -41,7 +41,7 @@ from uq.indices import (
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
-from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability
+from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, by_node
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 
@@ -503,7 +503,7 @@ class _Rows:
         return found
 
     def field(self) -> Variables:
-        """Indices of the displacement field, with errors of the generalised ones by leaving a scramble out."""
+        """Moments and indices of the displacement field; errors of the generalised ones by leaving a scramble out."""
         kept = [(total, n) for total, n in zip(self._sums, self.ok.sum(axis=1), strict=True) if total is not None]
         if not kept:
             return {}
@@ -514,15 +514,21 @@ class _Rows:
 
         def of(means: FloatArray) -> Variables:
             parts = self._of_fields.variances(means)
-            by_node = [p.reshape(*p.shape[:-1], -1, 3).sum(axis=-1) for p in (parts.variance, parts.first, parts.total)]
-            return field_indices(by_node[0], by_node[1][:d], by_node[2][:d])
+            variance, first, total = (
+                part.reshape(*part.shape[:-1], -1, 3).sum(axis=-1)
+                for part in (parts.variance, parts.first[:d], parts.total[:d])
+            )
+            return field_indices(variance, first, total)
 
         found = of(whole / n)
-        without = [of((whole - s) / (n - c)) for s, c in zip(sums, counts, strict=True)] if len(kept) > 1 else []
+        without = [of((whole - s) / (n - c)) for s, c in zip(sums, counts, strict=True)]
         for name in RUNNING:
             errors = jackknife_error(np.array([some[f"field_{name}"][1] for some in without]))
             found[f"field_{name}_error"] = (("parameter",), errors)
-        return found
+        square = self._of_fields.size
+        means = [[(s[0] + s[1]) / (2 * c), s[square] / c] for s, c in zip(sums, counts, strict=True)]
+        moments = estimate_from_replicates(np.swapaxes(np.array(means), 0, 1), self._centre.state[:count])
+        return found | by_node(moments, count)
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
         """Flatten (R, n, K, …) to (n R K, …), the first rows of all scrambles first: a shorter study is the beginning."""
