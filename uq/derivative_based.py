@@ -1,15 +1,15 @@
 """Global sensitivity from derivatives: bounds on total Sobol' indices and the active subspace, from the same tangents.
 
-With ν_i = E[(∂ψ/∂ω_i)²], the derivative-based measure of a parameter, and the Poincaré constant C_i of its distribution,
-the smallest with Var g(ω_i) ≤ C_i E[g'(ω_i)²] for every g, the total index is at most
+With ν_i = E[(∂ψ/∂ω_i)²], the derivative-based measure of a parameter, and the Poincaré constant C_i of its
+distribution, the smallest with Var g(ω_i) ≤ C_i E[g'(ω_i)²] for every g, the total index is at most
 
     S_Ti ≤ C_i ν_i / Var ψ
 
 (I. M. Sobol', S. Kucherenko, Math. Comput. Simul. 79 (2009) 3009–3017; M. Lamboni, B. Iooss, A.-L. Popelin, F. Gamboa,
 Math. Comput. Simul. 87 (2013) 45–54). C is σ² for a normal and (b − a)²/π² for a uniform distribution. For a gamma
 distribution of shape k and scale θ it is θ²(k + 1)²/k where k > 1 (g = (1 − x/(k + 1)) exp(x/(k + 1)) with x = ω/θ
-attains it) and 4θ² otherwise. A log-normal parameter has none: there the bound is that of its logarithm, s² E[(ω ∂ψ/∂ω)²]
-with the standard deviation s of the logarithm.
+attains it) and 4θ² otherwise. A log-normal parameter has none: there the bound is that of its logarithm, of which the
+standard deviation is s: s² E[(ω ∂ψ/∂ω)²]/Var ψ.
 
 The active subspace (P. G. Constantine, Active Subspaces, SIAM (2015)) are the leading eigenvectors of E[∇ψ∇ψᵀ] in
 standardised coordinates (ω_i − E ω_i)/σ_i: the directions along which ψ changes most.

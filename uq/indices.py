@@ -1,8 +1,8 @@
 """Sobol' indices: of expansions, of exchanged samples, and of their fields; each formula once.
 
-With the variance V of a quantity ψ, V_g = Var E[ψ | ω_g] and T_g = E Var(ψ | ω_~g) for a parameter or a group g, the index
-of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V, sums over its
-nodes and components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
+With the variance V of a quantity ψ, V_g = Var E[ψ | ω_g] and T_g = E Var(ψ | ω_~g) for a parameter or a group g, the
+index of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V, sums
+over its nodes and components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
 
 Of an expansion in orthonormal polynomials all these are sums of squares of coefficients (B. Sudret, Reliab. Eng. Syst.
 Safety 93 (2008) 964–979). From samples they come from rows of points: A and B, independent, AB_g, which is A with ω_g

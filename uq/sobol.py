@@ -1,4 +1,4 @@
-"""Sobol' indices of outputs and of the displacement field, from an expansion, from exchanged samples or from given data.
+"""Sobol' indices of outputs and of the displacement field: from an expansion, exchanged samples or given data.
 
 The formulas, and where they are from, are in `uq.indices`. Exchanged samples (A. Saltelli et al., Comput. Phys. Commun.
 181 (2010) 259–270) come in rows of d + 2 solves; A and B are the halves of scrambled Sobol' points in 2d dimensions.
@@ -99,7 +99,7 @@ class Sobol(Amount):
     kind: Literal["sobol"] = "sobol"
     design: Literal["chaos", "saltelli", "given-data"] = "chaos"
     second_order: bool = False
-    groups: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = {}
+    groups: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
     source: str | None = None
     scrambles: Annotated[int, Field(ge=4)] = 16
     max_order: Annotated[int, Field(ge=1, le=20)] = 6
@@ -354,12 +354,10 @@ def _read(directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         message = f"{directory}: holds no results.nc, expected the directory of a finished study"
         raise FileNotFoundError(message)
     source: xr.Dataset = xr.load_dataset(path, engine="h5netcdf")
-    for what, theirs, ours in (
-        ("parameters", tuple(source["parameter"].values), inputs.names),
-        ("outputs", tuple(source["output"].values), evaluate.outputs),
-    ):
-        if theirs != ours:
-            message = f"{directory}: holds results of {what} {', '.join(theirs)}, expected {', '.join(ours)}"
+    for what, expected in (("parameter", inputs.names), ("output", evaluate.outputs)):
+        theirs = tuple(source[what].values)
+        if theirs != expected:
+            message = f"{directory}: holds results of {what}s {', '.join(theirs)}, expected {', '.join(expected)}"
             raise FileNotFoundError(message)
     if not ("multi_index" in source or "values" in source):
         message = f"{directory}: holds neither samples nor an expansion, expected results of chaos or of sampling"
@@ -443,8 +441,8 @@ class _Rows:
         method, centre, K = self._method, self._centre, self.products.size
         R, d, new = method.scrambles, len(self._inputs.names), each - self.each
         cubes = np.concatenate([sobol_points(method.seed, r, self.each, each, 2 * d) for r in range(R)])
-        halves = (self._inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
-        points = exchanged(*halves, self._members, pairs=method.second_order).reshape(R, new * K, d)
+        first, second = (self._inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
+        points = exchanged(first, second, self._members, pairs=method.second_order).reshape(R, new * K, d)
         if method.fields and centre.state.size:
             joint = _FieldProducts(self._of_fields, K, centre.state)
             found = [self._ask(Request(some, start=centre.prediction, joint=joint)) for some in points]
@@ -468,7 +466,7 @@ class _Rows:
 
     def _usable(self, each: int) -> NDArray[np.bool_]:
         """Which scrambles (R,) have a whole row among their first `each`."""
-        return self.ok[:, :each].any(axis=1)
+        return np.asarray(self.ok[:, :each].any(axis=1))
 
     def _of_outputs(self, each: int) -> tuple[FloatArray, FloatArray]:
         """Sums (R', J, m) over the whole rows of every scramble that has some, and their numbers (R',)."""
@@ -531,7 +529,7 @@ class _Rows:
         return found | by_node(moments, count)
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        """Flatten (R, n, K, …) to (n R K, …), the first rows of all scrambles first: a shorter study is the beginning."""
+        """Flatten (R, n, K, …) to (n R K, …), the first rows of all scrambles first, as a shorter study has."""
         return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[3:])
 
     def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
@@ -543,9 +541,7 @@ class _Rows:
         whole = self._in_order(np.broadcast_to(self.ok[..., None], shape))
         independent = whole & (np.arange(whole.size) % K < 2)  # A and B
         values = self._in_order(self.outputs)
-        central, central_error = quantiles_from_replicates(
-            values[independent], scramble[independent], method.quantiles
-        )
+        central, central_error = quantiles_from_replicates(values[independent], scramble[independent], method.quantiles)
         rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
         moments = {each: self._moments(each) for each in rounds}
         running = {each * len(self.ok) * K: self.indices(each) for each in rounds}
@@ -574,8 +570,8 @@ class _Rows:
         lost = int((~self.ok).sum())
         if lost:
             dataset.attrs["note"] = (
-                f"{int((~answered).sum())} of {answered.size} samples have no answer; the {lost} of {self.ok.size} rows "
-                "that they are in are left out as a whole: estimates are conditional on the model having an answer"
+                f"{int((~answered).sum())} of {answered.size} samples have no answer; the {lost} of {self.ok.size} "
+                "rows that they are in are left out as a whole: estimates are conditional on the model having an answer"
             )
         return dataset
 
@@ -584,6 +580,4 @@ class _Rows:
         sums, counts = self._of_outputs(each)
         means = sums / counts[:, None, None]
         K = self.products.size
-        return estimate_from_replicates(
-            np.array([(means[:, 0] + means[:, 1]) / 2, means[:, K]]), self._centre.outputs
-        )
+        return estimate_from_replicates(np.array([(means[:, 0] + means[:, 1]) / 2, means[:, K]]), self._centre.outputs)

@@ -123,8 +123,8 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            restricted = isinstance(self.method, Chaos | Sobol | DerivativeBased)
-            objection = self.method.objection(inputs) if restricted else None
+            restricted = self.method if isinstance(self.method, Chaos | Sobol | DerivativeBased) else None
+            objection = None if restricted is None else restricted.objection(inputs)
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
             stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None

@@ -153,12 +153,12 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
     order = np.argsort(totals)[-BARS:]
     ax = ax or _axes(height=1.3 + 0.5 * len(order))
     for which, colour, side in (("first", CONTROLLED, 0.19), ("total", HIGH, -0.19)):
-        values, errors = (
-            dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error")
-        )
+        values, errors = (dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error"))
         label = "first order" if which == "first" else "total"
         places = np.arange(len(order)) + side
-        ax.barh(places, values, xerr=band(dataset) * errors, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label)
+        ax.barh(
+            places, values, xerr=band(dataset) * errors, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label
+        )
     if "total_bound" in dataset:
         limits = dataset["total_bound"].sel(output=output).to_numpy()[order]
         ax.plot(limits, np.arange(len(order)), "|", color=DARK, markersize=16, label="bound from derivatives")
@@ -171,9 +171,7 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
 
 
 def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw the shares of the variance of every output, and of the field, that parameters have alone, as stacked bars."""
-    from matplotlib import colormaps
-
+    """Draw what parameters have alone of the variance of every output, and of the field, as stacked bars."""
     first = dataset["sobol_first"].transpose("output", "parameter").to_numpy()
     names = [str(name) for name in dataset["output"].to_numpy()]
     if "field_sobol_first" in dataset:
@@ -182,11 +180,11 @@ def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     order = np.argsort(-first.mean(axis=0))
     places = np.arange(len(names))[::-1]
     ax = ax or _axes(height=1.7 + 0.42 * len(names))
-    colours, left = colormaps["tab10"].colors, np.zeros(len(names))
+    left = np.zeros(len(names))
     for rank, i in enumerate(order[:SHARES]):
         width = np.clip(first[:, i], 0, 1)
         name = _text(str(dataset["parameter"].to_numpy()[i]))
-        ax.barh(places, width, left=left, height=0.6, color=colours[rank % len(colours)], label=name)
+        ax.barh(places, width, left=left, height=0.6, color=f"C{rank}", label=name)
         left = left + width
     rest = np.clip(1 - left, 0, None)
     ax.barh(places, rest, left=left, height=0.6, color=PLAIN, alpha=0.5, label="interactions and the rest")
@@ -198,14 +196,12 @@ def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
 
 def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the total Sobol' indices of an output against the number of samples, with 95 % confidence bands."""
-    from matplotlib import colormaps
-
     ax = ax or _axes()
     counts = dataset["index_round"].to_numpy()
     totals = dataset["sobol_total"].sel(output=output).to_numpy()
     for rank, i in enumerate(np.argsort(-totals)[:SHARES]):
         of_parameter = dataset.isel(parameter=int(i)).sel(output=output)
-        colour = colormaps["tab10"].colors[rank % 10]
+        colour = f"C{rank}"
         name = _text(str(of_parameter["parameter"].item()))
         for which, style in (("first", "--"), ("total", "-")):
             mean, error = (of_parameter[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
@@ -224,8 +220,11 @@ def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
     ax = ax or _axes()
     ok = dataset["ok"].to_numpy()
     steps = (dataset["points"] - dataset["parameter_mean"]) / dataset["parameter_std"]
-    along = steps.transpose("sample", "parameter").to_numpy()[ok] @ dataset["active_direction"].sel(output=output)
-    ax.scatter(along, dataset["values"].sel(output=output).to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0)
+    direction = dataset["active_direction"].sel(output=output).to_numpy()
+    along = steps.transpose("sample", "parameter").to_numpy()[ok] @ direction
+    ax.scatter(
+        along, dataset["values"].sel(output=output).to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0
+    )
     ax.set_xlabel("leading direction (standard deviations)")
     ax.set_ylabel(_quantity(dataset, output))
     return ax

@@ -89,7 +89,7 @@ fields = true         # expand the displacement at every node
     "sobol": """\
 kind = "sobol"
 design = "chaos"      # from values and gradients at few points; or "saltelli": exchanged Sobol' points, samples = rows,
-                      # scrambles × a power of two, of d + 2 solves each; or "given-data" with source = "results/DIRECTORY"
+                      # scrambles × a power of two, of d + 2 solves each; or "given-data", source = "results/DIRECTORY"
 samples = 15          # or tolerance = 1e-3 (leave-one-out error / std; error of an index), or budget_seconds = 600
 second_order = true   # the share of every product of two parameters
 # groups = { load = ["loads.gravity.density"] }   # indices of several parameters together

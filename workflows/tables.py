@@ -162,8 +162,8 @@ def sobol(results: Results, output: str) -> Table:
     for name in map(str, results.dataset["group"].values if "group" in results.dataset.coords else ()):
         of_group = of_output.sel(group=name)
         kinds = [f"sobol_group_{which}" for which in ("first", "total")]
-        pairs = [(float(of_group[kind]), float(of_group[f"{kind}_error"])) for kind in kinds]
-        rows.append((f"group {name}", *(with_error(*pair) for pair in pairs)))
+        texts = [with_error(float(of_group[kind]), float(of_group[f"{kind}_error"])) for kind in kinds]
+        rows.append((f"group {name}", *texts))
     return Table(("parameter", "first order", "total"), rows)
 
 
