@@ -15,7 +15,7 @@ from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangu
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
 
-STUDENT = 2.13
+STUDENT = 2.04  # of a 95 % interval with 31 degrees of freedom
 ISHIGAMI = Inputs({name: Uniform(lower=-np.pi, upper=np.pi) for name in "abc"})
 TOTAL = (0.557588855209959, 0.442411144790041, 0.243683664062148)
 VARIANCE = 13.844587940719254
@@ -95,7 +95,7 @@ def test_measures_of_ishigami():
     np.testing.assert_allclose(data["local_share"][0], [1, 0, 0], atol=1e-12)
 
 
-def test_intervals_cover(monkeypatch):
+def test_standard_errors_are_right_and_intervals_nearly(monkeypatch):
     def none(*_):
         raise SolveError("no expansion is asked for")
 
@@ -107,11 +107,16 @@ def test_intervals_cover(monkeypatch):
 
     # Moments of a: 1, 1.25, 1.75, 2.6875; of 1 + b: 1.5, 7/3.
     nu = np.array([4 * 1.25 * 7 / 3, 2.6875 + 2 * 1.25 + 1])
-    hits = []
-    for seed in range(200):
-        data = run(DerivativeBased(samples=256, seed=seed, fields=False), inputs, function)
-        hits.append(np.abs(data["dgsm"][0] - nu) < STUDENT * data["dgsm_error"][0])
-    assert 0.92 < np.mean(hits) < 0.98
+    errors, claims = [], []
+    for seed in range(1000, 1200):
+        data = run(DerivativeBased(samples=128, seed=seed, fields=False), inputs, function)
+        errors.append(data["dgsm"].to_numpy()[0] - nu)
+        claims.append(data["dgsm_error"].to_numpy()[0])
+    errors, claims = np.array(errors), np.array(claims)
+    ratios = np.sqrt((errors**2).mean(axis=0) / (claims**2).mean(axis=0))
+    assert ((ratios > 0.85) & (ratios < 1.15)).all()
+    # Not 0.95: means over scrambles of what has tails are skewed, see `DerivativeBased`.
+    assert 0.89 < np.mean(np.abs(errors) < STUDENT * claims) < 0.98
 
 
 def test_bound_is_attained_by_linear_functions_of_normal_parameters():

@@ -297,7 +297,7 @@ def test_bounds_are_reported(tmp_path, undrawn):
     [
         {"kind": "sobol", "samples": 12},
         {"kind": "sobol", "design": "saltelli", "samples": 64},
-        {"kind": "derivative-based", "samples": 16},
+        {"kind": "derivative-based", "samples": 32},
     ],
 )
 def test_indices_are_drawn(method):

