@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, realisation, stability, throughput, variance
+from benchmarks import bookkeeping, chaos, coverage, realisation, stability, throughput, variance
 
 ALL = {
     "realisation": realisation.main,
@@ -12,6 +12,8 @@ ALL = {
     "throughput": throughput.main,
     "variance": variance.main,
     "stability": stability.main,
+    "chaos": chaos.main,
+    "coverage": coverage.main,
 }
 
 

@@ -1,4 +1,4 @@
-"""Solving with the factor of another matrix: Anderson mixing for equilibria, block GCR for linear systems.
+"""Solving with the factor of another matrix: Anderson mixing for equilibria, projections for linear systems.
 
 Both improve the plain correction x ← x − P⁻¹r(x) by what earlier corrections have shown of r. On a linear system the
 two span the same spaces. They converge as fast as P resembles the derivative of r; neither needs it symmetric.
@@ -15,6 +15,7 @@ from forward.model import FloatArray
 Inverse = Callable[[FloatArray], FloatArray]  # applies P⁻¹ to (n,) or to rows (k, n)
 Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
 NEGLIGIBLE = 1e-13  # relative size of a direction, in least squares, that is taken to be rounding
+MARGIN = 2.0  # what convergence may fall short of that of the iterations before
 
 
 class AndersonMixing:
@@ -80,7 +81,7 @@ def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray((vectors / values[good]) @ (vectors.T @ (right / size)) / size)
 
 
-def block_gcr(
+def block_galerkin(
     multiply: Callable[[FloatArray], FloatArray],
     precondition: Inverse,
     right: FloatArray,
@@ -88,13 +89,16 @@ def block_gcr(
     size: Callable[[FloatArray], FloatArray],
     tolerance: float,
     iterations: int,
+    first: FloatArray | None = None,
 ) -> FloatArray | None:
-    """Solve A x_i = b_i for all k right-hand sides together by generalised conjugate residuals.
+    """Solve A x_i = b_i for all k right-hand sides together, with residuals orthogonal to all directions searched.
 
-    All residuals are minimised over the sum of their search spaces, so that k systems need fewer iterations than one.
-    Stopped where the next correction P⁻¹r, times the factor by which the last iteration has shortened it, is below the
-    tolerance; that correction is still added, since it costs no product.
-    Source: S. C. Eisenstat, H. C. Elman, M. H. Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357.
+    Where A is symmetric these are block conjugate gradients, whose errors are the smallest in energy; with
+    P ≈ A that says more about x than the size of a residual does. Full orthogonalisation keeps them so after rounding,
+    and allows A without symmetry. All systems share their search spaces, so that k need fewer iterations than one.
+    Stopped where the next correction, times the factor by which both of the last two iterations have shortened it and
+    with a margin, is below the tolerance; that correction is still added, since it costs no product.
+    Sources: D. P. O'Leary, Linear Algebra Appl. 29 (1980) 293–322; Y. Saad, Math. Comp. 37 (1981) 105–126.
 
     Parameters
     ----------
@@ -110,48 +114,65 @@ def block_gcr(
         Error of each solution relative to its size.
     iterations
         Largest number of iterations.
+    first
+        Directions (j, n) that are searched before all others.
 
     Returns
     -------
     numpy.ndarray or None
         Solutions (k, n); nothing if they are not reached.
     """
-    x = np.zeros_like(right)
-    r = np.array(right)
-    search: list[tuple[FloatArray, FloatArray]] = []  # directions, and A times them, orthonormal
-    lengths = np.full(len(right), np.inf)
+    x, r = np.zeros_like(right), np.array(right)
+    most = (0 if first is None else len(first)) + iterations * len(right)
+    directions, images = np.empty((most, right.shape[1])), np.empty((most, right.shape[1]))
+    energies = np.empty((most, most))  # directions · images
+    inverse = np.empty((0, 0))  # of the energies so far
+    searched = 0
+
+    def search(p: FloatArray) -> None:
+        """Make the residuals orthogonal to the directions p (j, n) too."""
+        nonlocal x, r, inverse, searched
+        old, new = slice(searched), slice(searched, searched + len(p))
+        searched = new.stop
+        directions[new], images[new] = p, multiply(p)
+        D, Q = directions[:searched], images[:searched]
+        both = np.concatenate([images[new], r])
+        ahead, back = total(D @ both.T), total(p @ images[old].T)
+        energies[:searched, new], energies[new, old] = ahead[:, : len(p)], back
+        inverse = _scaled_inverse(energies[:searched, :searched])
+        part = (inverse @ ahead[:, len(p) :]).T
+        x = x + part @ D
+        r = r - part @ Q
+
+    if first is not None:
+        search(first)
+    lengths, ratio = np.full(len(right), np.inf), np.zeros(len(right))
     for _ in range(iterations):
-        z = precondition(r)
-        before, lengths = lengths, size(z)
-        factor = np.where(before < np.inf, np.minimum(1, lengths / np.maximum(before, np.finfo(float).tiny)), 1)
+        p = precondition(r)
+        if searched:
+            overlap = total(images[:searched] @ p.T)
+            p -= (inverse @ overlap).T @ directions[:searched]
+        before, lengths = lengths, size(p)
         if not np.isfinite(lengths).all():
             return None
-        unfinished = lengths * factor > tolerance * size(x + z)
+        factor = np.ones(len(right))
+        if np.isfinite(before).all():
+            earlier, ratio = ratio, np.minimum(1, lengths / np.maximum(before, np.finfo(float).tiny))
+            factor = MARGIN * np.maximum(ratio, earlier)
+        unfinished = lengths * factor > tolerance * size(x + p)
         if not unfinished.any():
-            return np.asarray(x + z)
-        z = z[unfinished]
-        q = multiply(z)
-        for _ in range(2):  # the second pass removes what rounding has left
-            for direction, image in search:
-                overlap = total(q @ image.T)
-                q = q - overlap @ image
-                z = z - overlap @ direction
-        z, q = _orthonormal(z, q, total)
-        part = total(r @ q.T)
-        x += part @ z
-        r -= part @ q
-        search.append((z, q))
+            return np.asarray(x + p)
+        search(p[unfinished])
     return None
 
 
-def _orthonormal(z: FloatArray, q: FloatArray, total: Total) -> tuple[FloatArray, FloatArray]:
-    """Combine the rows of z and q alike so that those of q are orthonormal; rows that depend on others drop out."""
-    for _ in range(2):
-        gram = total(q @ q.T)
-        size = np.sqrt(np.diag(gram))
-        size[size == 0] = 1
-        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
-        good = values > NEGLIGIBLE * values[-1]
-        change = ((vectors[:, good] / np.sqrt(values[good])) / size[:, None]).T
-        z, q = change @ z, change @ q
-    return z, q
+def _scaled_inverse(matrix: FloatArray) -> FloatArray:
+    """Invert a small matrix (k, k) of scaled rows and columns, without the directions that are rounding."""
+    if not np.isfinite(matrix).all():
+        return np.full_like(matrix, np.nan)
+    size = np.sqrt(np.abs(np.diag(matrix)))
+    size[size == 0] = 1
+    scale = np.outer(size, size)
+    left, values, right = np.linalg.svd(matrix / scale)
+    good = values > NEGLIGIBLE * values[0]
+    return np.asarray((right[good].T / values[good]) @ left[:, good].T / scale)

@@ -19,7 +19,7 @@ import numpy as np
 import ufl
 
 from forward import fenicsx, kinematics
-from forward.acceleration import Inverse, block_gcr
+from forward.acceleration import block_galerkin
 from forward.functionals import functional
 from forward.geometry import AXES
 from forward.hyperelastic import Hyperelastic
@@ -29,11 +29,11 @@ from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Residual, solve
-from forward.reference import ReferenceFactor
+from forward.reference import ReferenceFactor, turn
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
-ITERATIONS = 20  # of block GCR, before a factor is made after all
+ITERATIONS = 20  # of these derivatives, before a factor is made after all
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
 _OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh)
 
@@ -94,6 +94,7 @@ class Discretisation:
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding: float | None = None
+        self._given: FloatArray | None = None  # parameters that are set
         self._stretch = self._small_stretch()
 
     # --- forms -------------------------------------------------------------------------------------------------------
@@ -276,6 +277,10 @@ class Discretisation:
 
     def set_parameters(self, parameters: FloatArray) -> None:
         """Give the parameters (d,) their values."""
+        self._rounding = None
+        if self._given is not None and np.array_equal(parameters, self._given):
+            return
+        self._given = np.array(parameters, dtype=float)
         self._values |= dict(zip(self.parameters, map(float, parameters), strict=True))
         for path, constant in self._constants.items():
             constant.value = self._values[path]
@@ -288,7 +293,6 @@ class Discretisation:
             for path, force in self._unit_loads.items():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
-        self._rounding = None
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
@@ -615,12 +619,11 @@ class HyperelasticModel:
             self._factorised = solution
         return body
 
-    def near_reference(self, solution: FiniteElementSolution, reference: Reference, *, transpose: bool) -> Inverse:
-        """Return the approximate inverse of the stiffness at a solution that its reference gives."""
+    def take_reference(self, reference: Reference) -> ReferenceFactor:
+        """Return the factor of a reference; this may change parameters and state."""
         self._visited = None
         self.reference.prepare(reference)
-        self.visit(solution)
-        return self.reference.near(solution.state, transpose=transpose)
+        return self.reference
 
 
 class _Way:
@@ -679,30 +682,57 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
-    def _solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
-        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local)."""
+    @cached_property
+    def _rotation(self) -> FloatArray:
+        """Rotations of the nodes from the reference to this solution."""
+        model = self._model
+        assert self._reference is not None
+        factor = model.take_reference(self._reference)
+        model.visit(self)
+        return factor.rotation(self.state)
+
+    def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
+        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
         model = self._model
         if self._reference is not None and len(right) <= FEW:
-            inverse = model.near_reference(self, self._reference, transpose=transpose)
-            body = model.visit(self)
-            weights = body.weights()
-            found = block_gcr(
-                lambda x: weights * body.free_stiffness_times(x, transpose=transpose),
-                lambda r: inverse(r / weights),
-                weights * right,
-                body.total,
-                body.norms,
-                model.spec.solver.derivative_tolerance,
-                ITERATIONS,
-            )
+            found = self._solve_near(right, self._reference, transpose=transpose, directions=directions)
             if found is not None:
                 return found
         return model.linearise(self).back_substitute(right, transpose=transpose)
 
+    def _solve_near(
+        self, right: FloatArray, reference: Reference, *, transpose: bool, directions: FloatArray | None
+    ) -> FloatArray | None:
+        """Solve with the factor of the reference; nothing if that is too far away."""
+        model, R = self._model, self._rotation
+        factor = model.take_reference(reference)
+        fixed = model.body.fixed
+        first = None
+        if directions is not None and directions.shape[1] <= FEW:
+            # Turned along, the tangents at the reference are what a first back-substitution would give.
+            first = turn(directions @ factor.slopes(), R)
+            first[:, fixed] = 0
+        body = model.visit(self)
+        free = np.array(right)
+        free[:, fixed] = 0
+        found = block_galerkin(
+            lambda x: body.free_stiffness_times(x, transpose=transpose),
+            factor.inverse(R, transpose=transpose),
+            free,
+            body.total,
+            body.norms,
+            model.spec.solver.derivative_tolerance,
+            ITERATIONS,
+            first,
+        )
+        if found is not None:
+            found[:, fixed] = right[:, fixed]
+        return found
+
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
         directions = np.atleast_2d(direction)
-        du = self._solve(directions @ self._right_sides)
+        du = self._solve(directions @ self._right_sides, directions=directions)
         return du.reshape(*np.shape(direction)[:-1], -1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:

@@ -86,6 +86,13 @@ class _SixSided(Settings):
         """Smallest and largest coordinate (m) along each axis."""
         return tuple((min(along), max(along)) for along in zip(*self.vertices, strict=True))
 
+    @property
+    def longest_edge(self) -> float:
+        """Length (m) of the longest edge of a cell (the diagonals of tetrahedra apart)."""
+        corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
+        edges = [np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() / n for a, n in enumerate(self.cells)]
+        return float(max(edges))
+
     def corners_of(self, boundary: str) -> list[Vector]:
         """The four corners (m) of a boundary."""
         axis, end = boundary.split("-")

@@ -246,7 +246,7 @@ def _predict_correct(
         residual = system.residual(u)
         close = np.isfinite(residual.size)
         if close:
-            u, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
+            u, _, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
         if close and target == 1:
             return u
         if close:
@@ -280,8 +280,8 @@ def _mix(
     inverse: Inverse,
     limit: int,
     history: list[str],
-) -> tuple[FloatArray, bool]:
-    """Correct u with one factor; return the best state, and whether it is an equilibrium."""
+) -> tuple[FloatArray, Residual, bool]:
+    """Correct u with one factor; return the best state, its residual, and whether it is an equilibrium."""
     mixing = AndersonMixing(inverse, WINDOW, len(u), system.total, system.weights())
     best, smallest, since = u, residual, 0
     sizes: list[float] = []
@@ -293,7 +293,7 @@ def _mix(
         if _converged(system, tolerance, u, residual, sizes):
             # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
             convex = last is None or system.curvature(u - last[0], residual.vector - last[1].vector) >= 0
-            return u, convex and system.smallest_jacobian(u) > 0
+            return u, residual, convex and system.smallest_jacobian(u) > 0
         if iteration > 0 and residual.size < smallest.size:
             best, smallest, since = u, residual, 0
         else:
@@ -306,7 +306,7 @@ def _mix(
         if not np.isfinite(residual.size):
             history.append("correction: the state has no finite residual")
             break
-    return best, False
+    return best, smallest, False
 
 
 def _converged(system: System, tolerance: float, u: FloatArray, residual: Residual, sizes: list[float]) -> bool:
@@ -386,10 +386,9 @@ def _iterate(
         longest = max(longest, length)
         u, residual = _admissible_step(system, settings, u, step)
         if settings.kind != "newton" and length < NEAR * before < np.inf:
-            u, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
+            u, residual, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
                 return _accepted(system, settings, u, factorised=True), iteration + 1
-            residual = system.residual(u)
     message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
     raise _Diverged(message + _instability(system))
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.acceleration import Inverse
-from forward.model import FloatArray, Reference
+from forward.model import FloatArray, Reference, Work
 
 if TYPE_CHECKING:
     from forward.finite_element import Discretisation
@@ -48,6 +48,15 @@ def _determinant(F: FloatArray) -> FloatArray:
     return np.asarray((F[0] * _cross(F[1], F[2])).sum(axis=0))
 
 
+def turn(x: FloatArray, R: FloatArray) -> FloatArray:
+    """Return x (n,) or rows (k, n) with the vectors of the nodes turned by R (3, 3, n_owned); what follows is kept."""
+    n = 3 * R.shape[2]
+    y = np.array(x)
+    for i in range(3):  # nine products of long vectors: much faster than many small matrices
+        y[..., i:n:3] = R[i, 0] * x[..., 0:n:3] + R[i, 1] * x[..., 1:n:3] + R[i, 2] * x[..., 2:n:3]
+    return y
+
+
 def turned(inverse: Inverse, R: FloatArray, fixed: NDArray[np.int64]) -> Inverse:
     """Return x → R K̄⁻¹ Rᵀ x on the free unknowns, and the identity on the prescribed ones.
 
@@ -60,14 +69,6 @@ def turned(inverse: Inverse, R: FloatArray, fixed: NDArray[np.int64]) -> Inverse
     fixed
         Positions of the prescribed unknowns.
     """
-    n = 3 * R.shape[2]
-
-    def turn(x: FloatArray, R: FloatArray) -> FloatArray:
-        y = np.array(x)
-        for i in range(3):  # nine products of long vectors: much faster than many small matrices
-            y[..., i:n:3] = R[i, 0] * x[..., 0:n:3] + R[i, 1] * x[..., 1:n:3] + R[i, 2] * x[..., 2:n:3]
-        return y
-
     back = R.swapaxes(0, 1)
 
     def correct(x: FloatArray) -> FloatArray:
@@ -89,25 +90,48 @@ class ReferenceFactor:
         self._solver = body.new_solver()
         self._rotations = np.empty((3, 3, 0))
         self._reference: Reference | None = None
+        self._slopes: FloatArray | None = None
 
     def prepare(self, reference: Reference) -> None:
         """Factorise at a reference, if the factor at hand is another's; this changes parameters and state."""
         if self._reference is not None and self._reference.same(reference):
             return
-        body = self._body
-        self._reference = None
-        body.set_parameters(reference.parameters)
-        body.at_load(1.0)
-        body.set_state(reference.state)
+        self._reference = self._slopes = None
+        body = self._set(reference)
         self._solver.factorise()
         self._rotations = rotations(body.gradients())
         self._reference = reference
 
-    def near(self, u: FloatArray, *, transpose: bool = False) -> Inverse:
-        """Return the approximate inverse at a state u (U_local,)."""
+    def _set(self, reference: Reference) -> Discretisation:
+        body = self._body
+        body.set_parameters(reference.parameters)
+        body.at_load(1.0)
+        body.set_state(reference.state)
+        return body
+
+    def slopes(self) -> FloatArray:
+        """Derivatives (d, U_local) of the state at the reference; this may change parameters and state."""
+        if self._slopes is None:
+            assert self._reference is not None
+            body = self._set(self._reference)
+            kept, body.work = body.work, Work()  # the first solution is charged no more than the others
+            self._slopes = self._solver.solve(body.right_sides())
+            body.work = kept
+        return self._slopes
+
+    def rotation(self, u: FloatArray) -> FloatArray:
+        """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
         body = self._body
         body.set_state(u)
-        R = np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations)
+        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations))
+
+    def near(self, u: FloatArray) -> Inverse:
+        """Return the approximate inverse at a state u (U_local,)."""
+        return self.inverse(self.rotation(u))
+
+    def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
+        """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
+        body = self._body
 
         def inverse(right: FloatArray) -> FloatArray:
             body.work.back_substitutions += 1 if right.ndim == 1 else len(right)

@@ -191,6 +191,20 @@ def test_the_plan_says_the_form():
     assert "mixed form: displacements and pressures" in mixed[1]
 
 
+def test_the_plan_warns_of_a_transition_narrower_than_a_cell():
+    document_ = blocks()
+    body = document_["model"]["body"]
+    edge = max(size / n for size, n in zip(body["size"], body["cells"], strict=True))
+    inclusion = {"name": "tumour", "kind": "sphere", "x": 0, "y": 0, "z": 0, "radius": 0.01, "contrast": 10.0}
+    warned = []
+    for width in (0.99 * edge, 1.01 * edge):
+        document_["model"]["inclusions"] = [inclusion | {"width": width}]
+        warned.append([line for line in plan(parse(document_)) if line.startswith("warning")])
+    assert len(warned[0]) == 1
+    assert "inclusions.tumour.width" in warned[0][0]
+    assert warned[1] == []
+
+
 def test_overrides():
     study = parse(blocks(), ["method.samples=7", "model.loads.gravity.density=800", "parameters.material.D1.a=3"])
     assert study.method.samples == 7

@@ -65,6 +65,8 @@ def test_a_box_is_a_block():
     box = Box(size=(1.0, 0.7, 0.8), cells=(2, 1, 1))
     same = block(box.vertices)
     assert same.vertices == box.vertices
+    assert box.longest_edge == 0.8
+    assert same.model_copy(update={"cells": box.cells}).longest_edge == pytest.approx(0.8)
     assert same.bounds == box.bounds == ((0, 1), (0, 0.7), (0, 0.8))
     for face in FACES:
         assert same.corners_of(face) == box.corners_of(face)

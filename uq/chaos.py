@@ -43,6 +43,8 @@ ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
 FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
 DICTIONARY = 2000  # functions to select from, at most
 FIELD_DICTIONARY = 500  # the same where fields are expanded: every block of samples keeps a field for each function
+FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
+ROUNDING = 1e-13  # relative error below which there is nothing left to select for
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
 GROWTH = 1.5  # of the design, from one look at the tolerance to the next
@@ -200,46 +202,56 @@ def _first(inputs: Inputs, *, gradients: bool) -> int:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Some functions of the largest basis, by their numbers; order and q of the set that they are from."""
+    """Some functions of the largest basis, by their numbers; order and q of the set that they are from.
+
+    Where `sparse` is set they are a dictionary, to select functions from.
+    """
 
     order: int
     q: float
     which: IntArray
+    sparse: bool = False
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Sets to choose from, whole or (where `sparse`) function by function; `all` (P, d) is their union."""
+    """Sets to choose from; `all` (P, d) is their union."""
 
     all: IntArray
     sets: tuple[_Candidate, ...]
-    sparse: bool
-    most: int
 
 
 def _whole(inputs: Inputs, order: int) -> _Candidates:
     """Return the full basis of one order as the only choice."""
     indices = hyperbolic(len(inputs.names), order, 1.0)
-    whole = _Candidate(order, 1.0, np.arange(len(indices)))
-    return _Candidates(indices, (whole,), sparse=False, most=len(indices))
+    return _Candidates(indices, (_Candidate(order, 1.0, np.arange(len(indices))),))
 
 
 def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _Candidates:
-    """Return the bases that `rows` rows may determine, or sets of up to `dictionary` functions to select from."""
+    """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
     d = len(inputs.names)
-    sparse = d > FULL
-    most = dictionary if sparse else max(rows // ROWS_PER_TERM, d + 1)
-    found: dict[tuple[tuple[int, ...], ...], tuple[int, float]] = {}
+    most = max(rows // ROWS_PER_TERM, d + 1)
+    found: dict[tuple[bool, tuple[tuple[int, ...], ...]], tuple[int, float]] = {}
+    determined = False
     for q in reversed(TRUNCATIONS):
         for order in range(1, max_order + 1):
             indices = hyperbolic(d, order, q)
-            if len(indices) > most and order > 1:
-                break
-            found.setdefault(tuple(map(tuple, indices.tolist())), (order, q))
-    union = sorted({index for members in found for index in members}, key=by_degree)
+            members = tuple(map(tuple, indices.tolist()))
+            if d <= FULL and (len(indices) <= most or order == 1):
+                found.setdefault((False, members), (order, q))
+            if len(indices) <= dictionary or order == 1:
+                widest = members, order
+        if (True, widest[0]) not in found and not determined:
+            found[True, widest[0]] = (widest[1], q)
+        # Nothing is lost by selecting from all of them where there are as many rows.
+        determined = determined or (widest[1] == max_order and len(widest[0]) <= rows)
+    union = sorted({index for _, members in found for index in members}, key=by_degree)
     number = {index: i for i, index in enumerate(union)}
-    sets = [_Candidate(order, q, np.array([number[a] for a in members])) for members, (order, q) in found.items()]
-    return _Candidates(np.array(union, dtype=np.int64), tuple(sets), sparse, most)
+    sets = [
+        _Candidate(order, q, np.array([number[a] for a in members]), sparse)
+        for (sparse, members), (order, q) in found.items()
+    ]
+    return _Candidates(np.array(union, dtype=np.int64), tuple(sets))
 
 
 # --- regression ----------------------------------------------------------------------------------------------------
@@ -305,7 +317,9 @@ class _Fit:
     coefficients
         (P, m).
     without
-        Coefficients (n, P, m) of the fits that leave one sample out.
+        Coefficients (g, P', m), of all functions of the largest basis, of fits that leave a gth of the samples out.
+    sampled
+        Standard errors (P, m) of the coefficients as of a regression with independent errors of any sizes.
     triangle
         R (P, P) of the matrix of the regression, of which the Gram matrix is RᵀR.
     loo, relative
@@ -317,10 +331,30 @@ class _Fit:
     chosen: _Candidate
     coefficients: FloatArray
     without: FloatArray
+    sampled: FloatArray
     triangle: FloatArray
     loo: FloatArray
     relative: FloatArray
     squares: FloatArray
+
+
+@dataclass(frozen=True)
+class _Folds:
+    """What was selected without some of the samples.
+
+    Attributes
+    ----------
+    held
+        Number (n,) of the selection that went without the sample.
+    which
+        Functions (K, P) of each selection.
+    errors
+        Errors (n, rows, m) at each sample of the fit without it.
+    """
+
+    held: IntArray
+    which: IntArray
+    errors: FloatArray
 
 
 def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
@@ -332,83 +366,106 @@ def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
         If there are not enough samples.
     """
     left, right = data.left(largest), data.right
-    rows = left.shape[0] * left.shape[1]
-    scores: list[tuple[float, _Candidate]] = []
+    n, rows, _ = right.shape
+    d = largest.indices.shape[1]
+    held = np.arange(n) % min(n, FOLDS)
+    scores: list[tuple[float, _Candidate, _Folds | None]] = []
     for candidate in candidates.sets:
-        if candidates.sparse:
-            scores += _select(left, right, data, candidate, rows // ROWS_PER_TERM)
-        elif candidate.which.size <= min(candidates.most, rows) and (
-            candidate.order == 1 or len(candidates.sets) == 1 or candidate.which.size * ROWS_PER_TERM <= rows
+        terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
+        if candidate.sparse and (d > FULL or n * rows > d):
+            scores.append(_select(left, right, data, candidate, held, most))
+        elif (
+            not candidate.sparse
+            and terms <= n * rows
+            and (candidate.order == 1 or len(candidates.sets) == 1 or terms <= most)
         ):
-            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(rows, -1))
+            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(n * rows, -1))
             size = np.abs(np.diag(r))
             if size.min() > 1e-10 * size.max():
-                scores.append((_score(q, right, data), candidate))
-    scores = [(score, candidate) for score, candidate in scores if np.isfinite(score)]
+                blocks = q.reshape(n, rows, terms)
+                residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
+                scores.append((float(data.relative(_left_out(blocks, residual, held)).max()), candidate, None))
+    scores = [found for found in scores if np.isfinite(found[0])]
     if not scores:
-        message = f"{len(data.points)} samples have an answer, too few for an expansion of order 1"
+        message = f"{n} samples have an answer, too few for an expansion of order 1"
         raise SolveError(message)
-    best = min(score for score, _ in scores)
+    best = min(score for score, *_ in scores)
     # Of those that are as good, the smallest.
-    good = [candidate for score, candidate in scores if score <= 1.05 * best + 1e-13]
-    return _regress(left, right, data, min(good, key=lambda candidate: candidate.which.size))
+    good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
+    return _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
 
 
-def _score(q: FloatArray, right: FloatArray, data: _Data) -> float:
-    """Largest relative leave-one-out error of a fit whose orthonormal columns are q (n·rows, P)."""
-    blocks = q.reshape(*right.shape[:2], -1)
-    residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
-    return float(data.relative(_left_out(blocks, residual)).max())
+def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
+    """Errors (n, rows, m) at each sample of the fit without those that share its number in `held` (n,).
 
-
-def _left_out(blocks: FloatArray, residual: FloatArray) -> FloatArray:
-    """Errors (n, rows, m) at each sample of the fit without it, from the orthonormal columns and the residuals."""
-    rest = np.eye(blocks.shape[1]) - blocks @ np.swapaxes(blocks, 1, 2)
-    needed = np.linalg.eigvalsh(rest)[:, 0] < 1e-10  # without this sample the fit is not determined
-    rest[needed] = np.eye(blocks.shape[1])
-    errors = np.linalg.solve(rest, residual)
-    errors[needed] = np.inf
-    return np.asarray(errors)
+    They follow from the orthonormal columns (n, rows, P) and the residuals.
+    """
+    errors = np.empty_like(residual)
+    for number in np.unique(held):
+        out = held == number
+        part = blocks[out].reshape(-1, blocks.shape[2])
+        rest = np.eye(len(part)) - part @ part.T
+        if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
+            errors[out] = np.inf
+        else:
+            errors[out] = np.linalg.solve(rest, residual[out].reshape(len(part), -1)).reshape(residual[out].shape)
+    return errors
 
 
 def _select(
-    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, most: int
-) -> list[tuple[float, _Candidate]]:
+    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, held: IntArray, most: int
+) -> tuple[float, _Candidate, _Folds]:
     """Take functions one by one, each time the one that explains most of what all outputs have left.
 
-    Orthogonal least squares: after every step the columns of the dictionary are made orthogonal to those taken.
+    Orthogonal least squares, from all samples and, to learn when to stop, without those of each number in `held` (n,):
+    what is selected by samples cannot be judged by them.
+
+    Returns
+    -------
+    float, _Candidate, _Folds
+        The relative error at the samples left out, the functions selected from all, and those selected without some.
     """
     n, rows, m = right.shape
-    columns = left[:, :, dictionary.which].reshape(n * rows, -1).copy()
-    lengths = (columns**2).sum(axis=0)
-    rest = right.reshape(n * rows, m) / np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
-    taken: list[int] = []
-    q = np.empty((n * rows, 0))
-    found: list[tuple[float, _Candidate]] = []
-    best, waited = np.inf, 0
-    while len(taken) < min(most, columns.shape[1]) and waited < PATIENCE:
-        left_over = (columns**2).sum(axis=0)
+    columns = left[:, :, dictionary.which].reshape(n * rows, -1)
+    # The last of these fits sees everything.
+    numbers = np.arange(held.max() + 2)
+    seen = np.repeat(held[None, :] != numbers[:, None], rows, axis=1).astype(float)
+    scale = np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    rest = np.tile(right.reshape(n * rows, m) / scale, (len(numbers), 1, 1))
+    lengths = seen @ columns**2
+    left_over = lengths.copy()
+    taken: list[IntArray] = []
+    limit = min(most, columns.shape[1])
+    q = np.empty((len(numbers), n * rows, limit))
+    scores: list[float] = []
+    left_out: list[FloatArray] = []
+    while (step := len(taken)) < limit and (
+        not scores or (step - int(np.argmin(scores)) <= PATIENCE and min(scores) > ROUNDING)
+    ):
         usable = left_over > 1e-8 * lengths
-        if not usable.any():
+        if not usable.any(axis=1).all():
             break
-        gains = np.where(usable, ((columns.T @ rest) ** 2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0)
-        pick = int(gains.argmax()) if taken else 0  # the constant comes first
-        column = columns[:, pick]
-        column = column - q @ (q.T @ column)
-        column /= np.linalg.norm(column)
-        q = np.column_stack([q, column])
-        columns -= np.outer(column, column @ columns)
-        rest = rest - np.outer(column, column @ rest)
+        pick = np.zeros(len(numbers), dtype=np.int64)  # the constant comes first
+        if taken:
+            gains = np.swapaxes(rest * seen[:, :, None], 1, 2) @ columns
+            pick = np.where(usable, (gains**2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0).argmax(axis=1)
+        column = columns[:, pick].T
+        earlier = q[:, :, :step]
+        column = column - (earlier @ (np.swapaxes(earlier, 1, 2) @ (column * seen)[:, :, None]))[:, :, 0]
+        column = column / np.sqrt((column**2 * seen).sum(axis=1))[:, None]
+        q[:, :, step] = column
+        left_over -= ((column * seen) @ columns) ** 2
+        rest = rest - column[:, :, None] * np.einsum("fn,fnm->fm", column * seen, rest)[:, None, :]
         taken.append(pick)
-        score = _score(q, right, data)
-        which = dictionary.which[np.array(taken)]
-        found.append((score, _Candidate(dictionary.order, dictionary.q, which)))
-        waited = 0 if score < best else waited + 1
-        best = min(best, score)
-    return found
+        left_out.append(rest.reshape(len(numbers), n, rows, m)[held, np.arange(n)] * scale)
+        scores.append(float(data.relative(left_out[-1]).max()))
+    count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
+    picks = dictionary.which[np.array(taken[:count])]
+    chosen = _Candidate(dictionary.order, dictionary.q, picks[:, -1], sparse=True)
+    return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1])
 
 
-def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate) -> _Fit:
+def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate, folds: _Folds | None) -> _Fit:
     from scipy.linalg import solve_triangular
 
     n, rows, m = right.shape
@@ -416,14 +473,38 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
     blocks = q.reshape(n, rows, -1)
     rotated = np.einsum("zrp,zrm->pm", blocks, right)
     residual = right - blocks @ rotated
-    errors = _left_out(blocks, residual)
-    terms = chosen.which.size
-    moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
     coefficients = solve_triangular(r, rotated)
-    without = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
-    return _Fit(
-        chosen, coefficients, without, r, data.size(errors), data.relative(errors), (residual**2).sum(axis=(0, 1))
-    )
+    if folds is None:
+        errors = _left_out(blocks, residual, np.arange(n))
+        terms = chosen.which.size
+        moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
+        without = np.zeros((n, left.shape[2], m))
+        without[:, chosen.which] = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
+    else:
+        errors = folds.errors
+        without = np.zeros((len(folds.which), left.shape[2], m))
+        for k, which in enumerate(folds.which):
+            kept = folds.held != k
+            matrix = left[kept][:, :, which].reshape(-1, which.size)
+            without[k, which] = np.linalg.lstsq(matrix, right[kept].reshape(-1, m), rcond=None)[0]
+    squares = (residual**2).sum(axis=(0, 1))
+    sampled = _sampled(blocks, residual, r)
+    return _Fit(chosen, coefficients, without, sampled, r, data.size(errors), data.relative(errors), squares)
+
+
+def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Standard errors (P, m) of coefficients from the residuals of samples that are independent of each other.
+
+    With (I − H_z)^(−1/2) r_z for the errors of sample z (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002)
+    169–181), which has the right variance where all rows err alike.
+    """
+    from scipy.linalg import solve_triangular
+
+    n, rows, m = residual.shape
+    sizes, axes = np.linalg.eigh(np.eye(rows) - blocks @ np.swapaxes(blocks, 1, 2))
+    scaled = (np.swapaxes(axes, 1, 2) @ residual) / np.sqrt(np.maximum(sizes, 1e-10))[:, :, None]
+    moved = np.einsum("zrp,zrm->pzm", blocks, axes @ scaled).reshape(-1, n * m)
+    return np.asarray(np.sqrt((solve_triangular(triangle, moved).reshape(-1, n, m) ** 2).sum(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -480,7 +561,8 @@ class Regression:
 
     def estimates(self, of: Analysis = moments_and_indices) -> dict[str, FloatArray]:
         """Return what follows from the coefficients, by output, with standard errors."""
-        return _estimates(self.fit, self.indices, cautious=_cautious(self.inputs), of=of)
+        n = len(self.data.points)
+        return _estimates(self.fit, self.largest.indices, n, cautious=_cautious(self.inputs), of=of)
 
 
 @dataclass(frozen=True)
@@ -525,7 +607,9 @@ class _Projections:
             if self.gradients:
                 left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
                 right = np.vstack([right, solution.state_tangent(directions)])
-            total = np.vstack([left.T @ right, (right**2).sum(axis=0)])
+            total = np.empty((left.shape[1] + 1, right.shape[1]))
+            np.matmul(left.T, right, out=total[:-1])
+            np.einsum("ru,ru->u", right, right, out=total[-1])
             if self.points is None or self.weights is None:
                 return total
             return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
@@ -538,30 +622,39 @@ class _Projections:
 
 def _cautious(inputs: Inputs) -> bool:
     """Whether the samples may hide what the expansion misses, see `_estimates`."""
-    return None in [m.support for m in inputs.marginals.values()] or len(inputs.names) > FULL
+    return None in [m.support for m in inputs.marginals.values()]
 
 
 def _estimates(
-    fit: _Fit, indices: IntArray, *, cautious: bool, of: Analysis = moments_and_indices
+    fit: _Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis = moments_and_indices
 ) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
-    The jackknife is taken around the estimate itself, so that a bias counts too. To it comes what no coefficient can
-    show, the part r of the function outside the basis, whose norm is the leave-one-out error λ. For the indices this is
-    its share (λ/σ)² of the variance. For the standard deviation it is λ/√n, as if r were n independent values; where
-    distributions have tails, r is large there and no sample says so, and where functions were selected, the same
-    samples selected them: there, `cautious`, it is λ, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the mean. (Without,
-    intervals of functions of normal and gamma parameters covered 60 % instead of 95 %.)
+    The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
+    parts select anew: what the samples chose is uncertain as they are.
+
+    The jackknife asks of a fit what it does in the hole that a sample left, and claims too much; a regression with
+    independent errors takes the rest, which is smooth, for noise, and claims too little. For the mean, the geometric
+    mean of the two is claimed: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
+    jackknife 97 to 100 % at up to four times the length, the others 63 to 100 %. For the standard deviation, where
+    the rest that no polynomial takes is a bias, it is the jackknife: 92 to 100 %.
+
+    Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
+    there, `cautious`, its norm, the leave-one-out error λ, is added: λ for the standard deviation, as |σ_f − σ_g| ≤
+    ‖f − g‖, and λ/√n for the mean, which keeps the jackknife. (Without, intervals of functions of normal and gamma
+    parameters covered 60 % instead of 95 %.) The indices always have its share (λ/σ)² of the variance.
     """
+    indices = largest[fit.chosen.which]
     central = of(fit.coefficients.T, indices)
-    left_out = of(np.swapaxes(fit.without, 1, 2), indices)
-    n = len(fit.without)
+    left_out = of(np.swapaxes(fit.without, 1, 2), largest)
+    groups = len(fit.without)
     share = _ratio(fit.loo**2, central["std"] ** 2)
-    mean = fit.loo / np.sqrt(n) if cautious else np.zeros_like(fit.loo)
-    std = fit.loo if cautious else fit.loo / np.sqrt(n)
-    missing = {"mean": mean, "std": std}
+    nothing = np.zeros_like(fit.loo)
+    missing = {"mean": fit.loo / np.sqrt(n) if cautious else nothing, "std": fit.loo if cautious else nothing}
     for name, values in left_out.items():
-        spread = np.sqrt((n - 1) / n * ((values - central[name]) ** 2).sum(axis=0))
+        spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
+        if name == "mean" and not cautious:
+            spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
         unseen = missing.get(name, share)
         central[f"{name}_error"] = np.hypot(spread, unseen.reshape(-1, *(1,) * (spread.ndim - 1)))
     return central
@@ -585,7 +678,7 @@ def _dataset(
 ) -> xr.Dataset:
     basis = largest.subset(fit.chosen.which)
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = _estimates(fit, basis.indices, cautious=_cautious(inputs))
+    estimates = _estimates(fit, largest.indices, len(data.points), cautious=_cautious(inputs))
     lower, upper = (
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))

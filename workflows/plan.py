@@ -32,6 +32,8 @@ def plan(study: Study, groups: int = 1) -> list[str]:
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
     up_to = "up to " if getattr(study.method, "open_ended", False) else ""
+    edge = body.longest_edge
+    narrow = [inclusion for inclusion in study.model.inclusions if inclusion.width < edge]
     return [
         f"method      {study.method.kind}",
         f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
@@ -41,6 +43,11 @@ def plan(study: Study, groups: int = 1) -> list[str]:
         f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each:.2g} s a solve)",
+        *(
+            f"warning     inclusions.{inclusion.label}.width = {inclusion.width:g} m is below a cell ({edge:.3g} m):"
+            " few quadrature points see the transition, and derivatives by place and size are rough"
+            for inclusion in narrow
+        ),
     ]
 
 
