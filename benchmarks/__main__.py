@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bookkeeping, chaos, coverage, realisation, stability, throughput, variance
+from benchmarks import (
+    bookkeeping,
+    chaos,
+    fields,
+    levels,
+    realisation,
+    stability,
+    streaming,
+    throughput,
+    variance,
+)
 
 ALL = {
     "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "variance": variance.main,
+    "levels": levels.main,
+    "fields": fields.main,
+    "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,
-    "coverage": coverage.main,
 }
 
 

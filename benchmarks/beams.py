@@ -12,3 +12,8 @@ CONFIG = Path(__file__).parent.parent / "configs" / "beam.toml"
 def beam(cells: tuple[int, int, int], *changes: str) -> Study:
     """Return the study of the published beam on a mesh of P2 hexahedra."""
     return load(CONFIG, [f"model.body.cells={list(cells)}", *changes])
+
+
+def field_beam(cells: tuple[int, int, int], *changes: str) -> Study:
+    """Return the study of the beam with a random stiffness field on a mesh of P2 hexahedra."""
+    return load(CONFIG.with_name("beam-field.toml"), [f"model.body.cells={list(cells)}", *changes])

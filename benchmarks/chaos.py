@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import chaospy
@@ -15,11 +14,12 @@ from mpi4py import MPI
 from scipy.linalg import cho_solve
 
 from benchmarks.beams import CONFIG
-from forward.model import FloatArray, ForwardModel, FunctionModel
+from forward.model import WORK, FloatArray, ForwardModel, FunctionModel
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import Chaos, _moments, _Projections, load
+from uq.chaos import Chaos, Projections, load
 from uq.distributions import Beta, Uniform
-from uq.evaluate import Evaluations, Request, SerialEvaluate
+from uq.evaluate import Evaluations, Merger, Request, SerialEvaluate
+from uq.indices import coefficient_moments
 from uq.inputs import Inputs
 from uq.sampling import random_points
 from workflows.config import load as load_study
@@ -261,20 +261,27 @@ def _fields() -> None:
 
 
 def _own_fields(inputs: Inputs, order: int, points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sum the right-hand sides sample by sample, as states stream by, and solve: the path of `uq.chaos`."""
+    """Sum the right-hand sides as blocks of one sample come in, and solve: the path of `uq.chaos`."""
     basis = orthonormal(inputs, hyperbolic(len(inputs.names), order, 1.0))
-    whole: Any = SimpleNamespace(scatter=lambda rows: rows)
-    row = _Projections(basis, fields[0], False, None, None).on(whole)
-    total = None
+    merger = Merger(Projections(basis, fields[0], False, None, None))
     for point, state in zip(points, fields, strict=True):
-        solution: Any = SimpleNamespace(state=state)
-        part = row(solution, point)
-        total = part.copy() if total is None else np.add(total, part, out=total)
-    assert total is not None
+        merger.add(
+            Evaluations(
+                point[None, :],
+                np.zeros((1, 1)),
+                None,
+                (),
+                np.zeros(1),
+                np.zeros((1, len(WORK)), dtype=np.int64),
+                np.zeros(1),
+                np.ones(1, dtype=bool),
+                (state - fields[0])[None, :],
+            )
+        )
     triangle = np.linalg.qr(basis.values(points), mode="r")
-    coefficients = cho_solve((triangle, False), total[:-1])
+    coefficients = cho_solve((triangle, False), merger.result().fields[:-1])
     coefficients[0] += fields[0]
-    moments = _moments(coefficients.T, basis.indices)
+    moments = coefficient_moments(coefficients.T, basis.indices)
     return moments["mean"], moments["std"]
 
 

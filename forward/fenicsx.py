@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import basix
 import basix.cell
@@ -28,6 +28,9 @@ petsc4py.init(["tissuq", "-no_signal_handler"])  # PETSc would end the study whe
 
 from dolfinx import fem, geometry, mesh, plot  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
 
@@ -132,6 +135,44 @@ def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]], degree: int) -
 def vector_space(msh: Any, degree: int) -> Any:
     """Continuous vector-valued Lagrange elements."""
     return fem.VectorFunctionSpace(msh, ("Lagrange", degree))
+
+
+def scalar_space(msh: Any, degree: int) -> Any:
+    """Continuous scalar Lagrange elements."""
+    return fem.FunctionSpace(msh, ("Lagrange", degree))
+
+
+def interpolate(values: Any, space: Any) -> FloatArray:
+    """Return this rank's values of a function at the nodes of another space on its mesh."""
+    other = fem.Function(space)
+    other.interpolate(values)
+    return np.array(other.x.array[: owned_nodes(space)])
+
+
+def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
+    """Mesh a body by hexahedra in this process; return trilinear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them."""
+    from scipy.sparse import csr_matrix
+
+    msh, _ = mesh_body(MPI.COMM_SELF, body.model_copy(update={"cell": "hexahedron"}))
+    space = scalar_space(msh, 1)
+    v, w = ufl.TestFunction(space), ufl.TrialFunction(space)
+    parts = [constant(msh, 0.0) for _ in range(3)]
+    exact = {"quadrature_degree": 3}
+    dx, ds = ufl.dx(domain=msh, metadata=exact), ufl.ds(domain=msh, metadata=exact)
+    form = compile_form(
+        parts[0] * v * w * dx + parts[1] * ufl.inner(ufl.grad(v), ufl.grad(w)) * dx + parts[2] * v * w * ds,
+        MPI.COMM_SELF,
+    )
+    matrices = []
+    for part in parts:
+        for other in parts:
+            other.value = float(other is part)
+        matrix = fem.petsc.assemble_matrix(form)
+        matrix.assemble()
+        indptr, indices, values = matrix.getValuesCSR()
+        matrices.append(csr_matrix((values, indices, indptr), shape=matrix.getSize()))
+        matrix.destroy()
+    return space, matrices
 
 
 class Unknowns:
@@ -320,9 +361,12 @@ class NodalGradients:
 
 
 class VectorAssembler:
-    """A compiled linear form with its vector, used again for every assembly."""
+    """A compiled linear form with its vector, used again for every assembly.
 
-    def __init__(self, form: Any, unknowns: Unknowns, comm: Any) -> None:
+    Its test functions are those of the unknowns, or of any other space where no unknowns are given.
+    """
+
+    def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any) -> None:
         self._form = compile_form(form, comm)
         self._unknowns = unknowns
         self._vector = fem.petsc.create_vector(self._form)
@@ -333,7 +377,8 @@ class VectorAssembler:
             local.set(0.0)
         fem.petsc.assemble_vector(self._vector, self._form)
         self._vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-        return self._unknowns.take(self._vector.array_r)
+        values = self._vector.array_r
+        return np.array(values) if self._unknowns is None else self._unknowns.take(values)
 
 
 class ScalarAssembler:

@@ -28,8 +28,9 @@ from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS
 from forward.model import FloatArray, Reference, SolveError, Work
-from forward.newton import Residual, solve
+from forward.newton import Found, Residual, solve
 from forward.reference import ReferenceFactor, turn
+from forward.vertex_fields import VertexField
 
 STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
@@ -66,6 +67,8 @@ class Discretisation:
             if not path.startswith("displacements.")
         }
         self._variables = {path: ufl.variable(constant) for path, constant in self._constants.items()}
+        self.scalars = np.array([i for i, path in enumerate(parameters) if path in self._values], dtype=np.int64)
+        self.fields = tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
         self._directions = {path: fenicsx.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
         self._load = fenicsx.constant(self.mesh, 1.0)
 
@@ -109,12 +112,20 @@ class Discretisation:
 
     @cached_property
     def stiffness_factor(self) -> Any:
-        """What the inclusions multiply every modulus by, as a UFL expression of the place; 1 without inclusions."""
+        """What inclusions and fields multiply every modulus by, as a UFL expression of the place; 1 without any."""
         factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
         X = ufl.SpatialCoordinate(self.mesh)
         for inclusion in self.spec.inclusions:
             numbers = self._numbers(f"inclusions.{inclusion.label}")
             factor *= stiffness_factor(_OPS, X, inclusion.kind, **numbers)
+        return factor * self._factor_of("stiffness")
+
+    def _factor_of(self, quantity: str) -> Any:
+        """Product of the random fields on a quantity; 1 without any."""
+        factor = 1
+        for field in self.fields:
+            if field.field.of == quantity:
+                factor *= field.factor
         return factor
 
     def _numbers(self, block: str) -> dict[str, Any]:
@@ -161,7 +172,7 @@ class Discretisation:
             match load:
                 case Gravity():
                     pull = fenicsx.constant(self.mesh, load.acceleration * np.array(load.unit))
-                    works.append((-size * ufl.dot(pull, self.test), self.dx))
+                    works.append((-size * self._factor_of("density") * ufl.dot(pull, self.test), self.dx))
                 case Traction():
                     direction = fenicsx.constant(self.mesh, load.unit)
                     works.append((-size * ufl.dot(direction, self.test), self.surface(load.on)))
@@ -182,13 +193,14 @@ class Discretisation:
         return sum(terms[1:], terms[0]) if terms else None
 
     def along_parameters(self, integrand: Any) -> Any | None:
-        """Σ_i (∂ integrand/∂ω_i) dω_i with the direction dω as constants; nothing if it depends on no parameter."""
+        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction dω that is set; nothing if it depends on no parameter."""
         present = set(ufl.algorithms.analysis.extract_constants(integrand * self.dx))
         terms = [
             direction * ufl.diff(integrand, self._variables[path])
             for path, direction in self._directions.items()
             if self._constants[path] in present
         ]
+        terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
         return sum(terms[1:], terms[0]) if terms else None
 
     def compiled(self, owner: object, what: str, make: Callable[[], Any]) -> Any:
@@ -202,6 +214,21 @@ class Discretisation:
     def _parameter_force(self) -> fenicsx.VectorAssembler | None:
         form = self._imbalance_form(self.along_parameters)
         return None if form is None else self.vector(form)
+
+    @cached_property
+    def _field_forces(self) -> tuple[tuple[VertexField, fenicsx.VectorAssembler], ...]:
+        """The fields that forces depend on, each with ∂(wᵀF)/∂m by its values m at the vertices, w being `_along`."""
+        found = []
+        for field in self.fields:
+
+            def by_vertices(integrand: Any, field: VertexField = field) -> Any | None:
+                return field.test * ufl.diff(integrand, field.log) if field.inside(integrand) else None
+
+            form = self._imbalance_form(by_vertices)
+            if form is not None:
+                form = ufl.replace(form, {self._variation: self._along})
+                found.append((field, fenicsx.VectorAssembler(form, None, self.comm)))
+        return tuple(found)
 
     @cached_property
     def _stiffness_action(self) -> fenicsx.VectorAssembler:
@@ -281,7 +308,7 @@ class Discretisation:
         if self._given is not None and np.array_equal(parameters, self._given):
             return
         self._given = np.array(parameters, dtype=float)
-        self._values |= dict(zip(self.parameters, map(float, parameters), strict=True))
+        self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
         for path, constant in self._constants.items():
             constant.value = self._values[path]
         self._full_targets = np.zeros(len(self.fixed))
@@ -293,6 +320,12 @@ class Discretisation:
             for path, force in self._unit_loads.items():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
+        for field in self.fields:  # the size of the loads is that without fluctuations
+            field.set(parameters)
+
+    def forget_parameters(self) -> None:
+        """Set the parameters anew next time, whatever they are."""
+        self._given = None
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
@@ -488,25 +521,64 @@ class Discretisation:
     # --- derivatives with respect to the parameters ------------------------------------------------------------------
 
     def unit_directions(self) -> Iterator[str]:
-        """Set the direction constants to each unit vector in turn."""
-        for path in self.parameters:
+        """Set the direction to each unit vector of the s parameters that are numbers of the model in turn."""
+        self._set_field_directions(np.zeros(len(self.parameters)))
+        for i in self.scalars:
+            path = self.parameters[i]
             for other, direction in self._directions.items():
                 direction.value = 1.0 if other == path else 0.0
             yield path
 
+    def _set_field_directions(self, direction: FloatArray) -> None:
+        for field in self.fields:
+            field.set_direction(direction)
+
     def parameter_forces(self) -> FloatArray:
-        """∂F/∂ω (d, U_local) over all unknowns, at the state that is set."""
-        forces = np.zeros((len(self.parameters), self.size))
+        """∂F/∂ω (s, U_local) over all unknowns, at the state that is set, by the numbers of the model."""
+        forces = np.zeros((len(self.scalars), self.size))
         for i, path in enumerate(self.unit_directions()):
             if path in self._directions and self._parameter_force is not None:
                 self.work.residuals += 1
                 forces[i] = self._parameter_force()
         return forces
 
+    def right_sides_of_all(self) -> FloatArray:
+        """Right-hand sides (d, U_local) of the tangents along every parameter, at the state set."""
+        right = np.zeros((len(self.parameters), self.size))
+        right[self.scalars] = self.right_sides()
+        return right + self.field_right_sides(np.eye(len(right))) if self.fields else right
+
+    def field_right_sides(self, directions: FloatArray) -> FloatArray:
+        """Right-hand sides (k, U_local) of tangents along what directions (k, d) change of fields, at the state set."""
+        right = np.zeros((len(directions), self.size))
+        for direction in self._directions.values():
+            direction.value = 0.0
+        positions = np.concatenate([field.positions for field in self.fields])
+        for row, direction in zip(right, directions, strict=True):
+            if self._parameter_force is not None and direction[positions].any():
+                self._set_field_directions(direction)
+                self.work.residuals += 1
+                row[:] = -self._parameter_force()
+        right[:, self.fixed] = 0
+        return right
+
+    def field_products(self, w: FloatArray) -> FloatArray:
+        """Products wᵀ∂F/∂ω (d,) with w (U_local,) at the state that is set; zero for the numbers of the model.
+
+        One assembly for each field, however many parameters it has.
+        """
+        products = np.zeros(len(self.parameters))
+        if self._field_forces:
+            self.unknowns.give(self._along, w)
+        for field, assemble in self._field_forces:
+            self.work.residuals += 1
+            products[field.positions] = field.pull(assemble())
+        return products
+
     def right_sides(self) -> FloatArray:
-        """Right-hand sides (d, U_local) of the tangents at the state that is set: K du/dω_i = b_i."""
+        """Right-hand sides (s, U_local) of the tangents at the state that is set: K du/dω_i = b_i."""
         right = -self.parameter_forces()
-        for i, path in enumerate(self.parameters):
+        for i, path in enumerate(self.parameters[j] for j in self.scalars):
             right[i, self.fixed] = 0
             if path in self._movers:
                 w = np.zeros(right.shape[1])
@@ -535,9 +607,12 @@ class HyperelasticModel:
     """
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+        self._scalars = spec.scalars
+        coefficients = set(spec.coefficients)
         for path in parameters:
-            if path not in spec.scalars:
-                message = f"'{path}' is not a number of the model, expected one of: {', '.join(spec.scalars)}"
+            if path not in self._scalars and path not in coefficients:
+                known = [*self._scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
+                message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
                 raise ValueError(message)
         self.spec = spec
         self.parameters = parameters
@@ -556,7 +631,11 @@ class HyperelasticModel:
         return ReferenceFactor(self.body)
 
     def solve(
-        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
     ) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
 
@@ -567,6 +646,9 @@ class HyperelasticModel:
         reference
             A solution elsewhere, whose factor corrects the prediction. It is factorised when it is first given; the
             factor is kept until another is.
+        iterations
+            Stop after so many corrections with that factor (Newton steps without a reference, or with
+            ``solver = "newton"``). Derivatives are then those of the equations linearised at the state reached.
 
         Raises
         ------
@@ -576,7 +658,11 @@ class HyperelasticModel:
         body = self.body
         self._visited = self._factorised = None
         for path, value in zip(self.parameters, parameters, strict=True):
-            objection = self.spec.scalars[path].objection(float(value))
+            scalar = self._scalars.get(path)
+            if scalar is not None:
+                objection = scalar.objection(float(value))
+            else:
+                objection = None if np.isfinite(value) else "input should be a finite number"
             if objection is not None:
                 message = f"{path} = {value:.6g} is not admissible: {objection}"
                 raise SolveError(message)
@@ -587,10 +673,10 @@ class HyperelasticModel:
         body.work = Work()
         body.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters)
-        u = solve(body, self.spec.solver, np.zeros(body.size), start, way)
+        found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         corrected = body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, u, body.work, reference if corrected else None)
+        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -599,6 +685,22 @@ class HyperelasticModel:
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U) in canonical order."""
         return self.layout.scatter(rows)
+
+    def factors(self, points: FloatArray) -> dict[str, FloatArray]:
+        """Return the factors (n, nodes) of each random field at parameters (n, d), nodes in canonical order.
+
+        Collective; empty but on the first rank.
+        """
+        self._visited = None
+        self.body.forget_parameters()
+        space = fenicsx.scalar_space(self.body.mesh, self.spec.body.degree)
+        found = {field.field.label: field.factors(points, space) for field in self.body.fields}
+        return {label: factors for label, factors in found.items() if factors is not None}
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+        return {field.field.label: field.kept for field in self.body.fields}
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
         """Set parameters and state to those of a solution, if they are not."""
@@ -651,13 +753,14 @@ class FiniteElementSolution:
         self,
         model: HyperelasticModel,
         parameters: FloatArray,
-        state: FloatArray,
+        found: Found,
         work: Work,
         reference: Reference | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
-        self.state = np.array(state)
+        self.state = np.array(found.state)
+        self.residual, self.converged = found.residual, found.converged
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
@@ -732,7 +835,11 @@ class FiniteElementSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
         directions = np.atleast_2d(direction)
-        du = self._solve(directions @ self._right_sides, directions=directions)
+        body = self._model.body
+        right = directions[:, body.scalars] @ self._right_sides
+        if body.fields:
+            right += self._model.visit(self).field_right_sides(directions)
+        du = self._solve(right, directions=directions)
         return du.reshape(*np.shape(direction)[:-1], -1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
@@ -743,5 +850,12 @@ class FiniteElementSolution:
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
         loads = np.atleast_2d(weights) @ self._gradients
-        multipliers = self._solve(loads, transpose=True).reshape(*np.shape(weights)[:-1], -1)
-        return self._model.body.total(multipliers @ self._right_sides.T) + weights @ self._partials
+        multipliers = self._solve(loads, transpose=True)
+        body = self._model.body
+        gradients = np.zeros((len(loads), len(self.parameters)))
+        gradients[:, body.scalars] = body.total(multipliers @ self._right_sides.T)
+        if body.fields:
+            body = self._model.visit(self)
+            multipliers[:, body.fixed] = 0
+            gradients -= np.array([body.field_products(multiplier) for multiplier in multipliers])
+        return gradients.reshape(*np.shape(weights)[:-1], -1) + weights @ self._partials

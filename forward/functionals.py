@@ -6,6 +6,7 @@ explicit partial derivative ∂ψ/∂ω. They read the state and the parameters 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Protocol, assert_never
 
 import numpy as np
@@ -27,6 +28,7 @@ from forward.outputs import (
 
 if TYPE_CHECKING:
     from forward.finite_element import Discretisation
+    from forward.vertex_fields import VertexField
 
 
 class Functional(Protocol):
@@ -159,11 +161,23 @@ class _Integral:
 
     def partial(self) -> FloatArray:
         body = self._body
+        slopes = np.zeros(len(body.parameters))
         along = body.along_parameters(self._density)
         if along is None:
-            return np.zeros(len(body.parameters))
-        form = body.compiled(self, "partial", lambda: fenicsx.ScalarAssembler(along * body.dx, body.comm))
-        return np.array([form() for _ in body.unit_directions()]) / self.size
+            return slopes
+        if len(body.scalars):
+            form = body.compiled(self, "partial", lambda: fenicsx.ScalarAssembler(along * body.dx, body.comm))
+            slopes[body.scalars] = [form() for _ in body.unit_directions()]
+        for field in body.fields:
+            if field.inside(self._density):
+                form = body.compiled(self, f"by {field.field.label}", partial(self._by, field))
+                slopes[field.positions] = field.pull(form())
+        return slopes / self.size
+
+    def _by(self, field: VertexField) -> fenicsx.VectorAssembler:
+        """Assemble the derivative by the values of a random field at the vertices."""
+        body = self._body
+        return fenicsx.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm)
 
 
 class _Reaction:
@@ -183,7 +197,10 @@ class _Reaction:
         return self._body.stiffness_times(self._w, transpose=True)
 
     def partial(self) -> FloatArray:
-        return np.array([self._body.dot(self._w, force) for force in self._body.parameter_forces()])
+        body = self._body
+        slopes = body.field_products(self._w)
+        slopes[body.scalars] = [body.dot(self._w, force) for force in body.parameter_forces()]
+        return slopes
 
 
 class _MaxVonMises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
@@ -76,6 +76,12 @@ class _SixSided(Settings):
         return a * b * c
 
     @property
+    def vertex_count(self) -> int:
+        """Number of vertices of the mesh."""
+        a, b, c = self.cells
+        return (a + 1) * (b + 1) * (c + 1)
+
+    @property
     def quadrature(self) -> int:
         """The degree of quadrature in force."""
         default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
@@ -92,6 +98,17 @@ class _SixSided(Settings):
         corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
         edges = [np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() / n for a, n in enumerate(self.cells)]
         return float(max(edges))
+
+    def refined(self, level: int) -> Self:
+        """Return the same body with every cell divided by 2^level along each edge: its mesh is nested.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(n * 2**level for n in self.cells)
+        return self.model_validate(self.model_dump() | {"cells": cells})
 
     def corners_of(self, boundary: str) -> list[Vector]:
         """The four corners (m) of a boundary."""

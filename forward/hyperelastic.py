@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
 import numpy as np
 from annotated_types import Ge, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.fields import RandomField
 from forward.geometry import AXES, Body
 from forward.inclusions import Inclusion
-from forward.loads import LOAD_SIZES, Displacement, Load
+from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
 from forward.materials import MATERIALS, constants, small_strain_moduli, splits
 from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
@@ -87,6 +88,8 @@ class Hyperelastic(Settings):
         Strain energy and its constants.
     inclusions
         Regions that are stiffer or softer: their factors multiply the energy density.
+    fields
+        Random fields that multiply the stiffness or the density.
     clamp
         Boundaries that do not move.
     displacements
@@ -109,6 +112,7 @@ class Hyperelastic(Settings):
     body: Body
     material: Material
     inclusions: tuple[Inclusion, ...] = ()
+    fields: tuple[RandomField, ...] = ()
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
@@ -145,10 +149,14 @@ class Hyperelastic(Settings):
         return found
 
     @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Paths of the coefficients of the random fields, which can be parameters too."""
+        return tuple(path for field in self.fields for path in field.paths(self.body))
+
+    @property
     def unknowns(self) -> int:
         """Number of unknowns: displacements and, in the mixed form, pressures."""
-        a, b, c = self.body.cells
-        return 3 * self.body.nodes + ((a + 1) * (b + 1) * (c + 1) if self.mixed else 0)
+        return 3 * self.body.nodes + (self.body.vertex_count if self.mixed else 0)
 
     @property
     def mixed(self) -> bool:
@@ -170,6 +178,10 @@ class Hyperelastic(Settings):
     def _energy(self) -> str:
         return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
 
+    def refined(self, level: int) -> Self:
+        """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
+        return self.model_copy(update={"body": self.body.refined(level)})
+
     def build(self, comm: Any, parameters: tuple[str, ...]) -> HyperelasticModel:
         """Mesh the body and compile the forms on a communicator; collective.
 
@@ -178,7 +190,8 @@ class Hyperelastic(Settings):
         comm
             mpi4py communicator of the ranks that share the model.
         parameters
-            Paths of the numbers that the model's parameter vector holds; the others keep their values.
+            Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
+            random fields that it does not hold are zero.
         """
         from forward.finite_element import HyperelasticModel
 
@@ -214,6 +227,7 @@ class Hyperelastic(Settings):
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
         for block, label in (
             ("inclusions", "label"),
+            ("fields", "label"),
             ("displacements", "label"),
             ("loads", "label"),
             ("outputs", "name"),
@@ -227,6 +241,7 @@ class Hyperelastic(Settings):
             if not self.body.contains(centre):
                 message = f"its centre lies outside the body, which lies in {self._bounds}"
                 yield ("inclusions", i), message, list(centre)
+        yield from self._mistakes_of_fields()
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
         yield from self._contradictions()
@@ -257,6 +272,14 @@ class Hyperelastic(Settings):
                 )
             if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
                 yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
+
+    def _mistakes_of_fields(self) -> Iterator[Mistake]:
+        for i, field in enumerate(self.fields):
+            if field.of == "density" and not any(isinstance(load, Gravity) for load in self.loads):
+                yield ("fields", i, "of"), "no load is gravity, expected one where the density varies", field.of
+            if field.modes is not None and field.modes > self.body.vertex_count:
+                message = f"more modes than the mesh has vertices, expected at most {self.body.vertex_count}"
+                yield ("fields", i, "modes"), message, field.modes
 
     def _mistakes_of_formulation(self) -> Iterator[Mistake]:
         if self.formulation == "mixed" and not self._splits:

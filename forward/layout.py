@@ -6,13 +6,17 @@ form, the pressures of the vertices.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward import fenicsx
+from forward.geometry import Body
 from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 class Layout:
@@ -38,11 +42,11 @@ class Layout:
     def __init__(self, space: Any, comm: Any, pressure: Any | None = None) -> None:
         self._space = space
         self._comm = comm
-        self.coordinates, self._canonical, self.positions = _sorted_by_place(space, comm)
+        self.coordinates, self._canonical, self.positions = sorted_by_place(space, comm)
         self._size = self.coordinates.size
         self._unknowns = (3 * self.positions[:, None] + np.arange(3)).ravel()
         if pressure is not None:
-            vertices, _, positions = _sorted_by_place(pressure, comm)
+            vertices, _, positions = sorted_by_place(pressure, comm)
             self._unknowns = np.concatenate([self._unknowns, self._size + positions])
             self._size += len(vertices)
 
@@ -72,7 +76,7 @@ class Layout:
         return cells[np.lexsort(cells.T[::-1])], kind
 
 
-def _sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
     """Return the sorted places (N, 3) of all nodes of a space, and canonical numbers: by global number, and of ours."""
     parts = comm.allgather(fenicsx.node_coordinates(space))
     everywhere = np.concatenate(parts)
@@ -85,3 +89,17 @@ def _sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int6
     canonical[order] = np.arange(len(order))
     before = sum(len(part) for part in parts[: comm.rank])
     return everywhere[order], canonical, canonical[before : before + len(parts[comm.rank])]
+
+
+def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
+    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, vertices in canonical order.
+
+    They are of trilinear hexahedra, whatever the cells of the body: of tetrahedra with these vertices, correlations
+    would depend on how the hexahedra are cut.
+    Each process that calls makes a mesh of its own: the numbers do not depend on how others share theirs.
+    """
+    space, matrices = fenicsx.trilinear_elements(body)
+    _, canonical, _ = sorted_by_place(space, space.mesh.comm)
+    order = np.argsort(canonical)
+    mass, laplacian, surface = (matrix[order][:, order] for matrix in matrices)
+    return mass, laplacian, surface

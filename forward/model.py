@@ -99,6 +99,14 @@ class Solution(Protocol):
         """
 
     @property
+    def residual(self) -> float:
+        """Relative residual of the state, in the solver's measure; zero for a model that is not solved for."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether that meets the solver's tolerance (or is rounding); if not, the solver was stopped before."""
+
+    @property
     def work(self) -> Work:
         """What this solution has cost so far."""
 
@@ -139,11 +147,17 @@ class ForwardModel(Protocol):
         """
 
     def solve(
-        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
     ) -> Solution:
         """Solve at `parameters` (d,), from the state `start` (U_local,) with the help of a `reference`, if given.
 
-        Both may change the cost, never the answer beyond the solver's tolerance.
+        Both may change the cost, never the answer beyond the solver's tolerance. With `iterations` the solver makes at
+        most so many from `start`, and the solution is the state that it has then, whose `residual` says how far it is
+        from equilibrium; only where that state is not admissible is the model solved after all.
 
         Raises
         ------
@@ -188,9 +202,13 @@ class FunctionModel:
         return 0
 
     def solve(
-        self, parameters: FloatArray, start: FloatArray | None = None, reference: Reference | None = None
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
     ) -> FunctionSolution:
-        """Evaluate the function at `parameters` (d,); there is no state to `start` from."""
+        """Evaluate the function at `parameters` (d,); there is no state to `start` from, and nothing to iterate on."""
         # Copies: neither the caller nor the function can change a solution afterwards.
         point = np.array(parameters, dtype=float)
         point.flags.writeable = False
@@ -224,6 +242,16 @@ class FunctionSolution:
     def state(self) -> FloatArray:
         """No state: an empty array."""
         return np.empty(0)
+
+    @property
+    def residual(self) -> float:
+        """Nothing is left to solve."""
+        return 0.0
+
+    @property
+    def converged(self) -> bool:
+        """Always."""
+        return True
 
     @property
     def work(self) -> Work:

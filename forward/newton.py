@@ -2,7 +2,7 @@
 
 From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
 stiffness; where that is slow it goes on with Newton's method, then with adaptive load steps. All of them stop at the
-same test of the residual.
+same test of the residual. `solve` can also be told to stop after a few iterations, wherever it is then.
 
 Whole Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
 what stops the iteration are steps that grow. A line search on the residual or on the energy, or the natural
@@ -14,7 +14,7 @@ iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +31,8 @@ class SolverSettings(Settings):
     ----------
     kind
         "predict-correct" uses a prediction and a reference factor where the method has them, and the last factor for
-        more than one correction; "newton" is the textbook: from zero, a new factor for every step.
+        more than one correction; "newton" is the textbook: from zero, a new factor for every step. Where a method
+        counts iterations, both go from its prediction.
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
         prescribed); in the mixed form, also of the volumes, as the force of the pressure that they lack.
@@ -69,6 +70,7 @@ SHORTEST = 1 / 8  # part of the way from the reference that is not divided any m
 NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
+ASTRAY = 100  # relative residual after the corrections that were allowed: the reference is too far away
 SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
 STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
 
@@ -174,6 +176,14 @@ class Way(Protocol):
         """Return an approximate inverse of the stiffness at u."""
 
 
+class Found(NamedTuple):
+    """A state (U_local,), its relative residual, and whether it is an equilibrium to the solver's tolerance."""
+
+    state: FloatArray
+    residual: float
+    converged: bool = True
+
+
 class _Diverged(Exception):  # noqa: N818 - control flow inside this file
     """An attempt at one load failed, for the reason given."""
 
@@ -184,7 +194,8 @@ def solve(
     zero: FloatArray,
     start: FloatArray | None = None,
     way: Way | None = None,
-) -> FloatArray:
+    iterations: int | None = None,
+) -> Found:
     """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
 
     Parameters
@@ -199,11 +210,15 @@ def solve(
         A prediction of the state at full load (U_local,).
     way
         Where the prediction comes from.
+    iterations
+        Stop after so many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
+        or, without one, Newton steps. The equilibrium is looked for after all where they lead to no admissible state,
+        and where they are as many as the settings allow at all.
 
     Returns
     -------
-    numpy.ndarray
-        The state (U_local,), with J > 0 at every quadrature point.
+    Found
+        The state, with J > 0 at every quadrature point.
 
     Raises
     ------
@@ -211,7 +226,14 @@ def solve(
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
     history: list[str] = []
-    guesses = [zero] if start is None or settings.kind == "newton" else [start, zero]
+    if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
+        system.at_load(1.0)
+        try:
+            return _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
+        except _Diverged as stop:
+            history.append(f"{stop}: the equilibrium is looked for after all")
+    from_zero = start is None or (settings.kind == "newton" and iterations is None)
+    guesses = [zero] if start is None or from_zero else [start, zero]
     if way is not None and len(guesses) == 2:
         system.at_load(1.0)
         try:
@@ -226,9 +248,58 @@ def solve(
     return _load_steps(system, settings, zero, history)
 
 
+def _iterate_few(
+    system: System, settings: SolverSettings, start: FloatArray, way: Way | None, iterations: int, history: list[str]
+) -> Found:
+    """Make so many iterations, fewer if they meet the tolerance; or raise `_Diverged`.
+
+    What counts is the last state and not that with the smallest residual: the first step of a slender body in bending
+    raises the residual although it brings the body closer.
+    """
+    u = system.on_target(start)
+    residual = system.residual(u)
+    mixing = None
+    if way is not None and np.isfinite(residual.size):
+        window = min(iterations, WINDOW)
+        mixing = AndersonMixing(way.inverse(u), window, len(u), system.total, system.weights())
+    sizes: list[float] = []
+    last: tuple[FloatArray, Residual] | None = None
+    for iteration in range(iterations + 1):
+        history.append(f"iteration {iteration} of {iterations}: relative residual {residual.relative:.3e}")
+        if not np.isfinite(residual.size):
+            message = "the state has no finite residual"
+            raise _Diverged(message)
+        if residual.size > ROUNDED * residual.scale > 0:
+            sizes.clear()  # as in `_mix`
+        if _converged(system, settings.tolerance, u, residual, sizes):
+            if mixing is not None and last is not None and not _convex(system, last, (u, residual)):
+                message = "the stiffness is indefinite along the last move"
+                raise _Diverged(message)
+            factorised = mixing is None and iteration > 0
+            return Found(_accepted(system, settings, u, factorised=factorised), residual.relative)
+        if iteration == iterations:
+            break
+        last = (u, residual)
+        if mixing is not None:
+            u = mixing.next(u, residual.vector)
+            residual = system.residual(u)
+        else:
+            _factorise(system, u)
+            u, residual = _admissible_step(system, settings, u, system.solve(-residual.vector))
+    if mixing is not None and residual.relative > ASTRAY:
+        message = "the reference is too far away"
+        raise _Diverged(message)
+    return Found(_accepted(system, settings, u, factorised=False), residual.relative, converged=False)
+
+
+def _convex(system: System, before: tuple[FloatArray, Residual], now: tuple[FloatArray, Residual]) -> bool:
+    """Whether the energy is convex along a move; where it is not, only a factor can tell what the state is."""
+    return system.curvature(now[0] - before[0], now[1].vector - before[1].vector) >= 0
+
+
 def _predict_correct(
     system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]
-) -> FloatArray:
+) -> Found:
     """Correct a prediction with a reference factor, in steps along the way where one is too long; or raise `_Diverged`.
 
     With s the slope of the prediction, the state after a part t of the way is ū + t s + t² q(t). The first step takes
@@ -246,9 +317,9 @@ def _predict_correct(
         residual = system.residual(u)
         close = np.isfinite(residual.size)
         if close:
-            u, _, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
+            u, residual, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
         if close and target == 1:
-            return u
+            return Found(u, residual.relative)
         if close:
             known.append((target, ((u - way.state) / target - slope) / target))
             reached, target = target, 1.0
@@ -291,8 +362,7 @@ def _mix(
         if residual.size > ROUNDED * residual.scale > 0:
             sizes.clear()  # corrections falter before they are close
         if _converged(system, tolerance, u, residual, sizes):
-            # Where the stiffness is indefinite along the last move, only its factor can tell what this state is.
-            convex = last is None or system.curvature(u - last[0], residual.vector - last[1].vector) >= 0
+            convex = last is None or _convex(system, last, (u, residual))
             return u, residual, convex and system.smallest_jacobian(u) > 0
         if iteration > 0 and residual.size < smallest.size:
             best, smallest, since = u, residual, 0
@@ -324,36 +394,36 @@ def _converged(system: System, tolerance: float, u: FloatArray, residual: Residu
     return (residual.scale == 0 or stalled) and size <= system.rounding(u, residual.scale)
 
 
-def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> FloatArray:
+def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> Found:
     """Raise the load from zero; halve the step where Newton fails, double it where it is quick."""
     reached, step = 0.0, 0.5
-    u, slope = zero, np.zeros_like(zero)
+    found, slope = Found(zero, 0.0), np.zeros_like(zero)
     while reached < 1:
         load = min(1.0, reached + step)
         try:
             # The secant through the last two states predicts the next one.
-            found, iterations = _newton(system, settings, u + (load - reached) * slope, history, load)
+            there, iterations = _newton(system, settings, found.state + (load - reached) * slope, history, load)
         except _Diverged as stop:
             step /= 2
             slope = np.zeros_like(zero)
             if step < settings.minimum_load_step:
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
-                jacobian = system.smallest_jacobian(u)
+                jacobian = system.smallest_jacobian(found.state)
                 if jacobian < SQUEEZED:
                     message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
                 raise SolveError(message, history, system.work) from None
             continue
-        slope = (found - u) / (load - reached)
-        u, reached = found, load
+        slope = (there.state - found.state) / (load - reached)
+        found, reached = there, load
         system.work.load_steps += 1
         if iterations <= QUICK:
             step *= 2
-    return u
+    return found
 
 
 def _newton(
     system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
-) -> tuple[FloatArray, int]:
+) -> tuple[Found, int]:
     """Iterate at one load; return the state and the number of iterations, or raise `_Diverged`."""
     system.at_load(load)
     try:
@@ -365,7 +435,7 @@ def _newton(
 
 def _iterate(
     system: System, settings: SolverSettings, u: FloatArray, history: list[str], load: float
-) -> tuple[FloatArray, int]:
+) -> tuple[Found, int]:
     residual = system.residual(u)
     sizes: list[float] = []
     longest, length = 0.0, np.inf
@@ -375,7 +445,7 @@ def _iterate(
     for iteration in range(settings.iterations + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if _converged(system, settings.tolerance, u, residual, sizes):
-            return _accepted(system, settings, u, factorised=iteration > 0), iteration
+            return Found(_accepted(system, settings, u, factorised=iteration > 0), residual.relative), iteration
         if iteration == settings.iterations:
             break
         _factorise(system, u)
@@ -388,7 +458,7 @@ def _iterate(
         if settings.kind != "newton" and length < NEAR * before < np.inf:
             u, residual, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
-                return _accepted(system, settings, u, factorised=True), iteration + 1
+                return Found(_accepted(system, settings, u, factorised=True), residual.relative), iteration + 1
     message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
     raise _Diverged(message + _instability(system))
 

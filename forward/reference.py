@@ -115,7 +115,7 @@ class ReferenceFactor:
             assert self._reference is not None
             body = self._set(self._reference)
             kept, body.work = body.work, Work()  # the first solution is charged no more than the others
-            self._slopes = self._solver.solve(body.right_sides())
+            self._slopes = self._solver.solve(body.right_sides_of_all())
             body.work = kept
         return self._slopes
 

@@ -11,7 +11,10 @@ from tests.launch import run_script
 from uq import chaos
 from uq.basis import gauss, hyperbolic, orthonormal
 from uq.chaos import Chaos, OutsideRangeWarning, load
+from uq.checkpoint import Checkpoint
+from uq.checkpoint import load as load_block
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
+from uq.ensemble import Ensemble
 from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
 from uq.linearisation import linearise
@@ -337,6 +340,26 @@ def test_fields_are_the_regression_of_all_states(beam, method):
         assert sign * at_tip == pytest.approx(data[name].sel(output="uy_max").item(), rel=1e-6)
         assert data[f"field_{name}_error"].sel(component="y")[tip] >= 0.5 * data[f"{name}_error"].sel(output="uy_max")
     assert expansion.displacements(points[:2]).shape == (2, data.sizes["node"], 3)
+
+
+@pytest.mark.fem
+def test_blocks_change_no_bit_and_keep_states_only(beam, tmp_path, monkeypatch):
+    """Projections are added sample by sample, whatever the blocks; files hold d + 1 fields for each sample."""
+    from mpi4py import MPI
+
+    inputs, evaluate = beam
+    method = Chaos(samples=7)
+    expected = method.run(inputs, evaluate)
+    monkeypatch.setattr("uq.evaluate.BLOCKS", 3)
+    assert method.run(inputs, evaluate).identical(expected)
+    ensemble = Ensemble.split(MPI.COMM_SELF)
+    for _ in range(2):  # the second finds the blocks of the first
+        kept = Checkpoint(tmp_path, "beam")
+        data = ensemble.run(evaluate.model, lambda each: method.run(inputs, each), checkpoint=kept)
+        assert data.identical(expected)
+    rows = [load_block(path).fields.shape[0] for path in (tmp_path / "evaluations").glob("*.h5")]
+    assert sorted(rows) == [3, 3 * 1, 3 * 3, 3 * 3]
+    assert expected.sizes["term"] > 3
 
 
 @pytest.mark.fem

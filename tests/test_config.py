@@ -35,10 +35,13 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
         "monte-carlo",
         "sensitivity-monte-carlo",
         "quasi-monte-carlo",
+        "multilevel-monte-carlo",
         "local-sensitivity",
         "chaos",
+        "multilevel-chaos",
         "sobol",
         "derivative-based",
+        "compare",
     ],
 )
 def test_starters_are_valid(kind):
@@ -47,6 +50,10 @@ def test_starters_are_valid(kind):
 
 def test_chaos_needs_independent_parameters():
     names = list(blocks()["parameters"])
+    control = blocks() | {"method": {"kind": "quasi-monte-carlo", "samples": 32, "control": "chaos"}}
+    assert parse(control).planned == 1 + 7 + 32
+    with pytest.raises(StudyError, match=r"independent parameters.* for method\.control"):
+        parse(control | {"correlations": [{"between": names, "value": 0.3}]})
     document_ = blocks() | {"method": {"kind": "chaos", "samples": 9}}
     assert parse(document_).planned == 10
     assert parse(document_ | {"method": {"kind": "chaos", "fit": "projection", "max_order": 3}}).planned == 26

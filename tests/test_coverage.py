@@ -13,6 +13,7 @@ from uq.distributions import Uniform
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
 from uq.linearisation import linearise
+from uq.moments import estimate, monomials
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
 from uq.quasi_monte_carlo import QuasiMonteCarlo
 
@@ -50,21 +51,30 @@ def coverage(found, freedom):
     [
         (MonteCarlo(samples=200, fields=False), 199),
         (SensitivityMonteCarlo(samples=200, fields=False), 199),
-        pytest.param(
-            SensitivityMonteCarlo(samples=200, fields=False, coefficient="optimal"),
-            199,
-            marks=pytest.mark.xfail(reason="91 % of these repeats for both: claims may be 5 % too small"),
-        ),
-        (QuasiMonteCarlo(samples=64, fields=False, control="none"), 15),
-        (QuasiMonteCarlo(samples=64, fields=False, control="tangent"), 15),
-        (QuasiMonteCarlo(samples=64, fields=False, control="quadratic"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="none"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="tangent"), 15),
+        (QuasiMonteCarlo(samples=256, fields=False, control="quadratic"), 15),
     ],
-    ids=("plain", "tangent", "optimal tangent", "Sobol", "Sobol tangent", "Sobol quadratic"),
+    ids=("plain", "tangent", "Sobol", "Sobol tangent", "Sobol quadratic"),
 )
 def test_intervals_cover(method, freedom):
     mean, variance = coverage(repeats(method), freedom)
     assert 0.92 <= mean <= 0.98
     assert 0.92 <= variance <= 0.98
+
+
+@pytest.mark.parametrize("coefficient", ["one", "optimal"])
+def test_intervals_of_a_fitted_coefficient_cover_from_400_samples_on(coefficient):
+    """With fewer the fit to the samples that it corrects shows: 92 % for the variance with 200."""
+    n, count = 400, 4000
+    points = np.random.default_rng(0).random((n, count, 3))
+    values = (1 + points[..., 0]) * (1 + points[..., 1]) * np.exp(points[..., 2])
+    slopes = np.sqrt(np.e) * np.array([1.5, 1.5, 2.25])
+    nominal = np.full(count, 2.25 * np.sqrt(np.e))
+    sums = monomials(values - nominal, (points - 0.5) @ slopes).sum(axis=1)
+    found = estimate(sums, n, nominal, np.full(count, slopes @ slopes / 12), coefficient)
+    deviations = found.mean - MEAN, found.std**2 - STD**2, found.mean_error, 2 * found.std * found.std_error
+    assert all(0.92 <= share <= 0.98 for share in coverage(deviations, n - 1))
 
 
 @pytest.mark.slow

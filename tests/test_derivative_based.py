@@ -14,6 +14,7 @@ from uq.derivative_based import DerivativeBased, poincare
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
+from uq.monte_carlo import FIRST_ROUND
 
 STUDENT = 2.04  # of a 95 % interval with 31 degrees of freedom
 ISHIGAMI = Inputs({name: Uniform(lower=-np.pi, upper=np.pi) for name in "abc"})
@@ -95,6 +96,7 @@ def test_measures_of_ishigami():
     np.testing.assert_allclose(data["local_share"][0], [1, 0, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_right_and_intervals_nearly(monkeypatch):
     def none(*_):
         raise SolveError("no expansion is asked for")
@@ -157,7 +159,7 @@ MARGINAL = Uniform(lower=0.0, upper=1.0)
 def test_active_subspace_of_a_quadratic():
     inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in "abc"})
     matrix = np.diag([2.0, 1.0, 0.5]) @ np.diag([2.0, 1.0, 0.5])  # E[(Ax)(Ax)ᵀ] for ½ xᵀAx
-    data = run(DerivativeBased(samples=2048), inputs, lambda p: (2 * p[0] ** 2 + p[1] ** 2 + 0.5 * p[2] ** 2) / 2)
+    data = run(DerivativeBased(samples=512), inputs, lambda p: (2 * p[0] ** 2 + p[1] ** 2 + 0.5 * p[2] ** 2) / 2)
     found = data.isel(output=0)
     sigma = (found["active_eigenvalue_upper"] - found["active_eigenvalue_lower"]) / 3.9
     assert (np.abs(found["active_eigenvalue"] - np.diag(matrix)) < 4 * sigma).all()
@@ -177,9 +179,10 @@ def test_failures_are_left_out_and_said():
 
 
 def test_tolerance_grows_the_same_samples():
-    data = run(DerivativeBased(tolerance=0.2), ISHIGAMI, ishigami)
-    assert data["total_bound_error"].max() <= 0.2
-    assert "tolerance 0.2 met" in data.attrs["stopped"]
+    data = run(DerivativeBased(tolerance=0.7), ISHIGAMI, ishigami)
+    assert data.sizes["sample"] == 4 * FIRST_ROUND
+    assert data["total_bound_error"].max() <= 0.7
+    assert "tolerance 0.7 met" in data.attrs["stopped"]
     again = run(DerivativeBased(samples=data.sizes["sample"]), ISHIGAMI, ishigami)
     np.testing.assert_array_equal(again["total_bound"], data["total_bound"])
 

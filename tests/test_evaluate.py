@@ -40,6 +40,20 @@ def test_failures_are_kept_with_their_reason():
         assert np.isnan(evaluations.outputs[failure.index]).all()
 
 
+def test_residuals_are_kept(tmp_path):
+    request = Request(POINTS[:200], iterations=3)
+    evaluations = SerialEvaluate(MODEL)(request)
+    ok = POINTS[:200, 0] <= 0.9
+    np.testing.assert_array_equal(evaluations.residuals, np.where(ok, 0.0, np.nan))
+    np.testing.assert_array_equal(evaluations.converged, ok)
+    checkpoint = Checkpoint(tmp_path, "study")
+    assert checkpoint.key(request) != checkpoint.key(replace(request, iterations=4))
+    checkpoint.save("block", evaluations)
+    found = checkpoint.load("block")
+    np.testing.assert_array_equal(found.residuals, evaluations.residuals)
+    np.testing.assert_array_equal(found.converged, evaluations.converged)
+
+
 @pytest.mark.parametrize("n", [1, 2, BLOCKS, BLOCKS + 1, 10_000])
 def test_blocks_cover_all_points_in_order(n):
     points = np.arange(n, dtype=float)[:, None]

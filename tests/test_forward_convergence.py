@@ -120,7 +120,7 @@ def test_errors_fall_at_the_theoretical_rate(cell, degree, cells, bound):
         body = Forced(spec, MPI.COMM_SELF)
         body.set_parameters(np.empty(0))
         body.at_load(1.0)
-        errors.append(body.errors(solve(body, spec.solver, np.zeros(spec.unknowns))))
+        errors.append(body.errors(solve(body, spec.solver, np.zeros(spec.unknowns)).state))
     rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert rates[-1] == pytest.approx([degree + 1, degree], abs=0.15)
     assert (np.array(errors[-1]) < bound).all()

@@ -126,7 +126,7 @@ def test_affine_deformations(material, deformation):
     body.deformation = F = np.array(deformation, dtype=float)
     body.set_parameters(np.empty(0))
     body.at_load(1.0)
-    u = solve(body, spec.solver, np.zeros(body.size))
+    u = solve(body, spec.solver, np.zeros(body.size)).state
     body.at_load(1.0)
     body.set_state(u)
     places = np.asarray(body.space.tabulate_dof_coordinates())

@@ -155,3 +155,59 @@ def test_a_column_that_buckles_is_told_from_one_that_stands():
     lenient = spec.model_copy(update={"solver": spec.solver.model_copy(update={"accept_unstable": True})})
     straight = lenient.build(MPI.COMM_SELF, (path,)).solve(np.array([-1.5 * euler])).state.reshape(-1, 3)
     assert np.abs(straight[:, 1:]).max() < 0.01
+
+
+def test_a_few_corrections_say_how_far_they_are(case):
+    model, values, base, slopes = case
+    reference = Reference(values, base.state)
+    point = points(values, 0.3)[0]
+    start = base.state + (point - values) @ slopes
+    exact = model.solve(point)
+    assert exact.converged
+    assert exact.residual <= TOLERANCE
+    errors, corrections = [], model.solve(point, start, reference).work.back_substitutions
+    for d in (1, 2, 4):
+        found = model.solve(point, start, reference, d)
+        assert not found.converged
+        assert found.work.back_substitutions == d == found.work.residuals - 1
+        assert found.work.factorisations == 0
+        body = model.visit(found)
+        assert body.residual(found.state).relative == pytest.approx(found.residual, rel=1e-6)
+        errors.append(np.abs(found.state - exact.state).max())
+    assert errors[2] < 0.1 * errors[1] < 0.1 * errors[0]
+    # More than it takes: stopped by the tolerance, at the state of an unlimited solve.
+    enough = model.solve(point, start, reference, corrections + 5)
+    assert enough.converged
+    assert enough.work.back_substitutions == corrections
+    np.testing.assert_allclose(enough.state, exact.state, rtol=0, atol=1e-8 * np.abs(exact.state).max())
+
+
+def test_a_few_newton_steps_go_from_the_start(case):
+    model, values, base, slopes = case
+    spec = model.spec
+    newton = spec.model_copy(update={"solver": spec.solver.model_copy(update={"kind": "newton"})})
+    textbook = newton.build(MPI.COMM_SELF, tuple(spec.scalars))
+    point = points(values, 0.3)[0]
+    start = base.state + (point - values) @ slopes
+    exact = textbook.solve(point)
+    for any_model in (textbook, model):  # without a reference, both make Newton steps
+        errors = []
+        for d in (1, 2):
+            found = any_model.solve(point, start, None, d)
+            assert found.work.factorisations == d
+            errors.append(np.abs(found.state - exact.state).max() / np.abs(exact.state).max())
+        assert errors[1] < 1e-2 * errors[0]
+    at_once = textbook.solve(point, start, None, 1000)
+    assert at_once.converged
+    assert at_once.work.factorisations < exact.work.factorisations
+    assert textbook.solve(point, start).work.factorisations == exact.work.factorisations  # the textbook is from zero
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 1e6, -0.7])
+def test_a_partial_state_that_is_not_admissible_is_solved_and_charged(case, wrong):
+    model, values, base, _ = case
+    start = wrong * np.random.default_rng(0).random(len(base.state))
+    found = model.solve(values, start, Reference(values, base.state), 2)
+    assert found.converged
+    np.testing.assert_allclose(found.state, base.state, rtol=0, atol=1e-8 * np.abs(base.state).max())
+    assert found.work.residuals > model.solve(values).work.residuals

@@ -12,7 +12,7 @@ from scipy import stats
 
 from forward.model import FunctionModel, SolveError
 from tests.launch import run_script
-from uq import quasi_monte_carlo, taylor
+from uq import basis, quasi_monte_carlo, taylor
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
@@ -22,17 +22,19 @@ from uq.quasi_monte_carlo import QuasiMonteCarlo
 from uq.sampling import sobol_points
 
 remembered = cache(sobol_points)
+recurrence = cache(basis.recurrence)
 
 
 @pytest.fixture(autouse=True)
 def points_are_drawn_once(monkeypatch):
-    """Repeats with other controls have the same points, which take most of the time."""
+    """Repeats with other controls have the same points, which take most of the time, and the same polynomials."""
     monkeypatch.setattr(quasi_monte_carlo, "sobol_points", remembered)
+    monkeypatch.setattr(basis, "recurrence", recurrence)
 
 
 UNIT = Uniform(lower=0.0, upper=1.0)
 ANGLE = Uniform(lower=-np.pi, upper=np.pi)
-CONTROLS = ("none", "tangent", "quadratic")
+CONTROLS = ("none", "tangent", "quadratic", "chaos")
 
 
 def case(function, jacobian, mean, variance, *marginals):
@@ -74,6 +76,13 @@ PRODUCT = case(
     Uniform(lower=1.0, upper=2.0),
     UNIT,
 )
+STEEP = case(
+    lambda p: np.exp(3 * p[0]),
+    lambda p: [3 * np.exp(3 * p)],
+    (np.e**3 - 1) / 3,
+    (np.e**6 - 1) / 6 - ((np.e**3 - 1) / 3) ** 2,
+    UNIT,
+)
 CASES = {"linear": LINEAR, "quadratic": QUADRATIC, "ishigami": ISHIGAMI, "product": PRODUCT}
 
 
@@ -110,6 +119,39 @@ def test_a_control_expanded_elsewhere_would_be_noticed(monkeypatch):
         assert not is_unbiased(mean, PRODUCT[2])
 
 
+def with_slopes_times(factor, of):
+    """The same model with wrong derivatives."""
+    inputs, model, mean, variance = of
+    return (
+        inputs,
+        FunctionModel(
+            model.function, model.parameters, model.outputs, lambda p: factor * np.array(model.jacobian(p), dtype=float)
+        ),
+        mean,
+        variance,
+    )
+
+
+def test_a_bad_fit_costs_efficiency_and_no_bias():
+    good, bad = (
+        repeats(of, 60, samples=32, scrambles=4, control="chaos") for of in (PRODUCT, with_slopes_times(3, PRODUCT))
+    )
+    for right, wrong, exact in ((good[0], bad[0], PRODUCT[2]), (good[2], bad[2], PRODUCT[3])):
+        assert is_unbiased(wrong, exact)
+        assert wrong.std() > 10 * right.std()
+
+
+def test_samples_that_the_control_was_fitted_to_would_be_noticed(monkeypatch):
+    settings = {"samples": 8, "scrambles": 2, "control": "chaos", "control_samples": 4}
+    mean, _, variance, _ = repeats(STEEP, 120, **settings)
+    assert is_unbiased(mean, STEEP[2])
+    assert is_unbiased(variance, STEEP[3])
+    monkeypatch.setattr(quasi_monte_carlo, "FIT", 0)
+    mean, _, variance, _ = repeats(STEEP, 120, **settings)
+    assert not is_unbiased(mean, STEEP[2])
+    assert not is_unbiased(variance, STEEP[3])
+
+
 def test_a_wrong_second_moment_of_the_control_would_be_noticed(monkeypatch):
     exact = taylor.tangent
     monkeypatch.setattr(
@@ -124,17 +166,36 @@ def test_a_wrong_second_moment_of_the_control_would_be_noticed(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("control", "coefficient"),
-    [("none", "one"), ("tangent", "one"), ("tangent", "optimal"), ("quadratic", "one"), ("quadratic", "optimal")],
+    [
+        ("none", "one"),
+        ("tangent", "one"),
+        ("tangent", "optimal"),
+        ("quadratic", "one"),
+        ("quadratic", "optimal"),
+        ("chaos", "one"),
+        ("chaos", "optimal"),
+    ],
 )
 def test_claimed_intervals_cover_where_controls_are_useless(control, coefficient):
     check_coverage(ISHIGAMI, 250, samples=1024, control=control, coefficient=coefficient)
 
 
 @pytest.mark.parametrize(
-    ("control", "coefficient"), [("none", "one"), ("tangent", "one"), ("quadratic", "one"), ("quadratic", "optimal")]
+    ("control", "coefficient"),
+    [
+        ("none", "one"),
+        ("tangent", "one"),
+        ("quadratic", "one"),
+        ("quadratic", "optimal"),
+        pytest.param("chaos", "one", marks=pytest.mark.slow),
+    ],
 )
 def test_claimed_intervals_cover(control, coefficient):
     check_coverage(PRODUCT, 250, samples=256, control=control, coefficient=coefficient)
+
+
+def test_claimed_intervals_cover_with_a_chaos_control():
+    check_coverage(STEEP, 200, samples=64, control="chaos", coefficient="one")
 
 
 def check_coverage(of, count, **settings):
@@ -157,7 +218,7 @@ def test_converges_faster_than_monte_carlo(name):
 
 @pytest.mark.parametrize("coefficient", ["one", "optimal"])
 def test_controls_are_exact_where_the_model_is_their_polynomial(coefficient):
-    for of, control in ((LINEAR, "tangent"), (QUADRATIC, "quadratic")):
+    for of, control in ((LINEAR, "tangent"), (QUADRATIC, "quadratic"), (QUADRATIC, "chaos")):
         mean, mean_error, variance, variance_error = repeats(
             of, 3, samples=64, scrambles=8, control=control, coefficient=coefficient
         )
@@ -167,16 +228,17 @@ def test_controls_are_exact_where_the_model_is_their_polynomial(coefficient):
 
 def test_the_better_the_control_the_smaller_the_error():
     errors = [repeats(PRODUCT, 12, samples=64, control=control) for control in CONTROLS]
-    none, tangent, quadratic = (np.sqrt((e**2).mean(axis=1)) for e in errors)
+    none, tangent, quadratic, chaos = (np.sqrt((e**2).mean(axis=1)) for e in errors)
     for estimate in (0, 1, 2, 3):
         assert 2 * quadratic[estimate] < tangent[estimate] < none[estimate]
+        assert 2 * chaos[estimate] < quadratic[estimate]
 
 
 def test_an_optimal_coefficient_mends_a_control_that_hurts():
     """A control of three times the right slope: the coefficient is a third, and the estimate the same."""
-    inputs, model, mean, variance = PRODUCT
-    steep = FunctionModel(model.function, model.parameters, model.outputs, lambda p: 3 * np.array(model.jacobian(p)))
-    wrong = (inputs, steep, mean, variance)
+    inputs, model, _, _ = PRODUCT
+    wrong = with_slopes_times(3, PRODUCT)
+    steep = wrong[1]
     hurt = repeats(wrong, 12, samples=256, control="tangent")
     mended, right = (repeats(of, 12, samples=256, control="tangent", coefficient="optimal") for of in (wrong, PRODUCT))
     np.testing.assert_allclose(mended, right, rtol=1e-6, atol=1e-12)
@@ -303,6 +365,7 @@ def test_tolerance_is_met_by_doubling():
         ({"samples": 96, "scrambles": 8}, "such as 64 or 128"),
         ({"samples": 6, "scrambles": 3, "coefficient": "optimal"}, "expected at least 4"),
         ({}, "neither samples nor tolerance"),
+        ({"samples": 32, "control_samples": 8}, "control_samples = 8, expected none for control = 'tangent'"),
     ],
 )
 def test_amounts_that_cannot_be(settings, message):
@@ -312,12 +375,55 @@ def test_amounts_that_cannot_be(settings, message):
 
 def test_planned_solves():
     inputs, model, _, _ = PRODUCT
-    for control, more in (("none", 0), ("tangent", 0), ("quadratic", 6)):
-        method = QuasiMonteCarlo(samples=64, control=control)
+    for control, fitted, more in (
+        ("none", None, 0),
+        ("tangent", None, 0),
+        ("quadratic", None, 6),
+        ("chaos", None, 10),
+        ("chaos", 5, 5),
+    ):
+        method = QuasiMonteCarlo(samples=64, control=control, control_samples=fitted)
         asked = []
         counted = replace(model, function=lambda p, asked=asked: (asked.append(1), model.function(p))[1])
-        method.run(inputs, SerialEvaluate(counted))
+        data = method.run(inputs, SerialEvaluate(counted))
         assert method.planned(3) == len(asked) == 65 + more
+        if control == "chaos":
+            assert data["control_samples"].item() == more
+            assert 0 < data["loo_error"].item() < 0.2
+    # Twice what order 3 needs with d + 1 rows for each sample, and order 2 above eight parameters.
+    assert [QuasiMonteCarlo(samples=16, control="chaos").planned(d) - 17 for d in (1, 2, 4, 8, 9)] == [4, 7, 14, 37, 11]
+
+
+def test_tolerance_and_budget_with_a_chaos_control():
+    inputs, model, mean, _ = PRODUCT
+    data = QuasiMonteCarlo(tolerance=1e-5, control="chaos", control_samples=40).run(inputs, SerialEvaluate(model))
+    assert data.sizes["sample"] == 64, "the tangent takes more, see above"
+    assert "tolerance 1e-05 met" in data.stopped
+    assert abs(data["mean"].item() - mean) < 5 * data["mean_error"].item()
+    poor = QuasiMonteCarlo(budget_seconds=1e-9, control="chaos").run(inputs, SerialEvaluate(model))
+    assert poor.sizes["sample"] == 64
+    assert "all that budget_seconds = 1e-09 pays for" in poor.stopped
+
+
+def test_a_chaos_control_needs_independent_parameters():
+    inputs, model, _, _ = PRODUCT
+    correlated = Inputs(inputs.marginals, (("a", "b", 0.3),))
+    with pytest.raises(ValueError, match="independent parameters"):
+        QuasiMonteCarlo(samples=32, control="chaos").run(correlated, SerialEvaluate(model))
+
+
+def test_many_parameters_are_selected_from():
+    """Above eight parameters, two of which matter; a model of degree 2 is reproduced."""
+    inputs = Inputs({f"p{i}": UNIT for i in range(10)})
+    model = FunctionModel(
+        lambda p: p[3] * p[7] + p[0],
+        inputs.names,
+        ("f",),
+        lambda p: [np.eye(10)[0] + p[7] * np.eye(10)[3] + p[3] * np.eye(10)[7]],
+    )
+    data = QuasiMonteCarlo(samples=32, scrambles=4, control="chaos").run(inputs, SerialEvaluate(model))
+    assert data["mean"].item() == pytest.approx(0.75, abs=1e-12)
+    assert data["std"].item() ** 2 == pytest.approx(1 / 9 - 1 / 16 + 1 / 12, abs=1e-12)
 
 
 def test_failures_are_left_out_and_counted():
@@ -330,10 +436,16 @@ def test_failures_are_left_out_and_counted():
     model = FunctionModel(fails_sometimes, ("a", "b"), ("f",), lambda p: [[1, 0]])
     inputs = Inputs({"a": UNIT, "b": UNIT})
     for control in CONTROLS:
-        data = QuasiMonteCarlo(samples=512, control=control).run(inputs, SerialEvaluate(model))
+        fitted = 40 if control == "chaos" else None
+        method = QuasiMonteCarlo(samples=512, control=control, control_samples=fitted)
+        data = method.run(inputs, SerialEvaluate(model))
         failed = int((~data.ok).sum())
         assert failed == pytest.approx(0.05 * 512, abs=16)
         assert f"{failed} of 512 samples have no answer" in data.attrs["note"]
+        if control == "chaos":
+            lost = 40 - data["control_samples"].item()
+            assert lost > 0
+            assert f"{lost} of 40 samples for the chaos control have no answer" in data.attrs["note"]
         assert ("follow" in data.attrs["note"]) == (control != "none")
         assert np.isfinite(data["mean"].item())
     plain = QuasiMonteCarlo(samples=512, control="none").run(inputs, SerialEvaluate(model))
@@ -352,6 +464,7 @@ def test_failures_that_leave_nothing_are_an_error():
     for control, message in (
         ("tangent", "0 of 16 scrambles have an answer.*gone"),
         ("quadratic", "near the mean.*gone"),
+        ("chaos", "control = 'chaos': 0 samples have an answer, too few"),
     ):
         with pytest.raises(SolveError, match=message):
             QuasiMonteCarlo(samples=32, control=control).run(inputs, SerialEvaluate(model))
@@ -397,11 +510,12 @@ model = FunctionModel(
     lambda p: [p[0] * np.sin(p[1]), p[1] ** 3], ("a", "b"), ("f", "g"),
     lambda p: [[np.sin(p[1]), p[0] * np.cos(p[1])], [0, 3 * p[1] ** 2]],
 )
-method = QuasiMonteCarlo(tolerance=1e-5, samples=2048, control="quadratic")
-data = Ensemble.split(MPI.COMM_WORLD).run(model, lambda evaluate: method.run(inputs, evaluate))
-if data is not None:
-    assert data.identical(method.run(inputs, SerialEvaluate(model)))
-    print("same")
+for control in ("quadratic", "chaos"):
+    method = QuasiMonteCarlo(tolerance=1e-5, samples=2048, control=control)
+    data = Ensemble.split(MPI.COMM_WORLD).run(model, lambda evaluate: method.run(inputs, evaluate))
+    if data is not None:
+        assert data.identical(method.run(inputs, SerialEvaluate(model)))
+        print("same", control)
 """
 
 
@@ -410,7 +524,8 @@ if data is not None:
 def test_same_numbers_as_in_one_process(ranks):
     done = run_script(ranks, RANKS)
     assert done.returncode == 0, done.stderr
-    assert "same" in done.stdout
+    assert "same quadratic" in done.stdout
+    assert "same chaos" in done.stdout
 
 
 # --- the finite-element beam ---------------------------------------------------------------------------------------

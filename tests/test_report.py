@@ -202,7 +202,14 @@ def test_control_variate_that_hurts_is_called_so(tmp_path, sampled, undrawn):
     assert page.count("It hurts the mean: there, plain Monte Carlo is better.") == 1
 
 
-@pytest.mark.parametrize(("control", "words_"), [("none", "with Sobol"), ("tangent", "points and the control variate")])
+@pytest.mark.parametrize(
+    ("control", "words_"),
+    [
+        ("none", "with Sobol"),
+        ("tangent", "points and the control variate"),
+        ("chaos", "fitted to 7 samples of its own"),
+    ],
+)
 def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
     method = {"kind": "quasi-monte-carlo", "samples": 64, "control": control}
     dataset = solve(parse({**study().model_dump(mode="json", exclude_none=True), "method": method}))
@@ -319,6 +326,16 @@ def test_maps_are_drawn(sampled, shown):
     drawn = bodies.pictures(sampled.assign(maps), [shown])
     assert drawn is not None
     assert drawn[shown].startswith(PNG)
+
+
+def test_levels_are_told_and_drawn(tmp_path, undrawn):
+    case = study(kind="multilevel-chaos", samples=16, max_levels=3)
+    dataset = solve(case)
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    for told in ("Polynomial chaos", "<h2>Levels</h2>", "change of the moments", "Sobol"):
+        assert told in page
+    assert plots.png(plots.levels(dataset)).startswith(PNG)
+    assert case.planned == 49
 
 
 def test_local_study_has_sensitivities_only(tmp_path, undrawn):

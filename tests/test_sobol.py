@@ -138,7 +138,7 @@ def test_intervals_cover(name):
     inputs, function, first, total = EXACT[name]
     d, R, n = len(inputs.names), 16, 16
     products, hits = RowProducts(d), []
-    for seed in range(200):
+    for seed in range(100):
         cubes = np.concatenate([sobol_points(seed, r, 0, n, 2 * d) for r in range(R)])
         halves = (inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
         points = exchanged(*halves, np.eye(d, dtype=bool), pairs=False)

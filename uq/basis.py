@@ -8,8 +8,11 @@ set of multi-indices a.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,7 @@ from uq.distributions import Distribution, LogUniform, Triangular, TruncatedNorm
 from uq.inputs import Inputs
 
 IntArray = NDArray[np.int64]
+Real = TypeVar("Real", float, FloatArray)
 PANEL = 200  # Gauss points of a panel on which a density is smooth
 FAR = 12  # standard deviations beyond which a normal density is nothing
 
@@ -48,6 +52,15 @@ class Basis:
         tables, _ = self._tables(points, derivatives=False)
         return self._products(tables)
 
+    def at(self, point: FloatArray) -> FloatArray:
+        """Return ψ (P,) at one point (d,), without the overhead of arrays."""
+        result = np.ones(len(self.indices))
+        t = ((point - self.centre) / self.scale).tolist()
+        for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
+            table, _ = _recur(t[i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
+            result *= np.array(table)[self.indices[:, i]]
+        return result
+
     def derivatives(self, points: FloatArray) -> FloatArray:
         """Return σ_i ∂ψ/∂ω_i (n, d, P) at points (n, d): the derivatives per standard deviation."""
         tables, slopes = self._tables(points, derivatives=True)
@@ -63,21 +76,11 @@ class Basis:
         """Return p_k(t_i) and p_k'(t_i), each a list over i of (n, N + 1)."""
         t = (np.asarray(points, dtype=float) - self.centre) / self.scale
         values, slopes = [], []
-        for i, degree in enumerate(self.indices.max(axis=0, initial=0)):
-            p = np.ones((len(t), degree + 1))
-            dp = np.zeros_like(p)
-            for k in range(degree):
-                root = np.sqrt(self.beta[i, k + 1])
-                step = t[:, i] - self.alpha[i, k]
-                p[:, k + 1] = step * p[:, k] / root
-                dp[:, k + 1] = (p[:, k] + step * dp[:, k]) / root
-                if k:
-                    back = np.sqrt(self.beta[i, k]) / root
-                    p[:, k + 1] -= back * p[:, k - 1]
-                    dp[:, k + 1] -= back * dp[:, k - 1]
-            values.append(p)
+        for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
+            columns = _recur(t[:, i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=derivatives)
+            values.append(np.column_stack(columns[0]))
             if derivatives:
-                slopes.append(dp)
+                slopes.append(np.column_stack(columns[1]))
         return values, slopes
 
     def _products(self, tables: list[FloatArray]) -> FloatArray:
@@ -85,6 +88,18 @@ class Basis:
         for table, degrees in zip(tables, self.indices.T, strict=True):
             result *= table[:, degrees]
         return result
+
+
+def _recur(t: Real, alpha: list[float], beta: list[float], degree: int, *, derivatives: bool) -> tuple[list[Real], ...]:
+    """Return p_k(t) and (or nothing) p_k'(t) for k up to a degree, for numbers t or arrays of them."""
+    p, dp = [0 * t + 1], [0 * t]
+    for k in range(degree):
+        root, step = math.sqrt(beta[k + 1]), t - alpha[k]
+        back = math.sqrt(beta[k]) / root if k else 0.0
+        p.append(step * p[k] / root - (back * p[k - 1] if k else 0.0))
+        if derivatives:
+            dp.append((p[k] + step * dp[k]) / root - (back * dp[k - 1] if k else 0.0))
+    return p, dp
 
 
 def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
@@ -95,8 +110,9 @@ def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
     return Basis(inputs.mean, inputs.std, alpha, beta, indices)
 
 
+@cache
 def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return α and β (degree + 1,) of the standardised parameter, with β_0 = 1.
+    """Return α and β (degree + 1,) of the standardised parameter, with β_0 = 1; not to be written to.
 
     Chaospy knows them in closed form for uniform, beta, normal, log-normal and gamma parameters. For the others its
     numbers hold to six digits only; theirs come from the Stieltjes procedure with Gauss–Legendre panels.

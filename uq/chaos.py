@@ -11,24 +11,26 @@ residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there 
 by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
 The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
-of the largest basis that may be chosen. These rows are summed while the samples stream by.
+of the largest basis that may be chosen. These rows are summed where blocks are added, from the d + 1 fields of a sample
+that the blocks carry.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
 from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
-from uq.indices import Analysis, moments_and_indices
+from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.sampling import sobol_points
@@ -42,7 +44,7 @@ TRUNCATIONS = (0.5, 0.75, 1.0)
 ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
 FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
 DICTIONARY = 2000  # functions to select from, at most
-FIELD_DICTIONARY = 500  # the same where fields are expanded: every block of samples keeps a field for each function
+FIELD_DICTIONARY = 500  # the same where fields are expanded: a field in memory for each function
 FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
 ROUNDING = 1e-13  # relative error below which there is nothing left to select for
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
@@ -72,7 +74,7 @@ class Chaos(Amount):
     seed
         Seed of the design; sample z of a seed is the same in every study.
     quantiles
-        Probabilities of the quantiles of the outputs.
+        Probabilities of the quantiles of the outputs; without any there are no densities either.
     fields
         Whether the displacement field is expanded too, node by node.
     """
@@ -101,12 +103,9 @@ class Chaos(Amount):
             return int(1 + (self.max_order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
 
-    @staticmethod
-    def objection(inputs: Inputs) -> str | None:
+    def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters cannot be expanded in, or nothing."""
-        if any(rho for *_, rho in inputs.correlations):
-            return "polynomial chaos needs independent parameters, expected no correlations for method.kind = 'chaos'"
-        return None
+        return objection(inputs, self.kind)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Solve at the points of the design, fit and estimate.
@@ -124,13 +123,13 @@ class Chaos(Amount):
         ValueError
             If the parameters are correlated.
         """
-        return self.dataset(inputs, evaluate, self.expand(inputs, evaluate))
+        return expansion_dataset(self, evaluate, self.expand(inputs, evaluate))
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
         """Solve at the points of the design and fit; errors as of `run`."""
-        objection = self.objection(inputs)
-        if objection is not None:
-            raise ValueError(objection)
+        refusal = self.objection(inputs)
+        if refusal is not None:
+            raise ValueError(refusal)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         projection = self.fit == "projection"
@@ -139,14 +138,14 @@ class Chaos(Amount):
         grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
         expand_fields = self.fields and centre.state.size > 0
         if projection:
-            bases = _whole(inputs, self.max_order)
+            bases = whole(inputs, self.max_order)
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
             bases = _candidates(inputs, self.max_order, limit * _rows(inputs, gradients=gradients), dictionary)
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
-            fields = _Projections(largest, centre.state, gradients, grid, weights)
+            fields = Projections(largest, centre.state, gradients, grid, weights)
         rounds: list[Evaluations] = []
         count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
         while True:
@@ -158,8 +157,8 @@ class Chaos(Amount):
             rounds.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
             count = target
             evaluations = merge(rounds)
-            data = _Data.of(evaluations, inputs, weights)
-            fitted = _fit(bases, largest, data)
+            data = Data.of(evaluations, inputs, weights)
+            fitted = fit_best(bases, largest, data)
             reached = float(fitted.relative.max())
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             target = int(min(limit, np.ceil(GROWTH * count), paid))
@@ -169,20 +168,12 @@ class Chaos(Amount):
         stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
         return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
 
-    def dataset(self, inputs: Inputs, evaluate: Evaluate, expanded: Expanded) -> xr.Dataset:
-        """Return what `run` does, from an expansion by this method."""
-        regression = expanded.regression
-        return _dataset(
-            self,
-            inputs,
-            evaluate,
-            expanded.centre,
-            expanded.evaluations,
-            regression.largest,
-            regression.data,
-            regression.fit,
-            expanded.stopped,
-        )
+
+def objection(inputs: Inputs, kind: str) -> str | None:
+    """Say why a method of this kind cannot expand in these parameters, or nothing."""
+    if not inputs.independent:
+        return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
+    return None
 
 
 # --- design and candidates -----------------------------------------------------------------------------------------
@@ -221,7 +212,7 @@ class _Candidates:
     sets: tuple[_Candidate, ...]
 
 
-def _whole(inputs: Inputs, order: int) -> _Candidates:
+def whole(inputs: Inputs, order: int) -> _Candidates:
     """Return the full basis of one order as the only choice."""
     indices = hyperbolic(len(inputs.names), order, 1.0)
     return _Candidates(indices, (_Candidate(order, 1.0, np.arange(len(indices))),))
@@ -258,7 +249,7 @@ def _candidates(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> _
 
 
 @dataclass(frozen=True)
-class _Data:
+class Data:
     """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) per standard deviation or nothing.
 
     `weights` (n,) count the samples in sums of squares.
@@ -270,13 +261,30 @@ class _Data:
     weights: FloatArray
 
     @classmethod
-    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> _Data:
+    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
+        """Take those of the evaluations that have an answer; `weights` are one where none are given."""
         ok = evaluations.ok
-        slopes = None
-        if evaluations.tangents is not None:
-            slopes = np.swapaxes(evaluations.tangents[ok] * inputs.std, 1, 2)
-        counted = np.ones(int(ok.sum())) if weights is None else weights[ok]
-        return cls(evaluations.points[ok], evaluations.outputs[ok], slopes, counted)
+        tangents = None if evaluations.tangents is None else evaluations.tangents[ok]
+        counted = None if weights is None else weights[ok]
+        return cls.at(evaluations.points[ok], evaluations.outputs[ok], tangents, inputs, counted)
+
+    @classmethod
+    def at(
+        cls,
+        points: FloatArray,
+        values: FloatArray,
+        tangents: FloatArray | None,
+        inputs: Inputs,
+        weights: FloatArray | None = None,
+    ) -> Data:
+        """Take values (n, m) and, where they are given, tangents (n, m, d) at points; `weights` as of `of`."""
+        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
+        return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
+
+    def first(self, count: int) -> Data:
+        """Return the first `count` samples."""
+        slopes = None if self.slopes is None else self.slopes[:count]
+        return Data(self.points[:count], self.values[:count], slopes, self.weights[:count])
 
     @property
     def right(self) -> FloatArray:
@@ -307,7 +315,7 @@ class _Data:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """A regression and what it is worth.
 
     Attributes
@@ -357,7 +365,7 @@ class _Folds:
     errors: FloatArray
 
 
-def _fit(candidates: _Candidates, largest: Basis, data: _Data) -> _Fit:
+def fit_best(candidates: _Candidates, largest: Basis, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 
     Raises
@@ -413,7 +421,7 @@ def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> Float
 
 
 def _select(
-    left: FloatArray, right: FloatArray, data: _Data, dictionary: _Candidate, held: IntArray, most: int
+    left: FloatArray, right: FloatArray, data: Data, dictionary: _Candidate, held: IntArray, most: int
 ) -> tuple[float, _Candidate, _Folds]:
     """Take functions one by one, each time the one that explains most of what all outputs have left.
 
@@ -465,7 +473,7 @@ def _select(
     return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1])
 
 
-def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidate, folds: _Folds | None) -> _Fit:
+def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: _Candidate, folds: _Folds | None) -> Fit:
     from scipy.linalg import solve_triangular
 
     n, rows, m = right.shape
@@ -489,7 +497,7 @@ def _regress(left: FloatArray, right: FloatArray, data: _Data, chosen: _Candidat
             without[k, which] = np.linalg.lstsq(matrix, right[kept].reshape(-1, m), rcond=None)[0]
     squares = (residual**2).sum(axis=(0, 1))
     sampled = _sampled(blocks, residual, r)
-    return _Fit(chosen, coefficients, without, sampled, r, data.size(errors), data.relative(errors), squares)
+    return Fit(chosen, coefficients, without, sampled, r, data.size(errors), data.relative(errors), squares)
 
 
 def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
@@ -526,8 +534,8 @@ class Regression:
     inputs: Inputs
     candidates: _Candidates
     largest: Basis
-    data: _Data
-    fit: _Fit
+    data: Data
+    fit: Fit
 
     @classmethod
     def of(
@@ -540,29 +548,26 @@ class Regression:
         SolveError
             If there are not enough samples.
         """
-        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
-        data = _Data(points, values, slopes, np.ones(len(points)))
-        rows = len(points) * _rows(inputs, gradients=slopes is not None)
+        data = Data.at(points, values, tangents, inputs)
+        rows = len(points) * _rows(inputs, gradients=tangents is not None)
         candidates = _candidates(inputs, max_order, rows, DICTIONARY)
         largest = orthonormal(inputs, candidates.all)
-        return cls(inputs, candidates, largest, data, _fit(candidates, largest, data))
+        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
-        d = self.data
-        slopes = None if d.slopes is None else d.slopes[:count]
-        data = _Data(d.points[:count], d.values[:count], slopes, d.weights[:count])
-        return replace(self, data=data, fit=_fit(self.candidates, self.largest, data))
+        data = self.data.first(count)
+        return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
 
     @property
-    def indices(self) -> IntArray:
-        """Multi-indices (P, d) of the fit."""
-        return self.largest.subset(self.fit.chosen.which).indices
+    def basis(self) -> Basis:
+        """The P functions of the fit."""
+        return self.largest.subset(self.fit.chosen.which)
 
-    def estimates(self, of: Analysis = moments_and_indices) -> dict[str, FloatArray]:
+    def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
         """Return what follows from the coefficients, by output, with standard errors."""
-        n = len(self.data.points)
-        return _estimates(self.fit, self.largest.indices, n, cautious=_cautious(self.inputs), of=of)
+        cautious = None in [m.support for m in self.inputs.marginals.values()]
+        return _estimates(self.fit, self.largest.indices, len(self.data.points), cautious=cautious, of=of)
 
 
 @dataclass(frozen=True)
@@ -576,8 +581,10 @@ class Expanded:
 
 
 @dataclass(frozen=True)
-class _Projections:
+class Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
+
+    A compact sum: blocks carry y_z, the deviation and its slopes.
 
     Attributes
     ----------
@@ -598,36 +605,125 @@ class _Projections:
     weights: FloatArray | None
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → y_z of one group's model."""
         state = model.scatter(self.state[None, :])[0]
         directions = np.diag(self.basis.scale)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            left = self.basis.values(parameters[None, :])
-            right = (solution.state - state)[None, :]
-            if self.gradients:
-                left = np.vstack([left, self.basis.derivatives(parameters[None, :])[0]])
-                right = np.vstack([right, solution.state_tangent(directions)])
-            total = np.empty((left.shape[1] + 1, right.shape[1]))
-            np.matmul(left.T, right, out=total[:-1])
-            np.einsum("ru,ru->u", right, right, out=total[-1])
-            if self.points is None or self.weights is None:
-                return total
-            return np.asarray(self.weights[(self.points == parameters).all(axis=1)][0] * total)
+            deviation = (solution.state - state)[None, :]
+            return np.vstack([deviation, solution.state_tangent(directions)]) if self.gradients else deviation
 
         return rows
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return Σ A_zᵀ y_z and Σ |y_z|² (P + 1, U) from the rows y_z (n, 1 + d, U) or (n, 1, U)."""
+        left = self.basis.values(points)[:, None, :]
+        if self.gradients:
+            left = np.concatenate([left, self.basis.derivatives(points)], axis=1)
+        weighted = rows
+        if self.points is not None and self.weights is not None:
+            which = [int(np.flatnonzero((self.points == point).all(axis=1))[0]) for point in points]
+            weighted = self.weights[which][:, None, None] * rows
+        total = np.empty((left.shape[2] + 1, rows.shape[2]))
+        np.matmul(left.reshape(-1, left.shape[2]).T, weighted.reshape(-1, rows.shape[2]), out=total[:-1])
+        np.einsum("zru,zru->u", rows, weighted, out=total[-1])
+        return total
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Expansion of the deviations of outputs and state from those at the mean parameters.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    outputs, state
+        Coefficients (P, m) and (P, U); (P, 0) where the state was not wanted.
+    relative
+        Leave-one-out errors (m,) of the outputs over their standard deviation.
+    ok
+        Which samples (n,) had an answer and were fitted.
+    prediction
+        Of the state, from which the solver may start; nothing where the state was not wanted.
+    """
+
+    basis: Basis
+    outputs: FloatArray
+    state: FloatArray
+    relative: FloatArray
+    ok: NDArray[np.bool_]
+    prediction: StateExpansion | None
+
+
+def fit_deviations(
+    inputs: Inputs, evaluate: Evaluate, centre: Linearisation, points: FloatArray, max_order: int, *, fields: bool
+) -> Deviations:
+    """Fit an expansion to values and gradients at points (n, d), outputs and whole state alike.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at too many of the points for an expansion of order 1.
+    """
+    candidates = _candidates(inputs, max_order, len(points) * _rows(inputs, gradients=True), FIELD_DICTIONARY)
+    largest = orthonormal(inputs, candidates.all)
+    wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
+    data = Data.of(evaluations, inputs, None)
+    fit = fit_best(candidates, largest, data)
+    basis = largest.subset(fit.chosen.which)
+    outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
+    state, prediction = np.zeros((len(outputs), 0)), None
+    if wanted is not None:
+        state = _solved(fit, evaluations.fields[fit.chosen.which])
+        prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction)
+
+
+@dataclass(frozen=True)
+class StateExpansion:
+    """A prediction of the whole state by its expansion, with the factor at a point near all samples.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    coefficients
+        (P, U), in canonical order.
+    point, state
+        Parameters (d,) of the factor, and the state (U,) there.
+    """
+
+    basis: Basis
+    coefficients: FloatArray
+    point: FloatArray
+    state: FloatArray
+
+    @classmethod
+    def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
+        """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
+        coefficients = _solved(fit, fields[fit.chosen.which])
+        coefficients[(basis.indices == 0).all(axis=1)] += centre.state
+        return cls(basis, coefficients, centre.point, centre.state)
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+        coefficients, state = model.scatter(self.coefficients), model.scatter(self.state[None, :])[0]
+        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state)
+
+
+def _solved(fit: Fit, projections: FloatArray) -> FloatArray:
+    """Coefficients (P, U) of the regression on what has these projections (P, U)."""
+    from scipy.linalg import cho_solve
+
+    return np.asarray(cho_solve((fit.triangle, False), projections))
 
 
 # --- what follows from an expansion --------------------------------------------------------------------------------
 
 
-def _cautious(inputs: Inputs) -> bool:
-    """Whether the samples may hide what the expansion misses, see `_estimates`."""
-    return None in [m.support for m in inputs.marginals.values()]
-
-
-def _estimates(
-    fit: _Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis = moments_and_indices
-) -> dict[str, FloatArray]:
+def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
@@ -636,7 +732,7 @@ def _estimates(
     The jackknife asks of a fit what it does in the hole that a sample left, and claims too much; a regression with
     independent errors takes the rest, which is smooth, for noise, and claims too little. For the mean, the geometric
     mean of the two is claimed: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
-    jackknife 97 to 100 % at up to four times the length, the others 63 to 100 %. For the standard deviation, where
+    jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. For the standard deviation, where
     the rest that no polynomial takes is a bias, it is the jackknife: 92 to 100 %.
 
     Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
@@ -648,7 +744,7 @@ def _estimates(
     central = of(fit.coefficients.T, indices)
     left_out = of(np.swapaxes(fit.without, 1, 2), largest)
     groups = len(fit.without)
-    share = _ratio(fit.loo**2, central["std"] ** 2)
+    share = shares(fit.loo**2, central["std"] ** 2)
     nothing = np.zeros_like(fit.loo)
     missing = {"mean": fit.loo / np.sqrt(n) if cautious else nothing, "std": fit.loo if cautious else nothing}
     for name, values in left_out.items():
@@ -660,43 +756,42 @@ def _estimates(
     return central
 
 
-def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
-    """A / b, and 0 where b vanishes."""
-    return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 0.0))
+class Report(Protocol):
+    """Settings of a method that reports an expansion."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the points at which the expansion is drawn for quantiles and densities."""
+
+    @property
+    def quantiles(self) -> tuple[float, ...]:
+        """Probabilities of the quantiles."""
+
+    @property
+    def fields(self) -> bool:
+        """Whether the displacement field is reported."""
 
 
-def _dataset(
-    method: Chaos,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    centre: Linearisation,
-    evaluations: Evaluations,
-    largest: Basis,
-    data: _Data,
-    fit: _Fit,
-    stopped: str,
+def expansion_dataset(
+    method: Report, evaluate: Evaluate, expanded: Expanded, further: Mapping[str, FloatArray] | None = None
 ) -> xr.Dataset:
-    basis = largest.subset(fit.chosen.which)
+    """Return the results of an expansion; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
+    centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
+    inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = _estimates(fit, largest.indices, len(data.points), cautious=_cautious(inputs))
+    estimates = regression.estimates()
+    for name, error in (further or {}).items():
+        estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
     lower, upper = (
         np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
         for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
     )
-    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
-    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
-    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
     by_output, by_pair = ("output",), ("output", "parameter")
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
     dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
         {
             **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
-            "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
-            # No quantile moves by more than the function does.
-            "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
-            "density": (("output", "bin"), np.array([density for density, _ in counts])),
-            "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
             "ok": (("sample",), evaluations.ok),
@@ -710,10 +805,12 @@ def _dataset(
             "range_upper": (("parameter",), upper),
         }
     )
-    if evaluations.fields.size:
+    if method.quantiles:
+        dataset = dataset.assign(_distribution(method, inputs, basis, fit))
+    if evaluations.fields.size and method.fields:
         fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
         dataset = dataset.assign(fields)
-    dataset.attrs["stopped"] = stopped
+    dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:
         dataset.attrs["note"] = (
@@ -723,28 +820,42 @@ def _dataset(
     return dataset
 
 
+def _distribution(
+    method: Report, inputs: Inputs, basis: Basis, fit: Fit
+) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Quantiles and densities of the outputs, from many points of the expansion."""
+    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
+    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
+    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
+    return {
+        "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
+        # No quantile moves by more than the function does.
+        "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
+        "density": (("output", "bin"), np.array([density for density, _ in counts])),
+        "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
+    }
+
+
 def _field_estimates(
     evaluations: Evaluations,
     centre: Linearisation,
     count: int,
     basis: Basis,
-    fit: _Fit,
+    fit: Fit,
     estimates: dict[str, FloatArray],
 ) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
     """Coefficients, mean and standard deviation of the displacements.
 
     Their errors are those of the outputs in proportion to the residuals, which come from the same rows.
     """
-    from scipy.linalg import cho_solve
-
     projections = evaluations.fields[fit.chosen.which][:, :count]
-    coefficients = cho_solve((fit.triangle, False), projections)
+    coefficients = _solved(fit, projections)
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
-    moments = moments_and_indices(coefficients.T, basis.indices)
+    moments = coefficient_moments(coefficients.T, basis.indices)
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
     for name in ("mean", "std"):
-        share = np.sqrt(_ratio(estimates[f"{name}_error"] ** 2, fit.squares).max())
+        share = np.sqrt(shares(estimates[f"{name}_error"] ** 2, fit.squares).max())
         fields[f"{name}_error"] = (share * np.sqrt(squares)).reshape(-1, 3)
     return {
         **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
@@ -834,7 +945,7 @@ def load(source: str | Path | xr.Dataset) -> Expansion:
     Raises
     ------
     ValueError
-        If these are not results of `method.kind = "chaos"`.
+        If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
     """
     import xarray as xr
 

@@ -40,9 +40,7 @@ class Checkpoint:
 
     def key(self, block: Request) -> str:
         """Return the name of a block."""
-        digest = hashlib.sha256(self._identity)
-        _digest(digest, block)
-        return digest.hexdigest()[:24]
+        return digest(block, self._identity).hex()[:24]
 
     def has(self, key: str) -> bool:
         """Whether a block is finished; a file that cannot be read is removed."""
@@ -77,8 +75,14 @@ class Checkpoint:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _digest(digest: Any, value: object) -> None:
-    """Feed a value to a hash: arrays by their numbers, dataclasses by their fields."""
+def digest(value: object, before: bytes = b"") -> bytes:
+    """Return a hash of a value, after some text: of arrays by their numbers, of dataclasses by their fields."""
+    hashed = hashlib.sha256(before)
+    _feed(hashed, value)
+    return hashed.digest()
+
+
+def _feed(digest: Any, value: object) -> None:
     if isinstance(value, np.ndarray):
         digest.update(repr((value.shape, value.dtype.str)).encode())
         digest.update(np.ascontiguousarray(value).data)
@@ -86,7 +90,7 @@ def _digest(digest: Any, value: object) -> None:
         digest.update(type(value).__name__.encode())
         for field in fields(value):
             digest.update(field.name.encode())
-            _digest(digest, getattr(value, field.name))
+            _feed(digest, getattr(value, field.name))
     else:
         digest.update(repr(value).encode())
 
@@ -99,6 +103,8 @@ def _write(path: Path, block: Evaluations) -> None:
         file["seconds"] = block.seconds
         file["work"] = block.work
         file["work"].attrs["columns"] = list(WORK)
+        file["residuals"] = block.residuals
+        file["converged"] = block.converged
         file["failures"] = json.dumps([asdict(failure) for failure in block.failures])
         if block.tangents is not None:
             file["tangents"] = block.tangents
@@ -124,5 +130,7 @@ def load(path: Path) -> Evaluations:
             failures,
             np.asarray(file["seconds"]),
             np.asarray(file["work"]),
+            np.asarray(file["residuals"]),
+            np.asarray(file["converged"]),
             np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
         )

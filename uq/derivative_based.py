@@ -88,7 +88,7 @@ class DerivativeBased(Amount):
     @staticmethod
     def objection(inputs: Inputs) -> str | None:
         """Say why the bounds do not hold for these parameters, or nothing."""
-        if any(rho for *_, rho in inputs.correlations):
+        if not inputs.independent:
             return (
                 "bounds on Sobol' indices need independent parameters, expected no correlations for "
                 "method.kind = 'derivative-based'"

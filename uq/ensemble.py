@@ -163,7 +163,7 @@ class EnsembleEvaluate:
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
         kept = {i: key for i, key in enumerate(keys) if checkpoint and checkpoint.has(key)}
         pending = tuple(i for i in range(len(blocks)) if i not in kept)
-        merger, early = Merger(), dict[int, Evaluations]()
+        merger, early = Merger(request.fields), dict[int, Evaluations]()
 
         def receive(index: int, block: Evaluations) -> None:
             early[index] = block

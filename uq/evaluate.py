@@ -9,13 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import WORK, FloatArray, ForwardModel, Reference, Solution, SolveError
 
+TOGETHER = 16  # realisations whose part of a compact sum is formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks
 
 
@@ -47,8 +48,13 @@ class Evaluations:
         Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
     work
         Counts (n, k) of the operations `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
     fields
-        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for.
+        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
+        `CompactSum`, the rows of these points themselves, one point after the other.
     """
 
     points: FloatArray
@@ -57,6 +63,8 @@ class Evaluations:
     failures: tuple[Failure, ...]
     seconds: FloatArray
     work: NDArray[np.int64]
+    residuals: FloatArray
+    converged: NDArray[np.bool_]
     fields: FloatArray
 
     @property
@@ -74,6 +82,17 @@ class FieldSum(Protocol):
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
 
 
+@runtime_checkable
+class CompactSum(FieldSum, Protocol):
+    """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
+
+    `on` returns the few; the sum is formed where blocks are added, so that files and messages stay small.
+    """
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, k, U)."""
+
+
 class JointSum(Protocol):
     """A quantity of the states of several points that follow each other, summed as these rows of points stream by.
 
@@ -88,9 +107,19 @@ class JointSum(Protocol):
         """Return the function states (K, U_local) → rows (k, U_local) to be summed, for one group's model."""
 
 
+class Start(Protocol):
+    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+
+    A dataclass, by whose fields the blocks that were started from it are found again.
+    """
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state: start of the solver at every point, whose factor at `point` corrects it.
+    """A linear prediction of the state, with the factor at `point`.
 
     Attributes
     ----------
@@ -99,7 +128,7 @@ class Prediction:
     state
         State (U,) there, in canonical order.
     slopes
-        Derivatives (d, U) of the state.
+        Derivatives (d, U) of the state, or none (0, U): then the solver starts from the state at `point`.
     """
 
     point: FloatArray
@@ -109,6 +138,8 @@ class Prediction:
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+        if len(slopes) == 0:
+            return lambda _: state, Reference(self.point, state)
         return lambda parameters: state + (parameters - self.point) @ slopes, Reference(self.point, state)
 
 
@@ -126,6 +157,8 @@ class Request:
         What is summed of the states.
     start
         Where the solver starts.
+    iterations
+        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
     model
         Which of the models that the evaluation has; `Evaluate.on` sets it.
     joint
@@ -135,7 +168,8 @@ class Request:
     points: FloatArray
     tangents: bool = False
     fields: FieldSum | None = None
-    start: Prediction | None = None
+    start: Start | None = None
+    iterations: int | None = None
     model: int = 0
     joint: JointSum | None = None
 
@@ -217,7 +251,7 @@ class SerialEvaluate:
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
         solver = BlockSolver(self.model, request)
-        return merge([solver(block.points, self.progress) for block in request.blocks()])
+        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
 
 
 class Recorder:
@@ -227,11 +261,15 @@ class Recorder:
     ----------
     log
         Every evaluation, in order, of all models; shared by the evaluations of the other models.
+    models
+        The number of the model of each.
     """
 
-    def __init__(self, evaluate: Evaluate, log: list[Evaluations] | None = None) -> None:
+    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: int = 0) -> None:
         self._evaluate = evaluate
-        self.log: list[Evaluations] = [] if log is None else log
+        self._model = model
+        self.log: list[Evaluations] = [] if whole is None else whole.log
+        self.models: list[int] = [] if whole is None else whole.models
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -258,11 +296,12 @@ class Recorder:
         evaluations = self._evaluate(request)
         # Derivatives and fields are the method's own business.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
+        self.models.append(self._model)
         return evaluations
 
     def on(self, model: int) -> Recorder:
         """Return the evaluation of another of the models, with the same log."""
-        return Recorder(self._evaluate.on(model), self.log)
+        return Recorder(self._evaluate.on(model), self, model)
 
     @property
     def solves(self) -> int:
@@ -281,7 +320,9 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents = request.tangents
+        self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
+        self._compact = isinstance(request.fields, CompactSum)
         self._joint = request.joint.on(model) if request.joint is not None else None
         self._together = 1 if request.joint is None else request.joint.size
         self._predict: Callable[[FloatArray], FloatArray] | None = None
@@ -297,19 +338,21 @@ class BlockSolver:
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         failures: list[Failure] = []
-        total: FloatArray | None = None
-        states: list[FloatArray] = []
+        rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
+        states: list[FloatArray] = []  # of a row that is not complete
         for i, point in enumerate(points):
             begin = time.process_time()
             row = None
             try:
                 start = self._predict(point) if self._predict is not None else None
-                solution = model.solve(point, start, self._reference)
+                solution = model.solve(point, start, self._reference, self._iterations)
                 if self._row is not None:
                     row = self._row(solution, point)
                 if tangents is not None:
-                    tangents[i] = solution.tangent(np.eye(d)).T
+                    # One derivative for each parameter or for each output, whichever are fewer.
+                    tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
                 row = None
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
@@ -317,24 +360,27 @@ class BlockSolver:
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
+                residuals[i], converged[i] = solution.residual, solution.converged
                 states += [solution.state] if self._joint is not None else []
             if self._joint is not None and (i + 1) % self._together == 0:
                 row = self._joint(np.array(states)) if len(states) == self._together else None
                 states = []
-            if row is not None:
+            if row is not None and (self._compact or not rows):
+                rows.append(row.copy())
+            elif row is not None:
                 # In place: these are the largest arrays there are, and a new one for each sample takes longer.
-                total = row.copy() if total is None else np.add(total, row, out=total)
+                rows[0] += row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
-        fields = np.zeros((0, 0)) if total is None else model.gather(total)
+        fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, fields)
+        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, fields)
 
 
-def merge(blocks: Sequence[Evaluations]) -> Evaluations:
-    """Put the blocks of a request together, in their order."""
-    merger = Merger()
+def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
+    """Put the blocks of a request for these fields together, or several evaluations, in their order."""
+    merger = Merger(fields)
     for block in blocks:
         merger.add(block)
     return merger.result()
@@ -343,30 +389,53 @@ def merge(blocks: Sequence[Evaluations]) -> Evaluations:
 class Merger:
     """Adds blocks in their order, keeping one sum of fields.
 
+    Parameters
+    ----------
+    fields
+        The sum that the blocks are parts of; none where each of them is complete.
+
     Attributes
     ----------
     count
         Number of blocks added so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fields: FieldSum | None = None) -> None:
+        self._compact = fields if isinstance(fields, CompactSum) else None
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
+        self._waiting: list[tuple[FloatArray, FloatArray]] = []
         self._points = 0
         self.count = 0
         self._failures: list[Failure] = []
 
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
-        if block.fields.size:
-            self._fields = block.fields if self._fields.size == 0 else self._fields + block.fields
+        if block.fields.size and self._compact is None:
+            self._add(block.fields)
+        elif block.fields.size:
+            solved = block.points[block.ok]
+            self._waiting.append((solved, block.fields.reshape(len(solved), -1, block.fields.shape[1])))
+            if sum(len(points) for points, _ in self._waiting) >= TOGETHER:
+                self._form()
         self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
         self._points += len(block.points)
         self.count += 1
         self._blocks.append(replace(block, fields=np.zeros((0, 0))))
 
+    def _form(self) -> None:
+        """Add what waits, in one product: the sum is read and written once for all of it."""
+        if self._compact is not None and self._waiting:
+            points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+            self._add(self._compact.total(points, rows))
+            self._waiting.clear()
+
+    def _add(self, part: FloatArray) -> None:
+        self._fields = part if self._fields.size == 0 else self._fields + part
+
     def result(self) -> Evaluations:
         """Return everything added so far as one."""
+        self._form()
 
         def joined(pick: Callable[[Evaluations], FloatArray | None]) -> Iterator[FloatArray]:
             for block in self._blocks:
@@ -382,5 +451,7 @@ class Merger:
             tuple(self._failures),
             np.concatenate(list(joined(lambda b: b.seconds))),
             np.concatenate([b.work for b in self._blocks]),
+            np.concatenate(list(joined(lambda b: b.residuals))),
+            np.concatenate([b.converged for b in self._blocks]),
             self._fields,
         )

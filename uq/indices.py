@@ -65,7 +65,7 @@ def pair_variances(squares: FloatArray, indices: NDArray[np.int64]) -> FloatArra
     return np.asarray(np.tensordot(squares, both, axes=1))
 
 
-def moments_and_indices(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
+def coefficient_moments(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
     """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
     variance, first, total = partial_variances(coefficients**2, indices, np.eye(indices.shape[1], dtype=bool))
     constant = (indices == 0).all(axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -41,7 +42,9 @@ class Inputs:
             if a == b or not -1 < rho < 1:
                 message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
                 raise ValueError(message)
-        smallest = np.linalg.eigvalsh(self._copula).min(initial=1.0)
+        if not self.correlations:
+            return
+        smallest = np.linalg.eigvalsh(self._copula).min()
         if smallest <= 0:
             message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
             raise ValueError(message)
@@ -50,6 +53,11 @@ class Inputs:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return tuple(self.marginals)
+
+    @property
+    def independent(self) -> bool:
+        """Whether no two parameters are correlated."""
+        return not any(rho for *_, rho in self.correlations)
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -60,6 +68,14 @@ class Inputs:
     def std(self) -> FloatArray:
         """Standard deviations (d,)."""
         return np.array([m.moments[1] for m in self.marginals.values()])
+
+    @cached_property
+    def _columns(self) -> dict[Distribution, list[int]]:
+        """Positions of the parameters of each distribution."""
+        columns: dict[Distribution, list[int]] = {}
+        for i, marginal in enumerate(self.marginals.values()):
+            columns.setdefault(marginal, []).append(i)
+        return columns
 
     @cached_property
     def _copula(self) -> FloatArray:
@@ -90,11 +106,22 @@ class Inputs:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
         marginals = self.marginals.values()
         if not self.correlations:
-            return np.column_stack([m.quantile(u) for m, u in zip(marginals, uniforms.T, strict=True)])
+            points = np.empty_like(uniforms)
+            for marginal, columns in self._columns.items():  # many parameters have few distributions
+                points[:, columns] = marginal.quantile(uniforms[:, columns])
+            return points
         from scipy.special import ndtri
 
         normals = ndtri(uniforms) @ np.linalg.cholesky(self._copula).T
         return np.column_stack([_from_normal(m, z) for m, z in zip(marginals, normals.T, strict=True)])
+
+
+@runtime_checkable
+class Restricted(Protocol):
+    """A method that some parameters do not allow."""
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters do not allow it, or nothing."""
 
 
 def _from_normal(marginal: Distribution, normals: FloatArray) -> FloatArray:

@@ -16,6 +16,8 @@ from uq.inputs import Inputs
 if TYPE_CHECKING:
     import xarray as xr
 
+MANY = 256  # parameters above which the state has no slopes: each would be a field to keep and to send
+
 
 @dataclass(frozen=True)
 class Linearisation:
@@ -32,7 +34,7 @@ class Linearisation:
     state
         ū (U,) in canonical order.
     slopes
-        dū/dω (d, U); empty (0, U) for a model without derivatives.
+        dū/dω (d, U); empty (0, U) for a model without derivatives or of more than `MANY` parameters.
     """
 
     point: FloatArray
@@ -43,25 +45,25 @@ class Linearisation:
 
     @property
     def prediction(self) -> Prediction | None:
-        """The linear prediction of the state, where there is one."""
-        if self.state.size == 0 or len(self.slopes) == 0:
+        """The prediction of the state, linear where there are slopes; nothing for a model without derivatives."""
+        if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
         return Prediction(self.point, self.state, self.slopes)
 
 
 @dataclass(frozen=True)
 class _StateAndSlopes:
-    derivatives: bool
+    slopes: bool
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        if not self.derivatives:
+        if not self.slopes:
             return lambda solution, _: solution.state[None, :]
         directions = np.eye(len(model.parameters))
         return lambda solution, _: np.vstack([solution.state, solution.state_tangent(directions)])
 
 
 def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
-    """Solve at the mean parameters, with all derivatives that the model has.
+    """Solve at the mean parameters, with all derivatives that the model has (of the state, up to `MANY`).
 
     Raises
     ------
@@ -69,7 +71,8 @@ def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
         If the model has no answer there.
     """
     derivatives = evaluate.differentiable
-    found = evaluate(Request(inputs.mean[None, :], tangents=derivatives, fields=_StateAndSlopes(derivatives)))
+    slopes = derivatives and len(evaluate.parameters) <= MANY
+    found = evaluate(Request(inputs.mean[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
     for failure in found.failures:
         message = f"the model has no answer at the mean parameters: {failure.reason}"
         raise SolveError(message, failure.history)

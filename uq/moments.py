@@ -9,17 +9,23 @@ L = Σ_i ∂ψ/∂ω_i(ω̄)(ω_i − ω̄_i), with E[L] = 0 and E[L²] = V know
 β₁ = 1 is the estimator of Cao, Hussaini & Zang, AIAA J. 42 (2004) 703–710; β₂ = 0 is its published second moment (see
 docs/decisions/0003-second-moment-control.md), β₁ = β₂ = 0 is plain Monte Carlo. Everything follows from the means of
 w^a L^b, a + b ≤ 4, which are sums and so can be added up in any grouping.
+
+Either expectation may also be a sum of independently estimated terms (a telescoping sum over meshes): see `combine`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Coefficient = Literal["one", "optimal"]
 SecondMoment = Literal["quadratic", "linear"]
@@ -80,6 +86,84 @@ class Moments(Estimates):
     std_variance_ratio: FloatArray
 
 
+@dataclass(frozen=True)
+class Term:
+    """Estimates of a first and a second moment from n independent samples: those of ψ − ψ̄, or terms of a sum for them.
+
+    Attributes
+    ----------
+    n
+        Number of samples, at least 2.
+    first, second
+        Means of the controlled samples r₁ and r₂ of the two moments, each of the shape of the quantity.
+    variance, covariance, second_variance
+        Var r₁, Cov(r₁, r₂) and Var r₂.
+    """
+
+    n: int
+    first: FloatArray
+    second: FloatArray
+    variance: FloatArray
+    covariance: FloatArray
+    second_variance: FloatArray
+
+
+def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, FloatArray] | None = None) -> Term:
+    """Reduce samples to the moments that estimates are made of.
+
+    Parameters
+    ----------
+    first, second
+        Samples (n, …) that have the wanted moments as expectations, n ≥ 2.
+    controls
+        Controls (n, …) of both, with expectation zero; their coefficients are 1.
+    """
+    if controls is not None:
+        first, second = first - controls[0], second - controls[1]
+    n = len(first)
+    m1, m2 = first.mean(axis=0), second.mean(axis=0)
+    covariance = ((first - m1) * (second - m2)).sum(axis=0) / (n - 1)
+    return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1))
+
+
+def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | FloatArray = 1.0) -> Estimates:
+    """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each of samples of its own.
+
+    Parameters
+    ----------
+    reference
+        ψ̄ (…).
+    terms
+        The terms.
+    coefficient
+        β₁ of the terms, for the record.
+    """
+    m1, mean_variance, variance, variance_error = _sums(terms)
+    std: FloatArray = np.sqrt(variance)
+    return Estimates(
+        mean=reference + m1,
+        mean_error=np.sqrt(mean_variance),
+        std=std,
+        std_error=ratio(variance_error, 2.0 * std),
+        coefficient=np.broadcast_to(coefficient, std.shape),
+    )
+
+
+def _sums(terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Mean of ψ − ψ̄ and its variance; variance of ψ and its standard error, by linearisation."""
+    m1 = _sum(t.first for t in terms)
+    mean_variance = _sum(t.variance / t.n for t in terms)
+    # The squared mean exceeds the square of the expectation by its variance, which is added back: plain Monte Carlo
+    # gets the usual n − 1.
+    variance = np.maximum(_sum(t.second for t in terms) - m1**2 + mean_variance, 0)
+    scatter = _sum((t.second_variance - 4 * m1 * t.covariance + 4 * m1**2 * t.variance) / t.n for t in terms)
+    return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0))
+
+
+def _sum(arrays: Iterable[FloatArray]) -> FloatArray:
+    return np.asarray(sum(arrays))
+
+
 def estimate(
     sums: FloatArray,
     n: int,
@@ -133,22 +217,21 @@ def estimate(
     var1 = np.maximum(m11 - m1**2, 0) * bessel
     cov12 = (m12 - m1 * q) * bessel
     var2 = np.maximum(m22 - q**2, 0) * bessel
-    # ⟨r1⟩² exceeds its square by Var(r1)/n, which is added back: plain Monte Carlo gets the usual n − 1.
-    variance = np.maximum(q + beta2 * V - m1**2 + var1 / n, 0)
-    variance_error = np.sqrt(np.maximum(var2 - 4 * m1 * cov12 + 4 * m1**2 * var1, 0) / n)
-    std = np.sqrt(variance)
+    one = Term(n, m1, q + beta2 * V, var1, cov12, var2)
+    _, _, _, variance_error = _sums([one])
+    found = combine(reference, [one], beta1)
 
     plain1 = np.maximum(mean_of(2, 0) - mean_of(1, 0) ** 2, 0) * bessel
     w1, w2 = mean_of(1, 0), mean_of(2, 0)
     plain_variance = (mean_of(4, 0) - w2**2 - 4 * w1 * (mean_of(3, 0) - w1 * w2) + 4 * w1**2 * (w2 - w1**2)) * bessel
     return Moments(
-        mean=reference + m1,
-        mean_error=np.sqrt(var1 / n),
-        std=std,
-        std_error=ratio(variance_error, 2 * std),
+        mean=found.mean,
+        mean_error=found.mean_error,
+        std=found.std,
+        std_error=found.std_error,
+        coefficient=found.coefficient,
         variance_ratio=ratio(plain1, var1, empty=1.0),
         std_variance_ratio=ratio(plain_variance, n * variance_error**2, empty=1.0),
-        coefficient=beta1,
     )
 
 
@@ -270,3 +353,12 @@ def _around(values: FloatArray, p: FloatArray, spread: FloatArray) -> FloatArray
     upper = np.quantile(values, np.minimum(p + spread, 1), axis=0)
     lower = np.quantile(values, np.maximum(p - spread, 0), axis=0)
     return np.asarray((upper - lower) / 2)
+
+
+def half_width(dataset: xr.Dataset) -> float:
+    """Standard errors on either side of a 95 % interval of results: more where they come from a few scrambles."""
+    if "scramble" not in dataset:
+        return 1.96
+    from scipy.special import stdtrit
+
+    return float(stdtrit(int(dataset["scramble"].max()), 0.975))

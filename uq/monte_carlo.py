@@ -82,7 +82,9 @@ class SensitivityMonteCarlo(MonteCarlo):
     Parameters
     ----------
     coefficient
-        "one", or "optimal": β = Cov(ψ, L)/Var L estimated on the samples.
+        "one", or "optimal": β = Cov(ψ, L)/Var L estimated on the samples that it corrects, which has a bias of order
+        1/n: on a product of three functions 95 % intervals of the variance cover 89, 92, 93 and 95 % with 100, 200, 400
+        and 1000 samples (those of "one": 93 to 95 %).
     second_moment
         "quadratic" controls it by the square of the tangent, "linear" is the published form.
     """
@@ -131,7 +133,7 @@ def _sample(
 ) -> xr.Dataset:
     evaluate = Recorder(evaluate)
     centre = linearise(inputs, evaluate)
-    slopes = centre.slopes if control else None
+    slopes = centre.slopes if control and len(centre.slopes) else None
     fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
     limit = method.limit
@@ -182,7 +184,7 @@ def _field_moments(
     control: tuple[Coefficient, SecondMoment] | None,
 ) -> Moments:
     n = int(evaluations.ok.sum())
-    if control is None:
+    if control is None or len(centre.slopes) == 0:
         return estimate(evaluations.fields, n, centre.state)
     variance = np.einsum("iu,ij,ju->u", centre.slopes, inputs.covariance, centre.slopes)
     return estimate(evaluations.fields, n, centre.state, variance, *control)

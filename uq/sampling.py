@@ -7,10 +7,11 @@ import numpy as np
 from forward.model import FloatArray
 
 
-def random_points(seed: int, start: int, stop: int, dimension: int) -> FloatArray:
+def random_points(seed: int | tuple[int, ...], start: int, stop: int, dimension: int) -> FloatArray:
     """Return the pseudo-random points number `start` to `stop` (stop − start, dimension) of the stream `seed`.
 
-    A point is the same whichever range it is drawn in, and lies strictly inside the unit cube.
+    A point is the same whichever range it is drawn in, and lies strictly inside the unit cube. Several numbers make one
+    seed: (s, 1), (s, 2), … are independent streams.
     """
     bits = np.random.PCG64(seed)
     bits.advance(start * dimension)

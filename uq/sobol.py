@@ -22,7 +22,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import nearest
-from uq.chaos import LARGEST, Chaos, Regression
+from uq.chaos import LARGEST, Chaos, Regression, expansion_dataset
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import (
     Analysis,
@@ -30,10 +30,10 @@ from uq.indices import (
     RowProducts,
     bootstrap,
     bootstrap_error,
+    coefficient_moments,
     exchanged,
     field_indices,
     jackknife_error,
-    moments_and_indices,
     pair_variances,
     partial_variances,
     shares,
@@ -141,7 +141,7 @@ class Sobol(Amount):
     @staticmethod
     def objection(inputs: Inputs) -> str | None:
         """Say why these parameters have no Sobol' indices, or nothing."""
-        if any(rho for *_, rho in inputs.correlations):
+        if not inputs.independent:
             return "Sobol' indices need independent parameters, expected no correlations for method.kind = 'sobol'"
         return None
 
@@ -196,7 +196,7 @@ class Sobol(Amount):
         members = self._members(inputs)
 
         def of(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
-            found = moments_and_indices(coefficients, indices)
+            found = coefficient_moments(coefficients, indices)
             squares = coefficients**2
             variance, first, total = partial_variances(squares, indices, members)
             if len(members):
@@ -220,7 +220,7 @@ class Sobol(Amount):
             fields=self.fields,
         )
         expanded = method.expand(inputs, evaluate)
-        dataset = method.dataset(inputs, evaluate, expanded)
+        dataset = expansion_dataset(method, evaluate, expanded)
         return self._with_indices(dataset, inputs, expanded.regression)
 
     def _with_indices(self, dataset: xr.Dataset, inputs: Inputs, regression: Regression) -> xr.Dataset:
@@ -261,8 +261,8 @@ class Sobol(Amount):
             regression = Regression.of(inputs, points, values, None, self.max_order)
             dataset = dataset.assign(loo_error=(("output",), regression.fit.relative))
             dataset.attrs["stopped"] += (
-                f"; expanded to order {regression.fit.chosen.order}, {len(regression.indices)} terms, leave-one-out "
-                f"error {regression.fit.relative.max():.3g}"
+                f"; expanded to order {regression.fit.chosen.order}, {regression.fit.chosen.which.size} terms, "
+                f"leave-one-out error {regression.fit.relative.max():.3g}"
             )
             return self._with_indices(dataset, inputs, regression)
         coefficients, indices = source["coefficients"].to_numpy().T, source["multi_index"].to_numpy()

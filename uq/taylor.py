@@ -1,14 +1,16 @@
-"""Taylor polynomials of a model around the mean parameters, whose moments are known exactly: control variates.
+"""Polynomials that stand for a model and whose moments are known exactly: control variates.
 
-With the deviation δ = ω − ω̄, the polynomial is C(δ) = Σ_k φ_k(δ) c_k, of features φ = (δ_i; ½δ_i², δ_iδ_j for i < j)
-and coefficients c = (∂ψ/∂ω_i; ∂²ψ/∂ω_i∂ω_j). E[C] = Σ E[φ_k] c_k is exact whatever the coefficients are, so errors of a
-difference quotient cost efficiency and never bias; so is E[C²] = Σ c_k E[φ_kφ_l] c_l.
+A control is C(ω) = Σ_k φ_k(ω) c_k, of features φ whose moments are known. E[C] = Σ E[φ_k] c_k is exact whatever the
+coefficients are, as long as they do not depend on the samples that are controlled: an error of theirs costs efficiency
+and never bias. So is E[C²] = Σ c_k E[φ_kφ_l] c_l. For the Taylor polynomials around the mean parameters, with the
+deviation δ = ω − ω̄, φ = (δ_i; ½δ_i², δ_iδ_j for i < j) and c = (∂ψ/∂ω_i; ∂²ψ/∂ω_i∂ω_j).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -21,18 +23,37 @@ STEP = 0.5  # of the difference quotients, in standard deviations: wide, to see 
 EDGE = 1e-9  # probability of the quantile that takes the place of the end of an unbounded range
 
 
+class Features(Protocol):
+    """Functions φ of the parameters."""
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+
+
 @dataclass(frozen=True)
-class Taylor:
-    """A polynomial of first or second degree, of the outputs and of the state.
+class Monomials:
+    """The features of a Taylor polynomial: the deviations from `point` (d,), and products of `pairs` (i, j), i ≤ j."""
+
+    point: FloatArray
+    pairs: tuple[tuple[int, int], ...] = ()
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+        deviation = points - self.point
+        second = [(0.5 if i == j else 1.0) * deviation[:, i] * deviation[:, j] for i, j in self.pairs]
+        return np.column_stack([deviation, *second])
+
+
+@dataclass(frozen=True)
+class Control:
+    """A polynomial that stands for the deviations of the outputs and of the state from those at the mean parameters.
 
     Attributes
     ----------
-    point
-        ω̄ (d,).
-    pairs
-        (i, j), i ≤ j, of the features of second degree; none for the tangent.
+    polynomials
+        The k features.
     outputs, state
-        Coefficients (k, m) and (k, U).
+        Coefficients (k, m) and (k, U); no state (0, U) where the slopes of the state are not known.
     features_mean
         E[φ] (k,).
     features_second
@@ -40,8 +61,7 @@ class Taylor:
         square of what these predict is the control of the second moment.
     """
 
-    point: FloatArray
-    pairs: tuple[tuple[int, int], ...]
+    polynomials: Features
     outputs: FloatArray
     state: FloatArray
     features_mean: FloatArray
@@ -49,9 +69,7 @@ class Taylor:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return φ (…, k) at points (…, d)."""
-        deviation = points - self.point
-        second = [(0.5 if i == j else 1.0) * deviation[..., i] * deviation[..., j] for i, j in self.pairs]
-        return np.concatenate([deviation, *(f[..., None] for f in second)], axis=-1)
+        return self.polynomials.values(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:-1], -1)
 
     def predict(self, features: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the controls C and D (…, q) of the deviation and of its square, from φ (…, k) and c (k, q)."""
@@ -62,19 +80,18 @@ class Taylor:
 
     def expected(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return E[C] and E[D] (q,)."""
-        s = len(self.features_second)
-        leading = coefficients[:s]
-        return self.features_mean @ coefficients, np.einsum("kq,kl,lq->q", leading, self.features_second, leading)
+        leading = coefficients[: len(self.features_second)]
+        return self.features_mean @ coefficients, (leading * (self.features_second @ leading)).sum(axis=0)
 
 
-def tangent(inputs: Inputs, centre: Linearisation) -> Taylor:
-    """Return the polynomial of first degree: E[φ] = 0 and E[φφᵀ] is the covariance of the inputs."""
+def tangent(inputs: Inputs, centre: Linearisation) -> Control:
+    """Return the Taylor polynomial of first degree: E[φ] = 0 and E[φφᵀ] is the covariance of the inputs."""
     zero = np.zeros(len(centre.point))
-    return Taylor(centre.point, (), centre.tangents.T, centre.slopes, zero, inputs.covariance)
+    return Control(Monomials(centre.point), centre.tangents.T, centre.slopes, zero, inputs.covariance)
 
 
-def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> Taylor:
-    """Return the polynomial of second degree, by central differences of tangents: two solves for each parameter.
+def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> Control:
+    """Return the Taylor polynomial of second degree, by central differences of tangents: two solves for each parameter.
 
     E[φ] follows from the covariance of the inputs. E[φφᵀ] needs their moments up to the fourth, which are known where
     the inputs are independent; with a copula the second moment is controlled by the square of the tangent alone.
@@ -97,7 +114,7 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     pairs = tuple((i, j) for i in range(d) for j in range(i, d))
     steps = _steps(inputs)
     displaced = centre.point + np.concatenate([np.diag(steps), -np.diag(steps)])
-    wanted = _SecondDerivatives(centre.point, pairs) if fields and centre.state.size else None
+    wanted = _SecondDerivatives(centre.point, pairs) if fields and centre.slopes.size else None
     found = evaluate(Request(displaced, tangents=True, fields=wanted, start=centre.prediction))
     for failure in found.failures:
         message = (
@@ -108,13 +125,14 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     # (d, m, d): ∂/∂ω_i of ∂ψ/∂ω_j
     differences = (found.tangents[:d] - found.tangents[d:]) / (2 * steps[:, None, None])
     hessian = np.array([(differences[i, :, j] + differences[j, :, i]) / 2 for i, j in pairs])
-    state = np.concatenate([centre.slopes, found.fields]) if wanted is not None else centre.slopes[:, :0]
+    state = np.concatenate([centre.slopes, found.fields]) if wanted is not None else centre.slopes[:0]
     exponents = np.concatenate([np.eye(d, dtype=int), [np.eye(d, dtype=int)[[i, j]].sum(axis=0) for i, j in pairs]])
     factors = np.array([1.0] * d + [0.5 if i == j else 1.0 for i, j in pairs])
     covariance = inputs.covariance
     mean = factors * np.array([0.0] * d + [covariance[i, j] for i, j in pairs])
     second = covariance if inputs.correlations else _second_moments(inputs, exponents, factors)
-    return Taylor(centre.point, pairs, np.concatenate([centre.tangents.T, hessian]), state, mean, second)
+    outputs = np.concatenate([centre.tangents.T, hessian])
+    return Control(Monomials(centre.point, pairs), outputs, state, mean, second)
 
 
 def _second_moments(inputs: Inputs, exponents: FloatArray, factors: FloatArray) -> FloatArray:

@@ -38,7 +38,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         of that parameter): the field whose magnitude is the colour. With "std", lines show the edges of the body
         where all components are one standard deviation larger, and smaller, than their mean. "sobol_first PARAMETER",
         "sobol_total PARAMETER": that index of the displacement at the node. "dominating": a colour for the parameter
-        with the largest total index.
+        with the largest total index. "factor FIELD i": realisation i of the factor of a random field, on the undeformed
+        body.
 
     Returns
     -------
@@ -52,6 +53,9 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     parameter = shown.removeprefix("derivative ") if shown.startswith("derivative ") else None
     factor = 1.0 if parameter is None else float(dataset["parameter_std"].sel(parameter=parameter))
     grid.point_data["colour"] = factor * grid.point_data[shown]
+    scalar = grid.point_data[shown].ndim == 1
+    undeformed = shown.startswith("factor ")
+    displacement = np.zeros_like(grid.points) if undeformed else grid.point_data[motion]
 
     # Two panels, so that the scale of the colours never covers the body.
     plotter: Any = pyvista.Plotter(
@@ -63,15 +67,17 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         for sign in (-1, 1):
             edge = grid.point_data[motion] + sign * np.sign(grid.point_data[motion]) * grid.point_data["std"]
             plotter.add_mesh(_edges(grid, edge), color=SECOND, line_width=2)
-    surface = _surface(grid, grid.point_data[motion])
+    surface = _surface(grid, displacement)
     # The magnitude after the subdivision: between the nodes it is that of the interpolated vector, never negative.
     colour = np.asarray(surface.point_data["colour"])
-    surface.point_data["magnitude"] = np.linalg.norm(colour, axis=1) if colour.ndim == 2 else colour
-    colours: Any = "plasma" if shown == "std" else "viridis"
+    surface.point_data["magnitude"] = colour if scalar else np.linalg.norm(colour, axis=1)
+    colours: Any = "cividis" if scalar else "plasma" if shown == "std" else "viridis"
     ends: tuple[float, float] | None = None
     names = [str(name) for name in dataset["parameter"].values]
-    if shown.startswith("sobol_"):
-        colours, ends = "cividis", (0.0, 1.0)
+    if shown.startswith("factor "):
+        ends = _range(dataset, shown)
+    elif shown.startswith("sobol_"):
+        ends = (0.0, 1.0)
     elif shown == "dominating":
         surface.point_data["magnitude"] = np.round(np.clip(colour, -1, len(names) - 1))
         colours, ends = [STILL, *(BY_NUMBER[i % len(BY_NUMBER)] for i in range(len(names)))], (-1.0, len(names) - 1.0)
@@ -87,8 +93,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         split_sharp_edges=True,
         show_scalar_bar=False,
     )
-    plotter.add_mesh(_edges(grid, grid.point_data[motion]), color=DARK, line_width=1.5)
-    _show_lengths(plotter, np.concatenate([grid.points, grid.points + grid.point_data[motion]]))
+    plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
+    _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)
     labels = len(names) + 1 if shown == "dominating" else 5
@@ -115,6 +121,12 @@ def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | No
         return dict(pickle.loads(done.stdout))
     except (OSError, subprocess.SubprocessError, pickle.UnpicklingError, EOFError):
         return None
+
+
+def _range(dataset: xr.Dataset, shown: str) -> tuple[float, float]:
+    """Smallest and largest factor over all realisations of a random field, which share one scale of colours."""
+    factors = dataset["factor"].sel(random_field=shown.split()[1])
+    return float(factors.min()), float(factors.max())
 
 
 def _surface(grid: Any, displacement: FloatArray | None = None) -> Any:
@@ -209,6 +221,9 @@ def _colour_title(shown: str, parameter: str | None, names: list[str]) -> str:
         which, _, name = shown.partition(" ")
         kind = "first-order" if which == "sobol_first" else "total"
         return f"{kind} index of the displacement for {name}".replace("$", "")
+    if shown.startswith("factor "):
+        _, field, _ = shown.split()
+        return f"random factor {field} (1)".replace("$", "")
     words = {
         "mean": "magnitude of the mean displacement (m)",
         "std": "magnitude of the standard deviation of the displacement (m)",

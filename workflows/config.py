@@ -12,18 +12,17 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
-from uq.chaos import Chaos
+from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
-from uq.distributions import Distribution
-from uq.inputs import Inputs
+from uq.distributions import Distribution, Normal
+from uq.inputs import Inputs, Restricted
 from uq.linearisation import LocalSensitivity
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.quasi_monte_carlo import QuasiMonteCarlo
+from uq.multilevel import MultilevelMonteCarlo
+from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 Method = Annotated[
-    MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | LocalSensitivity | Chaos | Sobol | DerivativeBased,
-    Field(discriminator="kind"),
+    Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
 ]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
@@ -63,7 +62,8 @@ class Study(Settings):
     model
         The body.
     parameters
-        Distributions by the paths of the numbers of the model that they override.
+        Distributions by the paths of the numbers of the model that they override; may be left out where the model has
+        random fields, whose coefficients are parameters by themselves.
     correlations
         Correlations between them.
     method
@@ -73,20 +73,39 @@ class Study(Settings):
     """
 
     model: Hyperelastic
-    parameters: dict[str, Distribution] = Field(min_length=1)
+    parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Method
     parallel: Parallel = Parallel()
 
     @property
     def inputs(self) -> Inputs:
-        """The random parameters."""
-        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
+        standard = Normal(mean=0.0, std=1.0)
+        marginals = self.parameters | dict.fromkeys(self.model.coefficients, standard)
+        return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def meshes(self) -> tuple[Hyperelastic, ...]:
+        """The model, and the same on the finer meshes that a multilevel method may use."""
+        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
+        return self.model, *(self.model.refined(level) for level in range(1, levels))
+
+    @property
+    def models(self) -> tuple[Hyperelastic, ...]:
+        """The models that the method may ask for, in the order of their numbers."""
+        if not isinstance(self.method, Compare):
+            return self.meshes
+        solver = self.model.solver
+        tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
+        tight, textbook = (solver.model_copy(update=change) for change in (tolerances, {"kind": "newton"}))
+        others = [self.model.model_copy(update={"solver": changed}) for changed in (tight, textbook)]
+        return self.model, *others, *([self.model.refined(1)] if self.method.mesh_error else [])
 
     @property
     def planned(self) -> int:
-        """Number of solves, the largest where a tolerance may end the study earlier."""
-        return self.method.planned(len(self.parameters))
+        """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
+        return self.method.planned(len(self.parameters) + len(self.model.coefficients))
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -104,7 +123,41 @@ class Study(Settings):
         return self
 
     def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        try:
+            _ = self.models
+        except ValidationError as error:
+            message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
+            yield ("method", "levels"), message, getattr(self.method, "levels", None)
+        yield from self._mistakes_of_parameters()
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            objection = self.method.objection(inputs) if isinstance(self.method, Restricted) else None
+            if objection is not None:
+                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+            stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None
+            if stranger is not None:
+                yield ("method", "groups"), stranger, self.method.model_dump()["groups"]
+        if isinstance(self.method, MultilevelChaos):
+            shortage = self.method.shortage(len(self.parameters) + len(self.model.coefficients))
+            if shortage is not None:
+                yield ("method", "samples"), shortage, self.method.samples
+        if isinstance(self.method, Compare):
+            yield from self._compare_mistakes(self.method)
+
+    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         scalars = self.model.scalars
+        if not self.parameters and not self.model.fields:
+            yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
+        if self.model.fields and isinstance(self.method, MultilevelMonteCarlo):
+            message = "random fields have other coefficients on every mesh, expected a method with one mesh"
+            yield ("model", "fields"), message, self.method.kind
+        for i, field in enumerate(self.model.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
         for path, distribution in self.parameters.items():
             if path not in scalars:
                 yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
@@ -118,18 +171,17 @@ class Study(Settings):
                     message = f"reaches {end:.4g}, where the model is impossible ({objection})"
                     yield ("parameters", path), message, distribution.model_dump()
                     break
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            restricted = self.method if isinstance(self.method, Chaos | Sobol | DerivativeBased) else None
-            objection = None if restricted is None else restricted.objection(inputs)
-            if objection is not None:
-                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
-            stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None
-            if stranger is not None:
-                yield ("method", "groups"), stranger, self.method.model_dump()["groups"]
+
+    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        for i, entry in enumerate(method.methods):
+            shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
+            if shortage is not None:
+                yield ("method", "methods", i, "budgets"), shortage, list(entry.budgets)
+        if isinstance(method.reference, Given):
+            given, outputs = method.reference.values, [output.name for output in self.model.outputs]
+            if set(given) != set(outputs):
+                message = f"expected values of every output: {', '.join(outputs)}"
+                yield ("method", "reference", "values"), message, list(given)
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
@@ -247,7 +299,7 @@ def _path(key: str, blocks: Mapping[str, Any]) -> list[str]:
 
 def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     for i, item in enumerate(items):
-        if isinstance(item, dict) and name in (item.get("name"), item.get("kind"), item.get("on"), str(i)):
+        if isinstance(item, dict) and name in (*map(item.get, ("name", "kind", "on", "of")), str(i)):
             items[i] = item.copy()
             return items[i]  # type: ignore[no-any-return]
     message = f"--set {key}: no element is called '{name}'"
@@ -281,7 +333,7 @@ def _kinds() -> set[str]:
 
     unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
+    return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 
 
-_TAGS = _kinds()
+_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

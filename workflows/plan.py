@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
+from uq.multilevel import MultilevelMonteCarlo
+from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
-
-
-def seconds_per_solve(unknowns: int) -> float:
-    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so.
-
-    Fitted to 0.011, 0.067 and 0.98 s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core;
-    `python -m benchmarks realisation`). Inputs so wide that the prediction fails take several times as long.
-    """
-    return float(4e-3 + 1.2e-6 * unknowns**1.2)
-
-
-TEXTBOOK = 15  # times as long is a solve by the textbook, at 10⁴ unknowns
 
 
 def bytes_per_model(unknowns: int) -> float:
@@ -24,25 +14,39 @@ def bytes_per_model(unknowns: int) -> float:
 
 def plan(study: Study, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
-    unknowns = study.model.unknowns
-    solves = study.planned
-    each = seconds_per_solve(unknowns) * (TEXTBOOK if study.model.solver.kind == "newton" else 1)
-    seconds = min(solves * each, getattr(study.method, "budget_seconds", None) or float("inf")) / groups
-    body = study.model.body
+    method, body = study.method, study.model.body
+    textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
+    sizes = [model.unknowns for model in study.meshes]
+    each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
+    memory = sum(bytes_per_model(model.unknowns) for model in study.models)
     cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
-    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
     edge = body.longest_edge
     narrow = [inclusion for inclusion in study.model.inclusions if inclusion.width < edge]
+    up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
+    seconds = study.planned * each[0]
+    if isinstance(method, MultilevelMonteCarlo):
+        up_to, later = "", " for linearisations and pilots, which decide how many more"
+        seconds = method.seconds_to_begin(sizes, textbook)
+    seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
+    names = [*study.parameters]
+    for field in study.model.fields:
+        paths = field.paths(body)
+        names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
-        f"method      {study.method.kind}",
-        f"unknowns    {unknowns:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
-        f"parameters  {', '.join(study.parameters)}",
+        f"method      {method.kind}",
+        f"unknowns    {sizes[0]:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
+        *(
+            f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
+            for k, (size, s) in enumerate(zip(sizes, each, strict=True))
+            if k
+        ),
+        f"parameters  {', '.join(names)}",
         f"outputs     {', '.join(output.name for output in study.model.outputs)}",
-        f"solves      {up_to}{solves:,}",
-        f"memory      about {bytes_per_model(unknowns) / 2**20:,.0f} MiB for each group of ranks",
+        f"solves      {up_to}{study.planned:,}{later}",
+        f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
-        f" (rough; {each:.2g} s a solve)",
+        f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
         *(
             f"warning     inclusions.{inclusion.label}.width = {inclusion.width:g} m is below a cell ({edge:.3g} m):"
             " few quadrature points see the transition, and derivatives by place and size are rough"

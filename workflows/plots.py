@@ -13,17 +13,20 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from uq.moments import Coefficient, Moments, estimate, monomials
+from uq.moments import Coefficient, Moments, estimate, half_width, monomials
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+Estimated = Literal["mean", "std"]
+Cost = Literal["solves", "cpu_seconds"]
 FIRST_SHOWN = 8  # estimates from fewer samples say nothing
 BARS = 15  # parameters that a tornado chart shows
 SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
+METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6b", "#b08900", "#1d9aa8", "#5b4636")
 LOW, HIGH = "#0b6bb8", "#d1622b"
 
 
@@ -57,21 +60,12 @@ def running_estimates(
     return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
 
 
-def band(dataset: xr.Dataset) -> float:
-    """Standard errors on either side of a 95 % confidence band: more where they come from a few scrambles."""
-    if "scramble" not in dataset:
-        return 1.96
-    from scipy.special import stdtrit
-
-    return float(stdtrit(int(dataset["scramble"].max()), 0.975))
-
-
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
     ax = ax or _axes()
     series = _series(dataset, output)
     for label, colour, counts, mean, error in series:
-        half = band(dataset) * error
+        half = half_width(dataset) * error
         ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
         ax.plot(counts, mean, color=colour, label=label)
     _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
@@ -156,9 +150,8 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
         values, errors = (dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error"))
         label = "first order" if which == "first" else "total"
         places = np.arange(len(order)) + side
-        ax.barh(
-            places, values, xerr=band(dataset) * errors, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label
-        )
+        reach = half_width(dataset) * errors
+        ax.barh(places, values, xerr=reach, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label)
     if "total_bound" in dataset:
         limits = dataset["total_bound"].sel(output=output).to_numpy()[order]
         ax.plot(limits, np.arange(len(order)), "|", color=DARK, markersize=16, label="bound from derivatives")
@@ -205,7 +198,7 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
         name = _text(str(of_parameter["parameter"].item()))
         for which, style in (("first", "--"), ("total", "-")):
             mean, error = (of_parameter[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
-            half = band(dataset) * error
+            half = half_width(dataset) * error
             ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.12, linewidth=0)
             ax.plot(counts, mean, style, color=colour, label=name if which == "total" else None)
     ax.set_ylim(-0.1, 1.1)
@@ -248,8 +241,28 @@ def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     return ax
 
 
+def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw the residuals of the samples and the change of the moments, level by level."""
+    ax = ax or _axes()
+    places = dataset["level"].to_numpy()
+    for name, label, colour, dash in (
+        ("level_residual", "largest residual", CONTROLLED, "-"),
+        ("level_residual_median", "median residual", CONTROLLED, ":"),
+        ("level_change", "change of the moments", HIGH, "-"),
+    ):
+        values = dataset[name].to_numpy()
+        ax.plot(places, np.where(values > 0, values, np.nan), dash, color=colour, marker="o", markersize=4, label=label)
+    if bool((dataset["level_residual"] > 0).any() | (dataset["level_change"] > 0).any()):
+        ax.set_yscale("log")
+    ax.set_xticks(places)
+    ax.set_xlabel("level")
+    ax.set_ylabel("relative residual, relative change")
+    ax.legend()
+    return ax
+
+
 def comparison(
-    datasets: Mapping[str, xr.Dataset], output: str, estimated: Literal["mean", "std"] = "mean", ax: Axes | None = None
+    datasets: Mapping[str, xr.Dataset], output: str, estimated: Estimated = "mean", ax: Axes | None = None
 ) -> Axes:
     """Draw an estimate of several studies, each with its 95 % confidence interval.
 
@@ -268,7 +281,7 @@ def comparison(
     ax = ax or _axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
-    errors = [band(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
+    errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
     ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
     ax.set_yticks(places, [_text(name) for name in shown])
     ax.set_ylim(-0.6, len(shown) - 0.4)
@@ -276,6 +289,184 @@ def comparison(
     word = {"mean": "mean", "std": "standard deviation"}[estimated]
     quantities = {_quantity(datasets[name], output) for name in shown}
     ax.set_xlabel(f"{word} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
+    return ax
+
+
+def mesh_variance(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw log₂ of the variances of an output and of its differences between meshes, plain and controlled."""
+    found = _levels(dataset, output)
+    ax = _level_axis(dataset, ax)
+    levels = dataset["level"].to_numpy()
+    _log2(ax, levels, found["mesh_variance"], DARK, "output")
+    _log2(ax, levels[1:], found["difference_variance"][1:], PLAIN, "difference")
+    controlled = found["difference_variance"] / found["difference_variance_ratio"]
+    if (controlled != found["difference_variance"]).any():
+        _log2(ax, levels, found["mesh_variance"] / found["mesh_variance_ratio"], HIGH, "output, controlled")
+        _log2(ax, levels[1:], controlled[1:], CONTROLLED, "difference, controlled")
+    ax.set_ylabel(f"log₂ variance of {_text(output)}")
+    ax.legend()
+    return ax
+
+
+def mesh_mean(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw log₂ of the means of an output and of its differences between meshes."""
+    found = _levels(dataset, output)
+    ax = _level_axis(dataset, ax)
+    levels = dataset["level"].to_numpy()
+    _log2(ax, levels, found["mesh_mean"], DARK, "output")
+    _log2(ax, levels[1:], found["difference_mean"][1:], CONTROLLED, "difference")
+    _log2(ax, levels[1:], np.diff(found["mesh_nominal"]), HIGH, "difference at the mean parameters", linestyle="--")
+    ax.set_ylabel(f"log₂ |mean of {_text(output)}|")
+    ax.legend()
+    return ax
+
+
+def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the samples on every mesh, and the numbers that are best for other relative errors of sampling."""
+    from uq.multilevel import optimal
+
+    ax = _level_axis(dataset, ax)
+    levels, (variances, costs) = dataset["level"].to_numpy(), _sampling(dataset, output)
+    error = float(dataset["mean_error"].sel(output=output))
+    for i, target in enumerate([] if error == 0 else [4 * error, 2 * error, error, error / 2]):
+        numbers = np.maximum(optimal(variances, costs, target**2), 1)
+        relative = target / abs(float(dataset["mean"].sel(output=output)))
+        ax.plot(levels, numbers, color=CONTROLLED, alpha=0.3 + 0.2 * i, marker=".", label=f"error {relative:.2g}, best")
+    ax.plot(levels, dataset["mesh_samples"].to_numpy(), color=DARK, marker="o", linestyle="", label="taken")
+    ax.set_yscale("log")
+    ax.set_ylabel("samples")
+    ax.legend()
+    return ax
+
+
+def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the predicted time of sampling against the error of the mean, over meshes and on the finest mesh alone."""
+    ax = ax or _axes()
+    found, (variances, costs) = _levels(dataset, output), _sampling(dataset, output)
+    finest = float(dataset["mesh_cost"][-1])
+    plain, ratio = found["difference_variance"], found["difference_variance_ratio"]
+    works = {"all meshes": (CONTROLLED, "-", np.sqrt(variances * costs).sum() ** 2)}
+    single = found["mesh_variance"][-1] * finest
+    if (ratio != 1).any():
+        works["all meshes, no control"] = (CONTROLLED, "--", np.sqrt(plain * costs).sum() ** 2)
+        works["finest mesh"] = (HIGH, "-", single / found["mesh_variance_ratio"][-1])
+    works["finest mesh, no control"] = (HIGH, "--", single)
+    error = float(dataset["mean_error"].sel(output=output)) or np.sqrt(np.finfo(float).tiny)
+    errors = error * np.array([0.25, 4.0])
+    for label, (colour, style, work) in works.items():
+        ax.plot(errors, work / errors**2, color=colour, linestyle=style, label=label)
+    taken = float(dataset["mesh_samples"].to_numpy() @ costs)
+    ax.plot([error], [taken], color=DARK, marker="o", linestyle="", label="taken")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel(f"standard error of {_quantity(dataset, output)}")
+    ax.set_ylabel("predicted time (s)")
+    ax.legend()
+    return ax
+
+
+def _levels(dataset: xr.Dataset, output: str) -> dict[str, NDArray[np.float64]]:
+    """Return what belongs to an output on every mesh."""
+    return {str(n): v.sel(output=output).to_numpy() for n, v in dataset.items() if v.dims == ("level", "output")}
+
+
+def _sampling(dataset: xr.Dataset, output: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return variance and predicted time (s) of one sample on every mesh."""
+    found, each = _levels(dataset, output), dataset["mesh_cost"].to_numpy()
+    return found["difference_variance"] / found["difference_variance_ratio"], each + np.append(0.0, each[:-1])
+
+
+def _level_axis(dataset: xr.Dataset, ax: Axes | None) -> Axes:
+    ax = ax or _axes()
+    ax.set_xticks(dataset["level"].to_numpy())
+    ax.set_xlabel("level (0 is the coarsest mesh)")
+    return ax
+
+
+def _log2(
+    ax: Axes,
+    levels: NDArray[np.int64],
+    values: NDArray[np.float64],
+    colour: str,
+    label: str,
+    linestyle: str = "-",
+) -> None:
+    some = values != 0
+    ax.plot(levels[some], np.log2(np.abs(values[some])), color=colour, marker="o", linestyle=linestyle, label=label)
+
+
+def errors(
+    dataset: xr.Dataset,
+    output: str,
+    estimated: Estimated = "mean",
+    against: Cost = "solves",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the root mean square error of each method of a comparison against its cost, both logarithmic.
+
+    Hollow markers are errors that the reference cannot resolve; dashed lines over the solves are the fitted rates.
+
+    Parameters
+    ----------
+    dataset
+        Results of ``method.kind = "compare"``.
+    output
+        Name of the output.
+    estimated
+        The mean or the standard deviation.
+    against
+        The number of solves, or the processor time, which has the plain method by the textbook too.
+    ax
+        Where to draw.
+    """
+    ax = ax or _axes(height=4.2, width=8.6)
+    of_output = dataset.sel(output=output)
+    costs, rmse, rows = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
+    resolved, scatter = (of_output[f"{estimated}_{name}"].to_numpy() for name in ("resolved", "rmse_error"))
+    names = [
+        name
+        for name in of_output["estimator"].to_numpy().tolist()
+        if against == "cpu_seconds" or not of_output["derived"].to_numpy()[rows == name].all()
+    ]
+    for i, name in enumerate(names):
+        colour = METHOD_COLOURS[i % len(METHOD_COLOURS)]
+        mine = (rows == name) & (rmse > 0)
+        good = mine & resolved
+        ax.errorbar(costs[mine], rmse[mine], yerr=scatter[mine], fmt="none", ecolor=colour, capsize=2)
+        ax.plot(costs[mine], rmse[mine], color=colour, linewidth=0, marker="o", markerfacecolor="white")
+        label = _text(name)
+        if against == "cpu_seconds":
+            ax.plot(costs[mine], rmse[mine], color=colour, linewidth=1)
+        elif good.sum() > 1:
+            rate = float(of_output[f"{estimated}_rate"].sel(estimator=name))
+            logarithms = np.log(costs[good])
+            fitted = np.exp(np.log(rmse[good]).mean() + rate * (logarithms - logarithms.mean()))
+            ax.plot(costs[good], fitted, color=colour, linestyle="--", linewidth=1)
+            label += f" (rate {rate:.2f})".replace("-", "−")
+        ax.plot(costs[good], rmse[good], color=colour, linewidth=0, marker="o", label=label)
+    shown = costs[np.isin(rows, names)]
+    ends = np.array([shown.min() / 1.3, shown.max() * 1.3])
+    each = 1.0 if against == "solves" else float(of_output["plain_seconds"])
+    if np.isfinite(each):
+        line = float(of_output[f"{estimated}_single"]) * np.sqrt(each / ends)
+        ax.plot(ends, line, color=DARK, linewidth=0.8, linestyle=":", label="plain Monte Carlo, exactly")
+    reference = float(of_output[f"{estimated}_error"])
+    lowest = min([*rmse[rmse > 0], *([reference] if reference > 0 else [])], default=1.0) / 3
+    if reference > 0:
+        ax.axhspan(lowest, reference, color=PLAIN, alpha=0.25, linewidth=0, label="error of the reference")
+    floors = {"solver_error": "error of the solver", "mesh_error": "error of the mesh, of the mean"}
+    for (floor, label), style in zip(floors.items(), ("-.", "-"), strict=True):
+        size = float(of_output[floor])
+        if size > lowest and (estimated == "mean" or floor == "solver_error"):
+            ax.axhline(size, color=DARK, linewidth=1, linestyle=style, label=label)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(*ends)
+    ax.set_ylim(bottom=lowest)
+    ax.set_xlabel({"solves": "solves, set-up charged", "cpu_seconds": "processor time (s), set-up charged"}[against])
+    word = {"mean": "mean", "std": "standard deviation"}[estimated]
+    ax.set_ylabel(f"RMSE of the {word} of {_quantity(dataset, output)}")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1), frameon=False, fontsize="small")
     return ax
 
 
@@ -288,12 +479,12 @@ def png(ax: Axes) -> bytes:
     return file.getvalue()
 
 
-def _axes(height: float = 3.2) -> Axes:
+def _axes(height: float = 3.2, width: float = 5.4) -> Axes:
     """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.4, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     ax: Axes = figure.add_subplot()
     ax.spines[["top", "right"]].set_visible(False)

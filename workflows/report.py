@@ -15,13 +15,14 @@ import numpy as np
 from workflows import bodies, plots, tables
 from workflows.config import parse
 from workflows.results import read_dataset, read_summary, write_text
-from workflows.tables import Results
+from workflows.tables import Results, Table
 from workflows.words import model_in_words, number
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
 MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
@@ -103,10 +104,18 @@ def _context(results: Results) -> dict[str, Any]:
         "model": list(model_in_words(results.study)),
         "parameters": tables.parameters(results),
         "nominal": tables.nominal(results),
-        "moments": tables.moments(results) if sampled else None,
+        "references": tables.references(results) if "row_method" in dataset else None,
+        "errors": [(o, _errors(results, o)) for o in results.outputs] if "row_method" in dataset else [],
+        "moments": tables.moments(results) if "mean" in dataset else None,
         "gains": list(tables.gains(dataset)),
-        "quantiles": tables.quantiles(results) if sampled else None,
+        "quantiles": tables.quantiles(results) if "quantiles" in dataset else None,
+        "total_errors": tables.total_errors(results) if "total_error" in dataset else None,
+        "meshes": tables.meshes(results) if "mesh_samples" in dataset else None,
+        "differences": [_differences(results, o) for o in results.outputs] if "mesh_samples" in dataset else [],
         "expansion": tables.expansion(results) if "multi_index" in dataset else None,
+        "levels": tables.levels(results) if "level" in dataset.dims else None,
+        "controlled": tables.controlled(results) if "level" in dataset.dims else None,
+        "levels_drawn": [_picture(plots.levels(dataset), LEVELS_DRAWN)] if "level" in dataset.dims else [],
         **_sobol(results),
         "bounds": [_bounds(results, output) for output in results.outputs] if "total_bound" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
@@ -174,6 +183,34 @@ def _bounds(results: Results, output: str) -> tuple[str, list[tables.Table], lis
     )
 
 
+def _differences(results: Results, output: str) -> tuple[str, str, Table, list[Picture]]:
+    dataset = results.dataset
+    pictures = [
+        _picture(plots.mesh_variance(dataset, output), f"Variance of {output} and of its difference between meshes."),
+        _picture(plots.mesh_mean(dataset, output), f"Mean of {output} and of its difference between meshes."),
+        _picture(plots.mesh_samples(dataset, output), "Samples on every mesh: taken, and best for other errors."),
+        _picture(plots.mesh_cost(dataset, output), "Predicted time of sampling, without linearisations."),
+    ]
+    return output, tables.rates(results, output), tables.differences(results, output), pictures
+
+
+def _errors(results: Results, output: str) -> list[tuple[str, tables.Table, list[Picture]]]:
+    """Tables and pictures of a comparison of methods."""
+    costs: dict[str, plots.Cost] = {"the number of solves": "solves", "processor time": "cpu_seconds"}
+    words: dict[str, plots.Estimated] = {"mean": "mean", "standard deviation": "std"}
+    shown = []
+    for word, estimated in words.items():
+        pictures = [
+            _picture(
+                plots.errors(results.dataset, output, estimated, against),
+                f"Error of the {word} of {output} against {cost}.",
+            )
+            for cost, against in costs.items()
+        ]
+        shown.append((word, tables.errors(results, output, estimated), pictures))
+    return shown
+
+
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:
     return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order.")
 
@@ -216,6 +253,13 @@ def _body_captions(dataset: xr.Dataset) -> dict[str, str]:
             captions[f"sobol_first {name}"] = f"First-order index of the displacement for {name}, node by node."
             captions[f"sobol_total {name}"] = f"Total index of the displacement for {name}, node by node."
         captions["dominating"] = "The parameter with the largest total index, node by node."
+    if "factor" in dataset:
+        for field in dataset["random_field"].to_numpy():
+            for i, factor in enumerate(dataset["factor"].sel(random_field=field).to_numpy()):
+                ends = f"{number(float(factor.min()), 3)} to {number(float(factor.max()), 3)}"
+                captions[f"factor {field} {i}"] = (
+                    f"Realisation {i + 1} of the random factor '{field}', {ends}, on the undeformed body."
+                )
     return captions
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
 
 if TYPE_CHECKING:
@@ -69,11 +70,13 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the part of summary.json that follows from the results: `outputs` and `local`."""
+    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`."""
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
     if "mean" in dataset:
-        names = [name for name in (*ESTIMATES, "variance_ratio", "std_variance_ratio", "loo_error") if name in dataset]
+        mesh = ("bias_error", "total_error", "std_bias_error", "std_total_error")
+        others = ("variance_ratio", "std_variance_ratio", "loo_error", *mesh)
+        names = [name for name in (*ESTIMATES, *others) if name in dataset]
         summary["outputs"] = {
             output: {name: float(dataset[name].sel(output=output)) for name in names} for output in outputs
         }
@@ -114,13 +117,66 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
                 }
                 for output in outputs
             }
+    if "row_method" in dataset:
+        summary["methods"] = _methods(dataset)
     return summary
+
+
+def _methods(dataset: xr.Dataset) -> dict[str, list[dict[str, Any]]]:
+    """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
+    gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
+    methods: dict[str, list[dict[str, Any]]] = {}
+    for i, name in enumerate(dataset["row_method"].to_numpy().tolist()):
+        row = dataset.isel(row=i)
+        outputs = {
+            str(output): {
+                estimated: {
+                    "rmse": _number(of_output[f"{estimated}_rmse"]),
+                    "rmse_error": _number(of_output[f"{estimated}_rmse_error"]),
+                    "resolved": bool(of_output[f"{estimated}_resolved"]),
+                    "claimed": _number(of_output[f"{estimated}_claimed"]),
+                    "coverage": _number(of_output[f"{estimated}_coverage"]),
+                    "understated": bool(of_output[f"{estimated}_understated"]),
+                    **{
+                        f"gain_{key}": _number(g.isel(row=i).sel(output=output)) for key, g in gained[estimated].items()
+                    },
+                }
+                for estimated in ESTIMATED
+            }
+            for output in dataset.output.values
+            for of_output in [row.sel(output=output)]
+        }
+        methods.setdefault(name, []).append(
+            {
+                "cost": int(row["solves"]),
+                "cpu_seconds": float(row["cpu_seconds"]),
+                "error": next(iter(outputs.values()))["mean"]["rmse"],
+                "budget": int(row["budget"]),
+                "derived": bool(row["derived"]),
+                "outputs": outputs,
+            }
+        )
+    return methods
 
 
 def _number(value: Any) -> float | None:
     """A number, or nothing where it is not finite: JSON has no NaN."""
     number = float(value)
     return number if np.isfinite(number) else None
+
+
+def with_random_fields(
+    dataset: xr.Dataset, factors: Mapping[str, NDArray[np.float64]], variance_kept: Mapping[str, float]
+) -> xr.Dataset:
+    """Add what random fields look like, realisation by realisation (n, nodes), where fields are kept at the nodes."""
+    if not factors:
+        return dataset
+    dataset = dataset.assign_coords(random_field=list(variance_kept))
+    dataset = dataset.assign(variance_kept=(("random_field",), list(variance_kept.values())))
+    if "node" in dataset.dims:
+        values = np.array([factors[name] for name in variance_kept])
+        dataset = dataset.assign(factor=(("random_field", "realisation", "node"), values))
+    return dataset
 
 
 def body_grid(dataset: xr.Dataset) -> Any:
@@ -158,6 +214,10 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
             short = str(name).removeprefix("field_").removeprefix("node_")
             for parameter in dataset.parameter.values:
                 arrays[f"{short} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
+        elif variable.dims == ("random_field", "realisation", "node"):
+            for field in dataset.random_field.values:
+                for i, values in enumerate(variable.sel(random_field=field).to_numpy()):
+                    arrays[f"{name} {field} {i}"] = values
         elif variable.dims == ("node",):
             arrays[str(name)] = variable.to_numpy()
     return arrays

@@ -21,6 +21,8 @@ material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 # formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]
+# A random factor on the stiffness (or the density), log-normal, that varies over the body; its modes are parameters:
+# fields = [{ of = "stiffness", length = 0.03, std = 0.3, modes = 10 }]
 clamp = ["x-min"]
 # Boundaries that are moved by a given amount (m), component by component:
 # displacements = [{ on = "x-max", x = 0.01 }]
@@ -71,10 +73,19 @@ fields = true         # mean and standard deviation of the displacement at every
 kind = "quasi-monte-carlo"
 samples = 256         # scrambles × a power of two; or tolerance = 0.001, or budget_seconds = 600: whichever comes first
 scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
-control = "tangent"   # or "none", or "quadratic": two more solves for each parameter
+control = "tangent"   # or "none"; "quadratic": two more solves for each parameter; "chaos": a fit to samples of its own
 coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
+""",
+    "multilevel-monte-carlo": """\
+kind = "multilevel-monte-carlo"
+tolerance = 0.01      # total error (mesh and sampling) of means, relative; or budget_seconds = 600, or samples = 100 on
+                      # the coarsest mesh: whichever comes first
+levels = 3            # the body above is the coarsest of so many meshes: each has cells half as long as the one before
+pilot = 8             # samples on every mesh before the numbers are chosen
+control = "tangent"   # or "none"
+seed = 1
 """,
     "chaos": """\
 kind = "chaos"
@@ -85,6 +96,35 @@ fit = "regression"    # or "projection": (max_order + 2)^d Gauss points and no s
 seed = 1
 quantiles = [0.05, 0.5, 0.95]
 fields = true         # expand the displacement at every node
+""",
+    "multilevel-chaos": """\
+kind = "multilevel-chaos"
+iterations = 2        # of the solver for each sample of a level
+tolerance = 1e-3      # relative change of the moments from level to level
+order = 3             # of the expansion
+samples = 32          # of each level; by default three for each term and more
+max_levels = 10
+first = "tangent"     # where the first level starts; or "mean": the state at the mean parameters, as published
+seed = 1
+quantiles = [0.05, 0.5, 0.95]
+fields = true         # mean, standard deviation and expansion of the displacement at every node
+""",
+    "compare": """\
+kind = "compare"
+repeats = 20          # independent repeats of every method: errors are known to 16 %
+seed = 1
+textbook = 8          # draws that are also solved by Newton's method from zero: what plain Monte Carlo would cost so
+mesh_error = false    # true: solve once with twice the cells in each direction
+# A method, solved to tighter tolerances, or { kind = "given", values = { sag = { mean = ..., std = ... }, ... } }:
+reference = { kind = "chaos", fit = "projection", max_order = 8 }
+# Blocks of methods, with the numbers of samples that they are run with:
+methods = [
+    { kind = "monte-carlo", budgets = [16, 64, 256] },
+    { kind = "sensitivity-monte-carlo", budgets = [16, 64, 256] },
+    { name = "tangent", kind = "quasi-monte-carlo", control = "tangent", budgets = [64, 256] },
+    { name = "quadratic", kind = "quasi-monte-carlo", control = "quadratic", budgets = [64, 256] },
+    { kind = "chaos", max_order = 4, budgets = [5, 10, 15] },
+]
 """,
     "sobol": """\
 kind = "sobol"

@@ -9,19 +9,35 @@ import sys
 import time
 import tomllib
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
+from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
-from workflows.results import label, read_summary, summarise, write_dataset, write_fields, write_text
+from workflows.results import (
+    label,
+    read_summary,
+    summarise,
+    with_random_fields,
+    write_dataset,
+    write_fields,
+    write_text,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.finite_element import HyperelasticModel
+    from forward.model import FloatArray
+    from uq.checkpoint import Checkpoint
+    from uq.inputs import Inputs
+
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
+REALISATIONS = 3  # of random fields, to look at
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
@@ -53,8 +69,6 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     """
     from mpi4py import MPI
 
-    from workflows.report import write_report
-
     world = MPI.COMM_WORLD
     begin = time.monotonic()
     refusal, finished = None, None
@@ -69,7 +83,7 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     if finished is not None:
         if world.rank == 0:
             if not (directory / "report.html").exists():
-                write_report(directory)
+                _report(directory)
             if not quiet:
                 sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
@@ -85,29 +99,47 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     recorders: list[Recorder] = []
     # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
     cells, kind = model.layout.cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders.append(Recorder(evaluate))
         return study.method.run(inputs, recorders[0])
 
-    dataset = ensemble.run(model, task, checkpoint=checkpoint, progress=progress)
+    others = [partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]]
+    dataset = ensemble.run(model, task, others=others, checkpoint=checkpoint, progress=progress)
     if dataset is None:
         return DONE
     progress.close()
     dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
+    dataset = with_random_fields(dataset, factors, model.variance_kept)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
-    write_dataset(directory / "results.nc", dataset)
-    write_fields(directory / "fields", dataset)
     evaluations = merge(recorders[0].log)
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
+    if len(study.meshes) > 1:
+        summary["meshes"] = _meshes(study, recorders[0])
+    _leave(directory, dataset, evaluations, summary, checkpoint)
+    if not quiet:
+        sys.stdout.write(_closing_words(directory, dataset, summary))
+    return PARTIAL if summary["failed"] else DONE
+
+
+def _leave(
+    directory: Path, dataset: xr.Dataset, evaluations: Evaluations, summary: dict[str, Any], checkpoint: Checkpoint
+) -> None:
+    """Write all results, in an order that a kill cannot spoil."""
+    write_dataset(directory / "results.nc", dataset)
+    write_fields(directory / "fields", dataset)
     checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
+    _report(directory)
+
+
+def _report(directory: Path) -> None:
+    from workflows.report import write_report
+
     write_report(directory)
-    if not quiet:
-        sys.stdout.write(_closing_words(directory, dataset, summary))
-    return PARTIAL if summary["failed"] else DONE
 
 
 def _identity(study: Study) -> dict[str, Any]:
@@ -155,6 +187,17 @@ def _prepare(study: Study, directory: Path, ranks: int) -> int | None:
     if summary is None:
         return None
     return PARTIAL if summary["failed"] else DONE
+
+
+def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
+    """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
+
+    They are the first samples of Monte Carlo with the seed of the study.
+    """
+    if not study.model.fields:
+        return {}
+    seed = getattr(study.method, "seed", 0)
+    return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
 def _units(study: Study) -> dict[str, str]:
@@ -205,6 +248,17 @@ def _summary(
     }
 
 
+def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
+    """What was solved on each mesh, and what it took."""
+    found = []
+    for number in sorted(set(recorder.models)):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
+        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
+        solves = sum(len(part.points) for part in parts)
+        found.append({"unknowns": study.meshes[number].unknowns, "solves": solves, "cpu_seconds": seconds})
+    return found
+
+
 def _versions() -> dict[str, str]:
     names = ("tissuq", "fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
     found = {}
@@ -237,6 +291,17 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         lines.append(
             f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
             f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+        )
+        if "bias_error" in values:
+            lines[-1] += (
+                f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
+            )
+    first = next(iter(dataset.output.values))
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
         )
     if not lines:
         for output, slopes in summary.get("local_per_range", {}).items():

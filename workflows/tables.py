@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from uq.compare import gains as gains_of
+from uq.compare import plain_samples
+from uq.moments import half_width
 from workflows.config import Study
-from workflows.plots import band
 from workflows.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+ROWS = 40  # parameters that a table lists
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,13 @@ class Results:
         """Names of the parameters."""
         return [str(name) for name in self.dataset["parameter"].values]
 
+    def leading(self, effects: xr.DataArray) -> list[str]:
+        """Names of the parameters, or of those with the largest effects (parameter,) where there are many."""
+        if len(self.parameters) <= ROWS:
+            return self.parameters
+        largest = (-abs(effects)).argsort().to_numpy()[:ROWS]
+        return [str(name) for name in effects["parameter"].to_numpy()[largest]]
+
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""
         of_output = self.dataset.sel(output=output)
@@ -62,6 +75,11 @@ def parameters(results: Results) -> Table:
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
         rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, unit_of(name)))
+    for field in results.study.model.fields:
+        paths = field.paths(results.study.model.body)
+        kept = float(results.dataset["variance_kept"].sel(random_field=field.label))
+        law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
+        rows.append((f"fields.{field.label}.0 to {len(paths) - 1}", law, "0", "1", "1"))
     rows += [
         (" and ".join(c.between), f"joined by a Gaussian copula with correlation {c.value:g}", "", "", "")
         for c in results.study.correlations
@@ -109,7 +127,14 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
         yield Gain(
             f"Errors are from the scatter of {R} independent scrambles, and so known to {spread} % or so when squared; "
-            f"a 95 % interval is ± {number(band(dataset), 3)} of them.",
+            f"a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
+            hurts=False,
+        )
+    if "control_samples" in dataset:
+        error, fitted = number(float(dataset["loo_error"].max()), 2), int(dataset["control_samples"])
+        yield Gain(
+            f"The control variate is an expansion fitted to {fitted} samples of its own, with a leave-one-out "
+            f"error of at most {error} standard deviations.",
             hurts=False,
         )
     for output in dataset["output"].values:
@@ -122,6 +147,78 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         if worse:
             text += f" It hurts the {' and the '.join(worse)}: there, plain Monte Carlo is better."
         yield Gain(text, bool(worse))
+
+
+def total_errors(results: Results) -> Table:
+    """Errors of means and standard deviations by where they come from."""
+    rows = []
+    for output in results.outputs:
+        of_output = results.dataset.sel(output=output)
+        for word, first in (("mean", ""), ("standard deviation", "std_")):
+            names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
+            errors = [with_unit(number(float(of_output[name]), 2), results.unit(output)) for name in names]
+            rows.append((f"{word} of {output}", *errors))
+    return Table(("estimate", "sampling", "mesh", "total"), rows)
+
+
+def meshes(results: Results) -> Table:
+    """The meshes, and what was solved on them."""
+    dataset, rows = results.dataset, []
+    for level, found in zip(dataset["level"].to_numpy(), results.summary["meshes"], strict=True):
+        here = dataset.sel(level=level)
+        seconds = found["cpu_seconds"] / max(found["solves"], 1)
+        samples, failed = f"{int(here['mesh_samples']):,}", f"{int(here['mesh_failed']):,}"
+        cost = f"{float(here['mesh_cost']):.2g} s"
+        rows.append(
+            (f"{level}", f"{found['unknowns']:,}", samples, failed, f"{found['solves']:,}", cost, duration(seconds))
+        )
+    head = (
+        "level",
+        "unknowns",
+        "samples",
+        "failed",
+        "solves",
+        "a solve, predicted",
+        "a solve, measured (with the linearisation)",
+    )
+    return Table(head, rows)
+
+
+def differences(results: Results, output: str) -> Table:
+    """What every mesh adds to the mean of an output, and whether that can be trusted."""
+    rows = []
+    for level in results.dataset["level"].to_numpy():
+        here = results.dataset.sel(output=output, level=level)
+        text = with_error(float(here["difference_mean"]), float(here["difference_mean_error"]))
+        rest = (
+            "mesh_variance",
+            "difference_variance",
+            "difference_variance_ratio",
+            "difference_kurtosis",
+            "consistency",
+        )
+        rows.append((f"{level}", with_unit(text, results.unit(output)), *(number(float(here[n]), 3) for n in rest)))
+    head = (
+        "level",
+        "mean of the difference",
+        "variance",
+        "variance of the difference",
+        "÷ by the control",
+        "kurtosis",
+        "consistency",
+    )
+    return Table(head, rows)
+
+
+def rates(results: Results, output: str) -> str:
+    """The rates of convergence of an output, in words."""
+    of_output = results.dataset.sel(output=output)
+    weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
+    return (
+        f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "
+        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 says that the sum over the meshes "
+        "telescopes."
+    )
 
 
 def quantiles(results: Results) -> Table:
@@ -151,11 +248,44 @@ def expansion(results: Results) -> Table:
     return Table(("output", "order", "terms", "samples", "leave-one-out error / standard deviation"), rows)
 
 
+def levels(results: Results) -> Table:
+    """What the levels of multilevel chaos have cost and reached."""
+    rows = []
+    for k in results.dataset["level"].to_numpy():
+        level = results.dataset.sel(level=k)
+        work = {str(name): int(level["level_work"].sel(operation=name)) for name in level["operation"].to_numpy()}
+        iterations = int(level["level_iterations"])
+        rows.append(
+            (
+                f"{k}",
+                f"{iterations}" if iterations else "to the tolerance",
+                f"{int(level['level_solves'])}",
+                f"{int(level['level_converged'])}",
+                number(float(level["level_residual"]), 2),
+                number(float(level["level_residual_median"]), 2),
+                number(float(level["level_change"]), 2),
+                *(f"{work[name]:,}" for name in ("residuals", "back_substitutions", "factorisations")),
+            )
+        )
+    head = (
+        *("level", "iterations", "samples", "at equilibrium", "largest residual", "median residual"),
+        *("change of the moments", "residuals", "back-substitutions", "factorisations"),
+    )
+    return Table(head, rows)
+
+
+def controlled(results: Results) -> Table:
+    """Moments from the samples of the last level, with the expansion of the level before as control variate."""
+    names = ("control_mean", "control_std")
+    rows = [(output, *(results.estimate(output, name) for name in names)) for output in results.outputs]
+    return Table(("output", "mean", "standard deviation"), rows)
+
+
 def sobol(results: Results, output: str) -> Table:
     """Sobol' indices of an output."""
     of_output = results.dataset.sel(output=output)
     rows = []
-    for name in results.parameters:
+    for name in results.leading(of_output["sobol_total"]):
         of_parameter = of_output.sel(parameter=name)
         pairs = [(of_parameter[f"sobol_{which}"], of_parameter[f"sobol_{which}_error"]) for which in ("first", "total")]
         rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
@@ -229,7 +359,7 @@ def sensitivities(results: Results, output: str) -> Table:
     """Derivatives of an output, in physical units and times the spread of the parameter."""
     unit, slopes = results.unit(output), results.dataset.sel(output=output)
     rows = []
-    for name in results.parameters:
+    for name in results.leading(slopes["derivative_per_std"]):
         of_parameter = slopes.sel(parameter=name)
         slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
@@ -241,7 +371,7 @@ def field_norms(results: Results) -> Table:
     """Norms of the derivatives of the displacement field."""
     dataset = results.dataset
     rows = []
-    for name in results.parameters:
+    for name in results.leading(dataset["field_derivative_norm"] * dataset["parameter_std"]):
         of_parameter = dataset.sel(parameter=name)
         norm, std = float(of_parameter["field_derivative_norm"]), float(of_parameter["parameter_std"])
         over_range = float(of_parameter["field_derivative_norm_per_range"])
@@ -251,8 +381,8 @@ def field_norms(results: Results) -> Table:
 
 
 def failures(results: Results) -> Table:
-    """The solves that failed: parameters and reason."""
-    names = results.parameters
+    """The solves that failed: parameters (without the coefficients of random fields) and reason."""
+    names = list(results.study.parameters)
     rows = [
         (*(with_unit(number(f["parameters"][name], 6), unit_of(name)) for name in names), f["reason"])
         for f in results.summary["failures"]
@@ -288,6 +418,68 @@ def provenance(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     ranks, groups = found["ranks"], found["groups"]
     yield "ranks", f"{ranks} in {groups} group{'s' if groups > 1 else ''}, {found['processor']}"
     yield "versions", ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+
+
+def references(results: Results) -> Table:
+    """What methods are compared with, and what the solver and the mesh leave of it."""
+    rows = []
+    for output in results.outputs:
+        of_output, unit = results.dataset.sel(output=output), results.unit(output)
+        floors = (with_unit(number(float(of_output[f"{name}_error"]), 2), unit) for name in ("solver", "mesh"))
+        rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
+    return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
+
+
+def errors(results: Results, output: str, estimated: str) -> Table:
+    """What each method errs and costs at each budget, for one estimate of an output."""
+    dataset = results.dataset.sel(output=output)
+    scale = abs(float(dataset[estimated]))
+    plain, gained = plain_samples(dataset, estimated).to_numpy(), gains_of(dataset, estimated)
+    methods = dataset["row_method"].to_numpy().tolist()
+    rates = {}
+    for name in dataset["estimator"].to_numpy().tolist():
+        of_method = dataset.sel(estimator=name)
+        rates[name] = with_error(*(float(of_method[f"{estimated}_rate{end}"]) for end in ("", "_error")))
+    rows = []
+    for i, name in enumerate(methods):
+        row = dataset.isel(row=i)
+        rmse, resolved = float(row[f"{estimated}_rmse"]), bool(row[f"{estimated}_resolved"])
+        coverage = NONE
+        if resolved:
+            coverage = f"{100 * float(row[f'{estimated}_coverage']):.0f} %"
+            coverage += " (understated)" if bool(row[f"{estimated}_understated"]) else ""
+        bound = "" if resolved else "≥ "
+        ratios = [plain[i], *(float(gain[i]) for gain in gained.values())]
+        rows.append(
+            (
+                name,
+                f"{int(row['budget']):,}",
+                f"{int(row['solves']):,}",
+                duration(float(row["cpu_seconds"])),
+                number(rmse, 2) + ("" if resolved else " (not resolved)"),
+                number(rmse / scale if scale else float("nan"), 2),
+                number(float(row[f"{estimated}_claimed"]), 2),
+                coverage,
+                *(NONE if math.isnan(ratio) else bound + number(ratio, 2) for ratio in ratios),
+                rates[name] if name not in methods[i + 1 :] else "",
+            )
+        )
+    head = (
+        "method",
+        "samples",
+        "solves",
+        "CPU time",
+        with_unit("RMSE", f"({results.unit(output)})"),
+        "relative",
+        "claimed",
+        "coverage",
+        "plain samples for this error",
+        "gain in solves",
+        "gain in CPU time",
+        "gain over the textbook",
+        "rate",
+    )
+    return Table(head, rows)
 
 
 def costs(studies: dict[str, Results]) -> Table:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, assert_never
 
+from forward.fields import RandomField
 from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
 from forward.materials import MATERIALS, units
@@ -61,6 +62,8 @@ def unit_of(path: str) -> str:
     if block == "material":
         # A name has the same unit in every material.
         return next(of[name] for of in map(units, MATERIALS.values()) if name in of)
+    if block == "fields":
+        return "1"
     if block == "inclusions":
         return "1" if path.endswith(".contrast") else "m"
     if path.endswith(".density"):
@@ -90,15 +93,18 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     model = study.model
     body = model.body
     cells = " × ".join(f"{n}" for n in body.cells)
-    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree})"]
+    coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
+    yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
-    yield "unknowns", [f"{model.unknowns:,} displacements{pressures}"]
+    yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
     kind = str(model.material.model_dump()["kind"])
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
     if model.inclusions:
         yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
+    if model.fields:
+        yield "random fields", [_field(field) for field in model.fields]
     held = [f"{boundary} clamped" for boundary in model.clamp] + [
         f"{item.on}: u{axis} = {_scalar(study, f'displacements.{item.label}.{axis}')}"
         for item in model.displacements
@@ -123,6 +129,19 @@ def _inclusion(study: Study, inclusion: Inclusion) -> str:
     ]
     named = f"{inclusion.name} ({inclusion.kind})" if inclusion.name else inclusion.kind
     return f"{named}: {', '.join(numbers)}"
+
+
+def _field(field: RandomField) -> str:
+    made_of = {
+        "modes": f"{field.modes} Karhunen–Loève modes",
+        "noise": "white noise",
+        "nodes": "values at the vertices",
+    }
+    return (
+        f"{field.label}: log-normal factor on the {field.of} with mean {field.mean:g} and standard deviation "
+        f"{field.std:g}, Matérn correlation of length {field.length:g} m (ν = {field.smoothness - 1.5:g}), "
+        f"from {made_of[field.basis]}"
+    )
 
 
 def _load(study: Study, load: Load) -> str:
