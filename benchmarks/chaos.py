@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -57,15 +57,8 @@ class Remembered:
         if key not in self._known:
             self._known[key] = self._evaluate(Request(request.points, tangents=True, start=request.start))
         found = self._known[key]
-        return Evaluations(
-            found.points,
-            found.outputs,
-            found.tangents if request.tangents else None,
-            found.failures,
-            found.seconds,
-            found.work,
-            np.zeros((0, 0)) if request.fields is None else self._evaluate(request).fields,
-        )
+        fields = np.zeros((0, 0)) if request.fields is None else self._evaluate(request).fields
+        return replace(found, tangents=found.tangents if request.tangents else None, fields=fields)
 
 
 # --- cases ---------------------------------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
-    init.add_argument("kind", metavar="KIND", help="kind of the method, such as monte-carlo, chaos or compare")
+    init.add_argument("kind", metavar="KIND", help="a method.kind, such as chaos; `tissuq init list` names them all")
     check.set_defaults(command=_check)
     run.set_defaults(command=_run)
     report.set_defaults(command=_report)
