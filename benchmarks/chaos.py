@@ -16,9 +16,10 @@ from scipy.linalg import cho_solve
 from benchmarks.beams import CONFIG
 from forward.model import WORK, FloatArray, ForwardModel, FunctionModel
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import Chaos, Projections, coefficient_moments, load
+from uq.chaos import Chaos, Projections, load
 from uq.distributions import Beta, Uniform
 from uq.evaluate import Evaluations, Merger, Request, SerialEvaluate
+from uq.indices import coefficient_moments
 from uq.inputs import Inputs
 from uq.sampling import random_points
 from workflows.config import load as load_study

@@ -39,6 +39,8 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
         "local-sensitivity",
         "chaos",
         "multilevel-chaos",
+        "sobol",
+        "derivative-based",
         "compare",
     ],
 )
@@ -57,6 +59,24 @@ def test_chaos_needs_independent_parameters():
     assert parse(document_ | {"method": {"kind": "chaos", "fit": "projection", "max_order": 3}}).planned == 26
     with pytest.raises(StudyError, match="correlations: polynomial chaos needs independent parameters"):
         parse(document_ | {"correlations": [{"between": names, "value": 0.3}]})
+
+
+@pytest.mark.parametrize("kind", ["sobol", "derivative-based"])
+def test_indices_need_independent_parameters(kind):
+    names = list(blocks()["parameters"])
+    document_ = blocks() | {"method": {"kind": kind, "samples": 64}}
+    assert parse(document_).planned == 65
+    with pytest.raises(StudyError, match=r"correlations: .*need independent parameters"):
+        parse(document_ | {"correlations": [{"between": names, "value": 0.3}]})
+
+
+def test_groups_are_of_known_parameters():
+    method = {"kind": "sobol", "design": "saltelli", "samples": 64, "groups": {"load": ["loads.gravity.density"]}}
+    document_ = blocks() | {"method": method}
+    assert parse(document_).planned == 1 + 64 * 5
+    assert parse(document_ | {"method": method | {"second_order": True}}).planned == 1 + 64 * 7
+    with pytest.raises(StudyError, match=r"method\.groups: .*did you mean 'material.D1'"):
+        parse(document_ | {"method": method | {"groups": {"stiffness": ["material.D2"]}}})
 
 
 def test_a_study_is_a_few_lines_of_python():

@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 
 from forward.model import WORK, FunctionModel, SolveError
 from uq.evaluate import SerialEvaluate
+from uq.indices import field_indices
 from workflows import bodies, plots, words
 from workflows.config import dump, parse
 from workflows.report import NO_BODY, compare, write_report
-from workflows.results import label, summarise, write_dataset
+from workflows.results import label, node_fields, summarise, write_dataset
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 HEXAHEDRON = [[0, 4, 6, 2, 1, 5, 7, 3]]
@@ -44,6 +45,11 @@ def study(**method):
             "method": {"kind": "sensitivity-monte-carlo", "samples": 60, "seed": 7} | method,
         }
     )
+
+
+def study_of(method):
+    """The same study with a method of another kind."""
+    return parse({**study().model_dump(mode="json", exclude_none=True), "method": method})
 
 
 def test_inclusions_in_words():
@@ -247,6 +253,79 @@ def test_expansion_has_its_terms_and_indices(tmp_path, undrawn):
     assert set(shares) == {"first", "first_error", "total", "total_error"}
     assert 0 < shares["first"] <= shares["total"] <= 1
     assert case.planned == 9
+
+
+@pytest.mark.parametrize("design", ["chaos", "saltelli"])
+def test_sobol_indices_are_reported(tmp_path, undrawn, design):
+    groups = {"both": ["loads.gravity.density", "material.D1"]}
+    case = study_of({"kind": "sobol", "design": design, "samples": 64, "second_order": True, "groups": groups})
+    dataset = solve(case)
+    variance = np.linspace(0, 1, 8)
+    maps = field_indices(variance, 0.5 * np.array([variance, variance]), np.array([0.8, 0.6])[:, None] * variance)
+    dataset = dataset.assign(maps)
+    for name in ("field_sobol_first_error", "field_sobol_total_error"):
+        dataset[name] = (("parameter",), [0.01, 0.01])
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    sag = dataset.sel(output="sag", parameter="material.D1")
+    for told in (
+        "the shares of the variance that parameters have alone",
+        words.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
+        "group both",
+        "second order",
+        "Generalised indices",
+        "against the number of samples",
+        "Total index of the displacement for material.D1",
+        "The parameter with the largest total index",
+    ):
+        assert told in page, told
+    fields = node_fields(dataset)
+    assert fields["dominating"].tolist() == [-1] + 7 * [0]
+    np.testing.assert_allclose(fields["sobol_total material.D1"], [0, *7 * [0.6]])
+    assert set(summarise(dataset)["sobol"]["sag"]["material.D1"]) == {"first", "first_error", "total", "total_error"}
+
+
+def test_bounds_are_reported(tmp_path, undrawn):
+    dataset = solve(study_of({"kind": "derivative-based", "samples": 64}))
+    page = write_report(write(tmp_path / "out", dataset)).read_text()
+    sag = dataset.sel(output="sag", parameter="material.D1")
+    for told in (
+        "Sensitivity from derivatives",
+        words.with_error(float(sag["total_bound"]), float(sag["total_bound_error"])),
+        "leading direction",
+        "Poincaré constant",
+    ):
+        assert told in page, told
+    assert "Generalised" not in page
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "method",
+    [
+        {"kind": "sobol", "samples": 12},
+        {"kind": "sobol", "design": "saltelli", "samples": 64},
+        {"kind": "derivative-based", "samples": 32},
+    ],
+)
+def test_indices_are_drawn(method):
+    dataset = solve(study_of({**method, "fields": False}))
+    pictures = [plots.index_bars, plots.index_convergence]
+    if method["kind"] == "derivative-based":
+        pictures = [plots.index_bars, plots.active_summary, plots.spectrum]
+    for output in dataset.output.values:
+        for draw in pictures:
+            assert plots.png(draw(dataset, output)).startswith(PNG)
+    bars = plots.index_shares(dataset).patches
+    assert sum(bar.get_width() for bar in bars) == pytest.approx(2, abs=0.3)
+
+
+@pytest.mark.parametrize("shown", ["sobol_total material.D1", "dominating"])
+def test_maps_are_drawn(sampled, shown):
+    variance = np.linspace(0, 1, 8)
+    maps = field_indices(variance, np.array([variance, 0 * variance]), np.array([variance, 0.1 + 0 * variance]))
+    drawn = bodies.pictures(sampled.assign(maps), [shown])
+    assert drawn is not None
+    assert drawn[shown].startswith(PNG)
 
 
 def test_levels_are_told_and_drawn(tmp_path, undrawn):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
@@ -30,6 +30,7 @@ from pydantic import Field
 from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
 from uq.basis import Basis, IntArray, by_degree, gauss, hyperbolic, orthonormal
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.sampling import sobol_points
@@ -122,6 +123,10 @@ class Chaos(Amount):
         ValueError
             If the parameters are correlated.
         """
+        return expansion_dataset(self, evaluate, self.expand(inputs, evaluate))
+
+    def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
+        """Solve at the points of the design and fit; errors as of `run`."""
         refusal = self.objection(inputs)
         if refusal is not None:
             raise ValueError(refusal)
@@ -161,12 +166,12 @@ class Chaos(Amount):
                 break
         error = f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
         stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
-        return expansion_dataset(self, inputs, evaluate, centre, evaluations, largest, data, fitted, stopped)
+        return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
 
 
 def objection(inputs: Inputs, kind: str) -> str | None:
     """Say why a method of this kind cannot expand in these parameters, or nothing."""
-    if any(rho for *_, rho in inputs.correlations):
+    if not inputs.independent:
         return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
     return None
 
@@ -259,11 +264,27 @@ class Data:
     def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
         """Take those of the evaluations that have an answer; `weights` are one where none are given."""
         ok = evaluations.ok
-        slopes = None
-        if evaluations.tangents is not None:
-            slopes = np.swapaxes(evaluations.tangents[ok] * inputs.std, 1, 2)
-        counted = np.ones(int(ok.sum())) if weights is None else weights[ok]
-        return cls(evaluations.points[ok], evaluations.outputs[ok], slopes, counted)
+        tangents = None if evaluations.tangents is None else evaluations.tangents[ok]
+        counted = None if weights is None else weights[ok]
+        return cls.at(evaluations.points[ok], evaluations.outputs[ok], tangents, inputs, counted)
+
+    @classmethod
+    def at(
+        cls,
+        points: FloatArray,
+        values: FloatArray,
+        tangents: FloatArray | None,
+        inputs: Inputs,
+        weights: FloatArray | None = None,
+    ) -> Data:
+        """Take values (n, m) and, where they are given, tangents (n, m, d) at points; `weights` as of `of`."""
+        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
+        return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
+
+    def first(self, count: int) -> Data:
+        """Return the first `count` samples."""
+        slopes = None if self.slopes is None else self.slopes[:count]
+        return Data(self.points[:count], self.values[:count], slopes, self.weights[:count])
 
     @property
     def right(self) -> FloatArray:
@@ -495,6 +516,71 @@ def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> 
 
 
 @dataclass(frozen=True)
+class Regression:
+    """A fit to samples and what it was chosen from.
+
+    Attributes
+    ----------
+    inputs
+        The parameters.
+    candidates, largest
+        The sets of functions that were tried, and the basis of all of them.
+    data
+        The samples that have an answer.
+    fit
+        The fit.
+    """
+
+    inputs: Inputs
+    candidates: _Candidates
+    largest: Basis
+    data: Data
+    fit: Fit
+
+    @classmethod
+    def of(
+        cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int
+    ) -> Regression:
+        """Fit to values (n, m) and, where they are given, tangents (n, m, d) at points (n, d).
+
+        Raises
+        ------
+        SolveError
+            If there are not enough samples.
+        """
+        data = Data.at(points, values, tangents, inputs)
+        rows = len(points) * _rows(inputs, gradients=tangents is not None)
+        candidates = _candidates(inputs, max_order, rows, DICTIONARY)
+        largest = orthonormal(inputs, candidates.all)
+        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+
+    def first(self, count: int) -> Regression:
+        """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
+        data = self.data.first(count)
+        return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
+
+    @property
+    def basis(self) -> Basis:
+        """The P functions of the fit."""
+        return self.largest.subset(self.fit.chosen.which)
+
+    def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
+        """Return what follows from the coefficients, by output, with standard errors."""
+        cautious = None in [m.support for m in self.inputs.marginals.values()]
+        return _estimates(self.fit, self.largest.indices, len(self.data.points), cautious=cautious, of=of)
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """An expansion with the evaluations that it was made from, and why they were enough."""
+
+    centre: Linearisation
+    evaluations: Evaluations
+    regression: Regression
+    stopped: str
+
+
+@dataclass(frozen=True)
 class Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
@@ -570,7 +656,7 @@ class Deviations:
     prediction: StateExpansion | None
 
 
-def expand(
+def fit_deviations(
     inputs: Inputs, evaluate: Evaluate, centre: Linearisation, points: FloatArray, max_order: int, *, fields: bool
 ) -> Deviations:
     """Fit an expansion to values and gradients at points (n, d), outputs and whole state alike.
@@ -637,23 +723,7 @@ def _solved(fit: Fit, projections: FloatArray) -> FloatArray:
 # --- what follows from an expansion --------------------------------------------------------------------------------
 
 
-def coefficient_moments(coefficients: FloatArray, indices: IntArray) -> dict[str, FloatArray]:
-    """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
-    squares = np.where((indices > 0).any(axis=1), coefficients**2, 0.0)
-    variance = squares.sum(axis=-1)
-    used = (indices > 0).astype(float)
-    alone = used * (used.sum(axis=1) == 1)[:, None]
-    safe = np.where(variance > 0, variance, 1.0)[..., None]
-    constant = (indices == 0).all(axis=1)
-    return {
-        "mean": coefficients[..., constant].sum(axis=-1),
-        "std": np.sqrt(variance),
-        "sobol_first": squares @ alone / safe,
-        "sobol_total": squares @ used / safe,
-    }
-
-
-def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool) -> dict[str, FloatArray]:
+def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
@@ -671,28 +741,19 @@ def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool) -> dict[s
     parameters covered 60 % instead of 95 %.) The indices always have its share (λ/σ)² of the variance.
     """
     indices = largest[fit.chosen.which]
-    central = coefficient_moments(fit.coefficients.T, indices)
-    left_out = coefficient_moments(np.swapaxes(fit.without, 1, 2), largest)
+    central = of(fit.coefficients.T, indices)
+    left_out = of(np.swapaxes(fit.without, 1, 2), largest)
     groups = len(fit.without)
-    share = _ratio(fit.loo**2, central["std"] ** 2)[:, None]
+    share = shares(fit.loo**2, central["std"] ** 2)
     nothing = np.zeros_like(fit.loo)
-    missing = {
-        "mean": fit.loo / np.sqrt(n) if cautious else nothing,
-        "std": fit.loo if cautious else nothing,
-        "sobol_first": share,
-        "sobol_total": share,
-    }
+    missing = {"mean": fit.loo / np.sqrt(n) if cautious else nothing, "std": fit.loo if cautious else nothing}
     for name, values in left_out.items():
         spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
         if name == "mean" and not cautious:
             spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
-        central[f"{name}_error"] = np.hypot(spread, missing[name])
+        unseen = missing.get(name, share)
+        central[f"{name}_error"] = np.hypot(spread, unseen.reshape(-1, *(1,) * (spread.ndim - 1)))
     return central
-
-
-def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
-    """A / b, and 0 where b vanishes."""
-    return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 0.0))
 
 
 class Report(Protocol):
@@ -712,21 +773,13 @@ class Report(Protocol):
 
 
 def expansion_dataset(
-    method: Report,
-    inputs: Inputs,
-    evaluate: Evaluate,
-    centre: Linearisation,
-    evaluations: Evaluations,
-    largest: Basis,
-    data: Data,
-    fit: Fit,
-    stopped: str,
-    further: Mapping[str, FloatArray] | None = None,
+    method: Report, evaluate: Evaluate, expanded: Expanded, further: Mapping[str, FloatArray] | None = None
 ) -> xr.Dataset:
-    """Return the results of a fit; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
-    basis = largest.subset(fit.chosen.which)
+    """Return the results of an expansion; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
+    centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
+    inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
     supports = [m.support for m in inputs.marginals.values()]
-    estimates = _estimates(fit, largest.indices, len(data.points), cautious=None in supports)
+    estimates = regression.estimates()
     for name, error in (further or {}).items():
         estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
     lower, upper = (
@@ -757,7 +810,7 @@ def expansion_dataset(
     if evaluations.fields.size and method.fields:
         fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
         dataset = dataset.assign(fields)
-    dataset.attrs["stopped"] = stopped
+    dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:
         dataset.attrs["note"] = (
@@ -802,7 +855,7 @@ def _field_estimates(
     moments = coefficient_moments(coefficients.T, basis.indices)
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
     for name in ("mean", "std"):
-        share = np.sqrt(_ratio(estimates[f"{name}_error"] ** 2, fit.squares).max())
+        share = np.sqrt(shares(estimates[f"{name}_error"] ** 2, fit.squares).max())
         fields[f"{name}_error"] = (share * np.sqrt(squares)).reshape(-1, 3)
     return {
         **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},

@@ -22,7 +22,7 @@ from forward.model import FloatArray, SolveError
 from forward.settings import Settings
 from uq.chaos import Chaos
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
-from uq.inputs import Inputs
+from uq.inputs import Inputs, Restricted
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, half_width, ratio
 from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
@@ -203,8 +203,7 @@ class Compare(Settings):
     def objection(self, inputs: Inputs) -> str | None:
         """Say why one of the methods cannot take these parameters, or nothing."""
         methods = [self.reference, *(entry.sampling for entry in self.methods)]
-        restricted = [method for method in methods if isinstance(method, Chaos | MultilevelChaos | QuasiMonteCarlo)]
-        objections = (method.objection(inputs) for method in restricted)
+        objections = (method.objection(inputs) for method in methods if isinstance(method, Restricted))
         return next((objection for objection in objections if objection), None)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:

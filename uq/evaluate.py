@@ -93,6 +93,20 @@ class CompactSum(FieldSum, Protocol):
         """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, k, U)."""
 
 
+class JointSum(Protocol):
+    """A quantity of the states of several points that follow each other, summed as these rows of points stream by.
+
+    A row is never cut by blocks; one in which a solve failed adds nothing.
+    """
+
+    @property
+    def size(self) -> int:
+        """Number K of points in a row."""
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        """Return the function states (K, U_local) → rows (k, U_local) to be summed, for one group's model."""
+
+
 class Start(Protocol):
     """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
 
@@ -147,6 +161,8 @@ class Request:
         Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
     model
         Which of the models that the evaluation has; `Evaluate.on` sets it.
+    joint
+        What is summed, in place of `fields`, of the states of points that follow each other.
     """
 
     points: FloatArray
@@ -155,10 +171,12 @@ class Request:
     start: Start | None = None
     iterations: int | None = None
     model: int = 0
+    joint: JointSum | None = None
 
     def blocks(self) -> list[Request]:
-        """Cut into blocks that depend on the number of points only."""
-        size = max(1, -(-len(self.points) // BLOCKS))
+        """Cut into blocks that depend on the number of points, and of those that belong together, only."""
+        together = 1 if self.joint is None else self.joint.size
+        size = together * max(1, -(-len(self.points) // (together * BLOCKS)))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 
 
@@ -305,6 +323,8 @@ class BlockSolver:
         self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = isinstance(request.fields, CompactSum)
+        self._joint = request.joint.on(model) if request.joint is not None else None
+        self._together = 1 if request.joint is None else request.joint.size
         self._predict: Callable[[FloatArray], FloatArray] | None = None
         self._reference: Reference | None = None
         if request.start is not None:
@@ -321,27 +341,35 @@ class BlockSolver:
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         failures: list[Failure] = []
         rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
+        states: list[FloatArray] = []  # of a row that is not complete
         for i, point in enumerate(points):
             begin = time.process_time()
+            row = None
             try:
                 start = self._predict(point) if self._predict is not None else None
                 solution = model.solve(point, start, self._reference, self._iterations)
-                row = self._row(solution, point) if self._row is not None else None
+                if self._row is not None:
+                    row = self._row(solution, point)
                 if tangents is not None:
                     # One derivative for each parameter or for each output, whichever are fewer.
                     tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
+                row = None
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
                 work[i] = error.work.as_array()
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
                 residuals[i], converged[i] = solution.residual, solution.converged
-                if row is not None and (self._compact or not rows):
-                    rows.append(row.copy())
-                elif row is not None:
-                    # In place: these are the largest arrays there are, and a new one for each sample takes longer.
-                    rows[0] += row
+                states += [solution.state] if self._joint is not None else []
+            if self._joint is not None and (i + 1) % self._together == 0:
+                row = self._joint(np.array(states)) if len(states) == self._together else None
+                states = []
+            if row is not None and (self._compact or not rows):
+                rows.append(row.copy())
+            elif row is not None:
+                # In place: these are the largest arrays there are, and a new one for each sample takes longer.
+                rows[0] += row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
         fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -52,6 +53,11 @@ class Inputs:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return tuple(self.marginals)
+
+    @property
+    def independent(self) -> bool:
+        """Whether no two parameters are correlated."""
+        return not any(rho for *_, rho in self.correlations)
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -108,6 +114,14 @@ class Inputs:
 
         normals = ndtri(uniforms) @ np.linalg.cholesky(self._copula).T
         return np.column_stack([_from_normal(m, z) for m, z in zip(marginals, normals.T, strict=True)])
+
+
+@runtime_checkable
+class Restricted(Protocol):
+    """A method that some parameters do not allow."""
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters do not allow it, or nothing."""
 
 
 def _from_normal(marginal: Distribution, normals: FloatArray) -> FloatArray:

@@ -25,17 +25,19 @@ from forward.model import WORK, FloatArray
 from uq.basis import hyperbolic, orthonormal
 from uq.chaos import (
     Data,
+    Expanded,
     Fit,
     Probability,
     Projections,
+    Regression,
     StateExpansion,
-    coefficient_moments,
     expansion_dataset,
     fit_best,
     objection,
     whole,
 )
 from uq.evaluate import Evaluate, Evaluations, Prediction, Recorder, Request, Start
+from uq.indices import coefficient_moments
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise
 from uq.moments import Moments, estimate, monomials, ratio
@@ -175,7 +177,8 @@ class MultilevelChaos(Amount):
         error = f"moments changed by {change:.3g}, largest residual {largest:.2g}"
         count = f"{len(levels)} level{'s' if len(levels) > 1 else ''} of {n} samples"
         stopped = self.why_stopped(change, error, len(levels), self.max_levels, count)
-        dataset = expansion_dataset(self, inputs, evaluate, centre, found, basis, data, fit, stopped, further)
+        expanded = Expanded(centre, found, Regression(inputs, bases, basis, data, fit), stopped)
+        dataset = expansion_dataset(self, evaluate, expanded, further)
         return dataset.assign(_by_level(levels)).assign(
             {
                 f"control_{name}": (("output",), getattr(controlled, name))

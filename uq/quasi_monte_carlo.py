@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.chaos import FULL, ROWS_PER_TERM, Deviations, expand
+from uq.chaos import FULL, ROWS_PER_TERM, Deviations, fit_deviations
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
@@ -32,7 +32,7 @@ from uq.moments import (
     ratio,
 )
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
-from uq.sampling import sobol_points
+from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.taylor import Control, quadratic, tangent
 
 if TYPE_CHECKING:
@@ -85,11 +85,7 @@ class QuasiMonteCarlo(MonteCarlo):
     @model_validator(mode="after")
     def _check_scrambles(self) -> QuasiMonteCarlo:
         R = self.scrambles
-        if self.samples is not None and self.samples != R * _power_of_two(self.samples // R):
-            below = R * _power_of_two(self.samples // R)
-            nearest = f"{below} or {2 * below}" if self.samples > R else str(R)
-            message = f"samples = {self.samples}, expected scrambles = {R} times a power of two, such as {nearest}"
-            raise ValueError(message)
+        check_scrambles(self.samples, R)
         if self.coefficient == "optimal" and R < 4:
             message = f"scrambles = {R}, expected at least 4 for coefficient = 'optimal', which is fitted to them"
             raise ValueError(message)
@@ -101,7 +97,7 @@ class QuasiMonteCarlo(MonteCarlo):
     @property
     def limit(self) -> int:
         """Number of samples, the largest where a tolerance may end the study earlier."""
-        return self.samples or self.scrambles * _power_of_two(UNLIMITED // self.scrambles)
+        return self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles)
 
     def planned(self, dimension: int) -> int:
         """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
@@ -118,7 +114,7 @@ class QuasiMonteCarlo(MonteCarlo):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters do not allow the control, or nothing."""
-        if self.control == "chaos" and any(rho for *_, rho in inputs.correlations):
+        if self.control == "chaos" and not inputs.independent:
             return (
                 "polynomial chaos needs independent parameters, expected no correlations for method.control = 'chaos'"
             )
@@ -162,7 +158,7 @@ class QuasiMonteCarlo(MonteCarlo):
             control, start = _orthonormal(expansion), expansion.prediction or start
         samples = _Samples(self, inputs, evaluate, centre, control, start)
         last = self.limit // self.scrambles
-        first = min(last, _power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
+        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
         samples.extend(first)
         scalars = samples.scalars(first)
         while not self.met(float(scalars.relative_error.max())) and samples.each < last:
@@ -177,7 +173,7 @@ class QuasiMonteCarlo(MonteCarlo):
         d = len(inputs.names)
         points = inputs.points(sobol_points(self.seed, FIT, 0, self._fitted(d), d))
         try:
-            return expand(inputs, evaluate, centre, points, ORDER, fields=self.fields)
+            return fit_deviations(inputs, evaluate, centre, points, ORDER, fields=self.fields)
         except SolveError as error:
             message = f"control = 'chaos': {error.reason}"
             raise SolveError(message, error.history) from None
@@ -240,11 +236,6 @@ class QuasiMonteCarlo(MonteCarlo):
         if notes:
             dataset.attrs["note"] = "; ".join(notes)
         return dataset
-
-
-def _power_of_two(limit: int) -> int:
-    """Return the largest power of two up to `limit`, at least 1."""
-    return 1 << max(limit.bit_length() - 1, 0)
 
 
 def _orthonormal(expansion: Deviations) -> Control:

@@ -32,3 +32,17 @@ def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int
     points = engine.random(1 << (stop - 1).bit_length())[start:stop]
     # The points are lower corners of cells of this size: the centres lie strictly inside the cube.
     return np.asarray(points + 2.0**-53, dtype=float)
+
+
+def power_of_two(limit: int) -> int:
+    """Return the largest power of two up to `limit`, at least 1."""
+    return 1 << max(limit.bit_length() - 1, 0)
+
+
+def check_scrambles(samples: int | None, scrambles: int) -> None:
+    """Raise ValueError if so many samples, where a number is given, are not scrambles of a power of two each."""
+    if samples is not None and samples != scrambles * power_of_two(samples // scrambles):
+        below = scrambles * power_of_two(samples // scrambles)
+        nearest = f"{below} or {2 * below}" if samples > scrambles else str(scrambles)
+        message = f"samples = {samples}, expected scrambles = {scrambles} times a power of two, such as {nearest}"
+        raise ValueError(message)

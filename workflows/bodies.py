@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 SUBDIVISION = 3  # times that a face of high order is halved
 DRAWING_SECONDS = 600  # what the drawing of all bodies may take
 FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
+STILL = "#c9ced4"  # of nodes that do not move
+BY_NUMBER = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
 
 
 def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
@@ -34,8 +36,10 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     shown
         "mean", "std", "mean_error", "std_error", "nominal", or "derivative PARAMETER" (times the standard deviation
         of that parameter): the field whose magnitude is the colour. With "std", lines show the edges of the body
-        where all components are one standard deviation larger, and smaller, than their mean. "factor FIELD i" is
-        realisation i of the factor of a random field, on the undeformed body.
+        where all components are one standard deviation larger, and smaller, than their mean. "sobol_first PARAMETER",
+        "sobol_total PARAMETER": that index of the displacement at the node. "dominating": a colour for the parameter
+        with the largest total index. "factor FIELD i": realisation i of the factor of a random field, on the undeformed
+        body.
 
     Returns
     -------
@@ -50,7 +54,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     factor = 1.0 if parameter is None else float(dataset["parameter_std"].sel(parameter=parameter))
     grid.point_data["colour"] = factor * grid.point_data[shown]
     scalar = grid.point_data[shown].ndim == 1
-    displacement = np.zeros_like(grid.points) if scalar else grid.point_data[motion]
+    undeformed = shown.startswith("factor ")
+    displacement = np.zeros_like(grid.points) if undeformed else grid.point_data[motion]
 
     # Two panels, so that the scale of the colours never covers the body.
     plotter: Any = pyvista.Plotter(
@@ -64,13 +69,24 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
             plotter.add_mesh(_edges(grid, edge), color=SECOND, line_width=2)
     surface = _surface(grid, displacement)
     # The magnitude after the subdivision: between the nodes it is that of the interpolated vector, never negative.
-    colour = surface.point_data["colour"]
+    colour = np.asarray(surface.point_data["colour"])
     surface.point_data["magnitude"] = colour if scalar else np.linalg.norm(colour, axis=1)
+    colours: Any = "cividis" if scalar else "plasma" if shown == "std" else "viridis"
+    ends: tuple[float, float] | None = None
+    names = [str(name) for name in dataset["parameter"].values]
+    if shown.startswith("factor "):
+        ends = _range(dataset, shown)
+    elif shown.startswith("sobol_"):
+        ends = (0.0, 1.0)
+    elif shown == "dominating":
+        surface.point_data["magnitude"] = np.round(np.clip(colour, -1, len(names) - 1))
+        colours, ends = [STILL, *(BY_NUMBER[i % len(BY_NUMBER)] for i in range(len(names)))], (-1.0, len(names) - 1.0)
     coloured = plotter.add_mesh(
         surface,
         scalars="magnitude",
-        cmap="cividis" if scalar else "plasma" if shown == "std" else "viridis",
-        clim=_range(dataset, shown) if scalar else None,
+        cmap=colours,
+        clim=ends,
+        interpolate_before_map=shown != "dominating",
         ambient=0.45,
         diffuse=0.6,
         smooth_shading=True,
@@ -81,7 +97,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)
-    _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter))
+    labels = len(names) + 1 if shown == "dominating" else 5
+    _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter, names), labels)
     plotter.subplot(0, 0)
     return plotter
 
@@ -106,10 +123,10 @@ def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | No
         return None
 
 
-def _range(dataset: xr.Dataset, shown: str) -> list[float]:
+def _range(dataset: xr.Dataset, shown: str) -> tuple[float, float]:
     """Smallest and largest factor over all realisations of a random field, which share one scale of colours."""
     factors = dataset["factor"].sel(random_field=shown.split()[1])
-    return [float(factors.min()), float(factors.max())]
+    return float(factors.min()), float(factors.max())
 
 
 def _surface(grid: Any, displacement: FloatArray | None = None) -> Any:
@@ -153,13 +170,13 @@ def _look(plotter: Any, up: FloatArray) -> None:
     plotter.camera.SetWindowCenter(0, -0.06)  # the numbers of the axes are below the body
 
 
-def _show_colours(plotter: Any, mapper: Any, title: str) -> None:
+def _show_colours(plotter: Any, mapper: Any, title: str, labels: int) -> None:
     """Draw the scale of the colours with what they show below it."""
     plotter.add_scalar_bar(
         mapper=mapper,
         title="",
         fmt="%.3g",
-        n_labels=5,
+        n_labels=labels,
         label_font_size=26,
         color="black",
         width=0.8,
@@ -193,10 +210,17 @@ def _show_lengths(plotter: Any, points: FloatArray) -> None:
     )
 
 
-def _colour_title(shown: str, parameter: str | None) -> str:
+def _colour_title(shown: str, parameter: str | None, names: list[str]) -> str:
+    # A dollar would begin a formula of VTK.
     if parameter is not None:
-        parameter = parameter.replace("$", "")  # which VTK would read as the beginning of a formula
-        return f"displacement by one standard deviation of {parameter} (m)"
+        return f"displacement by one standard deviation of {parameter} (m)".replace("$", "")
+    if shown == "dominating":
+        listed = ", ".join(f"{i}: {name}" for i, name in enumerate(names))
+        return f"parameter that dominates (-1: none, {listed})".replace("$", "")
+    if shown.startswith("sobol_"):
+        which, _, name = shown.partition(" ")
+        kind = "first-order" if which == "sobol_first" else "total"
+        return f"{kind} index of the displacement for {name}".replace("$", "")
     if shown.startswith("factor "):
         _, field, _ = shown.split()
         return f"random factor {field} (1)".replace("$", "")

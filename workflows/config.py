@@ -12,16 +12,18 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
-from uq.chaos import Chaos
 from uq.compare import TIGHTER, Compare, Given, Sampling
+from uq.derivative_based import DerivativeBased
 from uq.distributions import Distribution, Normal
-from uq.inputs import Inputs
+from uq.inputs import Inputs, Restricted
 from uq.linearisation import LocalSensitivity
 from uq.multilevel import MultilevelMonteCarlo
 from uq.multilevel_chaos import MultilevelChaos
-from uq.quasi_monte_carlo import QuasiMonteCarlo
+from uq.sobol import Sobol
 
-Method = Annotated[Sampling | MultilevelMonteCarlo | LocalSensitivity | Compare, Field(discriminator="kind")]
+Method = Annotated[
+    Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
+]
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -132,10 +134,12 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
-            restricted = Chaos | MultilevelChaos | QuasiMonteCarlo | Compare
-            objection = self.method.objection(inputs) if isinstance(self.method, restricted) else None
+            objection = self.method.objection(inputs) if isinstance(self.method, Restricted) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
+            stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None
+            if stranger is not None:
+                yield ("method", "groups"), stranger, self.method.model_dump()["groups"]
         if isinstance(self.method, MultilevelChaos):
             shortage = self.method.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
+MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
 
@@ -115,7 +116,8 @@ def _context(results: Results) -> dict[str, Any]:
         "levels": tables.levels(results) if "level_change" in dataset else None,
         "controlled": tables.controlled(results) if "level_change" in dataset else None,
         "levels_drawn": [_picture(plots.levels(dataset), LEVELS_DRAWN)] if "level_change" in dataset else [],
-        "sobol": [(o, tables.sobol(results, o)) for o in results.outputs] if "sobol_first" in dataset else [],
+        **_sobol(results),
+        "bounds": [_bounds(results, output) for output in results.outputs] if "total_bound" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
         "field_lines": field_lines,
         "bodies": drawn,
@@ -144,6 +146,41 @@ def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
         _picture(plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
         _picture(plots.standard_error(dataset, output), f"Standard error of the mean of {output}."),
     ]
+
+
+def _sobol(results: Results) -> dict[str, Any]:
+    """Sobol' indices: tables and pictures by output, shares of all outputs side by side, and those of the field."""
+    dataset = results.dataset
+    if "sobol_first" not in dataset:
+        return {"sobol": [], "stacked": None, "field_sobol": None}
+    by_output = []
+    for output in results.outputs:
+        shown = [tables.sobol(results, output)]
+        if "sobol_second" in dataset:
+            shown.append(tables.second_order(results, output))
+        caption = f"Indices of {output} with 95 % confidence intervals."
+        pictures = [_picture(plots.index_bars(dataset, output), caption)]
+        if dataset.sizes.get("index_round", 0) > 1:
+            caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
+            pictures.append(_picture(plots.index_convergence(dataset, output), caption))
+        by_output.append((output, shown, pictures))
+    return {
+        "sobol": by_output,
+        "stacked": _picture(plots.index_shares(dataset), "Shares of the variance: parameters alone, and the rest."),
+        "field_sobol": tables.field_sobol(results) if "field_sobol_first" in dataset else None,
+    }
+
+
+def _bounds(results: Results, output: str) -> tuple[str, list[tables.Table], list[Picture]]:
+    """Sensitivity of an output from derivatives: tables and pictures."""
+    dataset = results.dataset
+    summary = f"{output} against its leading direction: a curve, if that direction is all that matters."
+    spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
+    return (
+        output,
+        [tables.bounds(results, output), tables.active_subspace(results, output)],
+        [_picture(plots.active_summary(dataset, output), summary), _picture(plots.spectrum(dataset, output), spectrum)],
+    )
 
 
 def _differences(results: Results, output: str) -> tuple[str, str, Table, list[Picture]]:
@@ -210,6 +247,12 @@ def _body_captions(dataset: xr.Dataset) -> dict[str, str]:
         strongest = dataset["parameter"].to_numpy()[np.argsort(-effects.to_numpy())][:DERIVATIVES_DRAWN]
         for name in strongest:
             captions[f"derivative {name}"] = f"What one standard deviation of {name} moves, to first order."
+    if "dominating" in dataset:
+        strongest = dataset["parameter"].to_numpy()[np.argsort(-dataset["field_sobol_total"].to_numpy())]
+        for name in strongest[:MAPS_DRAWN]:
+            captions[f"sobol_first {name}"] = f"First-order index of the displacement for {name}, node by node."
+            captions[f"sobol_total {name}"] = f"Total index of the displacement for {name}, node by node."
+        captions["dominating"] = "The parameter with the largest total index, node by node."
     if "factor" in dataset:
         for field in dataset["random_field"].to_numpy():
             for i, factor in enumerate(dataset["factor"].sel(random_field=field).to_numpy()):

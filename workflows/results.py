@@ -93,6 +93,17 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
             }
             for output in outputs
         }
+    if "total_bound" in dataset:
+        summary["bounds"] = {
+            output: {
+                str(parameter): {
+                    short: _number(dataset[name].sel(output=output, parameter=parameter))
+                    for short, name in (("total", "total_bound"), ("total_error", "total_bound_error"))
+                }
+                for parameter in dataset.parameter.values
+            }
+            for output in outputs
+        }
     for key, variable in (
         ("local", "derivative"),
         ("local_per_std", "derivative_per_std"),
@@ -194,18 +205,21 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
 
 
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return the fields (n_nodes, 3), or (n_nodes,), of the results by a name that tells what they are."""
+    """Return the fields (n_nodes, 3) and numbers (n_nodes,) of the results by a name that tells what they are."""
     arrays = {}
     for name, variable in dataset.data_vars.items():
         if set(variable.dims) == {"node", "component"}:
             arrays[str(name).removeprefix("field_")] = variable.to_numpy()
-        elif variable.dims == ("parameter", "node", "component"):
+        elif variable.dims in {("parameter", "node", "component"), ("parameter", "node")}:
+            short = str(name).removeprefix("field_").removeprefix("node_")
             for parameter in dataset.parameter.values:
-                arrays[f"{str(name).removeprefix('field_')} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
+                arrays[f"{short} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
         elif variable.dims == ("random_field", "realisation", "node"):
             for field in dataset.random_field.values:
                 for i, values in enumerate(variable.sel(random_field=field).to_numpy()):
                     arrays[f"{name} {field} {i}"] = values
+        elif variable.dims == ("node",):
+            arrays[str(name)] = variable.to_numpy()
     return arrays
 
 
@@ -218,6 +232,6 @@ def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any,
             cell_nodes=(("cell", "corner"), cells, {"vtk_cell_type": vtk_cell_type}),
         )
         for name in dataset.data_vars:
-            if str(name).startswith("field_") and "derivative" not in str(name):
+            if str(name).startswith("field_") and not any(word in str(name) for word in ("derivative", "sobol")):
                 dataset[name].attrs["units"] = "m"
     return dataset

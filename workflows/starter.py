@@ -126,6 +126,22 @@ methods = [
     { kind = "chaos", max_order = 4, budgets = [5, 10, 15] },
 ]
 """,
+    "sobol": """\
+kind = "sobol"
+design = "chaos"      # from values and gradients at few points; or "saltelli": exchanged Sobol' points, samples = rows,
+                      # scrambles × a power of two, of d + 2 solves each; or "given-data", source = "results/DIRECTORY"
+samples = 15          # or tolerance = 1e-3 (leave-one-out error / std; error of an index), or budget_seconds = 600
+second_order = true   # the share of every product of two parameters
+# groups = { load = ["loads.gravity.density"] }   # indices of several parameters together
+seed = 1
+fields = true         # indices of the displacement field, and at every node
+""",
+    "derivative-based": """\
+kind = "derivative-based"
+samples = 128         # scrambles × a power of two; or tolerance = 0.01 (error of a bound), or budget_seconds = 600
+scrambles = 32        # independent randomisations of the Sobol' points: their scatter is the error
+seed = 1
+""",
     "local-sensitivity": """\
 kind = "local-sensitivity"
 """,

@@ -289,7 +289,70 @@ def sobol(results: Results, output: str) -> Table:
         of_parameter = of_output.sel(parameter=name)
         pairs = [(of_parameter[f"sobol_{which}"], of_parameter[f"sobol_{which}_error"]) for which in ("first", "total")]
         rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
+    for name in map(str, results.dataset["group"].values if "group" in results.dataset.coords else ()):
+        of_group = of_output.sel(group=name)
+        kinds = [f"sobol_group_{which}" for which in ("first", "total")]
+        texts = [with_error(float(of_group[kind]), float(of_group[f"{kind}_error"])) for kind in kinds]
+        rows.append((f"group {name}", *texts))
     return Table(("parameter", "first order", "total"), rows)
+
+
+def second_order(results: Results, output: str) -> Table:
+    """Shares of the variance of an output that two parameters have together and neither has alone."""
+    of_output = results.dataset.sel(output=output)
+    names = results.parameters
+    rows = []
+    for i, name in enumerate(names):
+        for partner in names[i + 1 :]:
+            of_pair = of_output.sel(parameter=name, partner=partner)
+            share = with_error(float(of_pair["sobol_second"]), float(of_pair["sobol_second_error"]))
+            rows.append((name, partner, share))
+    return Table(("parameter", "with", "second order"), rows, text=frozenset({0, 1}))
+
+
+def field_sobol(results: Results) -> Table:
+    """Generalised Sobol' indices of the displacement field."""
+    rows = []
+    for name in results.parameters:
+        of = results.dataset.sel(parameter=name)
+        pairs = [(of[f"field_sobol_{which}"], of[f"field_sobol_{which}_error"]) for which in ("first", "total")]
+        rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
+    return Table(("parameter", "first order", "total"), rows)
+
+
+def bounds(results: Results, output: str) -> Table:
+    """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
+    of_output = results.dataset.sel(output=output)
+    rows = []
+    for name in results.parameters:
+        of = of_output.sel(parameter=name)
+        squared = with_error(float(of["dgsm"]), float(of["dgsm_error"]))
+        total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
+        bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
+        rows.append((name, number(float(of["local_share"])), squared, number(float(of["poincare"])), total, bound))
+    head = (
+        "parameter",
+        "share of the local variance",
+        "mean squared derivative",
+        "Poincaré constant",
+        "total index (expansion)",
+        "is at most",
+    )
+    return Table(head, rows)
+
+
+def active_subspace(results: Results, output: str) -> Table:
+    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, and the leading direction."""
+    of_output = results.dataset.sel(output=output)
+    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
+    directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
+    rows = [
+        (name, with_error(float(component), float(error)), str(i), number(value), f"{number(lower)} to {number(upper)}")
+        for i, (name, (component, error), value, lower, upper) in enumerate(
+            zip(results.parameters, directions, *values, strict=True), start=1
+        )
+    ]
+    return Table(("parameter", "leading direction", "number", "eigenvalue", "95 % range"), rows)
 
 
 def sensitivities(results: Results, output: str) -> Table:

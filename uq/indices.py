@@ -1,0 +1,233 @@
+"""Sobol' indices: of expansions, of exchanged samples, and of their fields; each formula once.
+
+With the variance V of a quantity ψ, V_g = Var E[ψ | ω_g] and T_g = E Var(ψ | ω_~g) for a parameter or a group g, the
+index of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V, sums
+over its nodes and components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
+
+Of an expansion in orthonormal polynomials all these are sums of squares of coefficients (B. Sudret, Reliab. Eng. Syst.
+Safety 93 (2008) 964–979). From samples they come from rows of points: A and B, independent, AB_g, which is A with ω_g
+taken from B, and for products of two parameters BA_i:
+
+    V_g = ⟨B (AB_g − A)⟩              A. Saltelli et al., Comput. Phys. Commun. 181 (2010) 259–270
+    T_g = ⟨(A − AB_g)²⟩/2             M. J. W. Jansen, Comput. Phys. Commun. 117 (1999) 35–43
+    V_ij = ⟨BA_i AB_j − A B⟩ − V_i − V_j      A. Saltelli, Comput. Phys. Commun. 145 (2002) 280–297
+
+where the letters stand for values of ψ less their mean over all points. Everything follows from the means over rows of
+the values and of some of their products, which are sums and so can be added up in any grouping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+Analysis = Callable[[FloatArray, NDArray[np.int64]], dict[str, FloatArray]]
+MOVES = 1e-12  # of the largest variance: below, a variance at a node is rounding
+
+
+# --- expansions ----------------------------------------------------------------------------------------------------
+
+
+def partial_variances(
+    squares: FloatArray, indices: NDArray[np.int64], members: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Variance (…), and its parts V_g and T_g (…, G), from squares of coefficients (…, P).
+
+    Parameters
+    ----------
+    squares
+        Of the coefficients, or sums of them over the entries of a field.
+    indices
+        Multi-indices (P, d) of the functions.
+    members
+        Which parameters (G, d) each group has.
+    """
+    active = indices > 0
+    inside = (active[:, None, :] & members).any(axis=2)
+    outside = (active[:, None, :] & ~members).any(axis=2)
+    varying = active.any(axis=1).astype(float)
+    return squares @ varying, squares @ (inside & ~outside).astype(float), squares @ inside.astype(float)
+
+
+def pair_variances(squares: FloatArray, indices: NDArray[np.int64]) -> FloatArray:
+    """Variance V_ij (…, d, d) of what two parameters do together and neither alone, symmetric; zero on the diagonal."""
+    active = indices > 0
+    d = active.shape[1]
+    both = np.zeros((len(indices), d, d))
+    for term in np.flatnonzero(active.sum(axis=1) == 2):
+        i, j = np.flatnonzero(active[term])
+        both[term, i, j] = both[term, j, i] = 1
+    return np.asarray(np.tensordot(squares, both, axes=1))
+
+
+def coefficient_moments(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
+    """Mean, standard deviation and Sobol' indices (…, d) of coefficients (…, P)."""
+    variance, first, total = partial_variances(coefficients**2, indices, np.eye(indices.shape[1], dtype=bool))
+    constant = (indices == 0).all(axis=1)
+    return {
+        "mean": coefficients[..., constant].sum(axis=-1),
+        "std": np.sqrt(variance),
+        "sobol_first": shares(first, variance[..., None]),
+        "sobol_total": shares(total, variance[..., None]),
+    }
+
+
+def shares(parts: FloatArray, variance: FloatArray | float) -> FloatArray:
+    """Parts over a variance, and 0 where nothing varies."""
+    variance = np.asarray(variance)
+    return np.asarray(np.where(variance > 0, parts / np.where(variance > 0, variance, 1.0), 0.0))
+
+
+# --- rows of exchanged points --------------------------------------------------------------------------------------
+
+
+def exchanged(A: FloatArray, B: FloatArray, members: NDArray[np.bool_], *, pairs: bool) -> FloatArray:
+    """Return the rows (n, K, d) of points A, B, AB_g for each of G groups and, for pairs, BA_i for each parameter.
+
+    Parameters
+    ----------
+    A, B
+        Independent points (n, d).
+    members
+        Which parameters (G, d) each group has.
+    pairs
+        Whether products of two parameters are asked for.
+    """
+    points = [A, B, *(np.where(group, B, A) for group in members)]
+    if pairs:
+        points += [np.where(one, A, B) for one in np.eye(A.shape[1], dtype=bool)]
+    return np.stack(points, axis=1)
+
+
+@dataclass(frozen=True)
+class RowProducts:
+    """What of a row of values is averaged.
+
+    Attributes
+    ----------
+    groups
+        Number G of parameters and groups; the parameters come first.
+    pairs
+        Number d of parameters whose products are asked for, or 0.
+    """
+
+    groups: int
+    pairs: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number K of points in a row."""
+        return 2 + self.groups + self.pairs
+
+    def of(self, row: FloatArray) -> FloatArray:
+        """Return the values (K, …) of a row and their products, (J, …) in all."""
+        A, B = row[0], row[1]
+        AB = row[2 : 2 + self.groups]
+        parts = [row, ((A**2 + B**2) / 2)[None], B * (AB - A), (A - AB) ** 2 / 2]
+        if self.pairs:
+            BA = row[2 + self.groups :]
+            parts += [(A * B)[None], *((BA[i] * AB[j])[None] for i, j in self._couples())]
+        return np.concatenate(parts)
+
+    def variances(self, means: FloatArray) -> ExchangedVariances:
+        """Return the variances that follow from means (J, …) over the rows."""
+        G, K = self.groups, self.size
+        values, square = means[:K], means[K]
+        cross, total = means[K + 1 : K + 1 + G], means[K + 1 + G : K + 1 + 2 * G]
+        A, B, AB, BA = values[0], values[1], values[2 : 2 + G], values[2 + G :]
+        centre = values.mean(axis=0)
+        first = cross - centre * (AB - A)
+        second = None
+        if self.pairs:
+            rest = means[K + 1 + 2 * G :]
+            second = np.zeros((self.pairs, self.pairs, *centre.shape))
+            for (i, j), product in zip(self._couples(), rest[1:], strict=True):
+                together = product - rest[0] - centre * (BA[i] + AB[j] - A - B)
+                second[i, j] = second[j, i] = together - first[i] - first[j]
+        return ExchangedVariances(square - ((A + B) / 2) ** 2, first, total, second)
+
+    def _couples(self) -> list[tuple[int, int]]:
+        return [(i, j) for i in range(self.pairs) for j in range(i + 1, self.pairs)]
+
+
+@dataclass(frozen=True)
+class ExchangedVariances:
+    """Variance (…), its parts V_g and T_g (G, …) and, where they were asked for, V_ij (d, d, …)."""
+
+    variance: FloatArray
+    first: FloatArray
+    total: FloatArray
+    second: FloatArray | None = None
+
+
+# --- errors of what follows from means over independent replicates -------------------------------------------------
+
+
+def bootstrap(sums: FloatArray, counts: FloatArray, seed: int, draws: int = 1000) -> FloatArray:
+    """Means (J, draws, …) over replicates that are drawn again, from sums (R, J, …) over each of R replicates.
+
+    A replicate is a set of points, however these depend on each other; drawing single points of quasi-random sets again
+    would take them for independent ones, and claim too large errors.
+
+    Parameters
+    ----------
+    sums
+        Sums over the points of each replicate.
+    counts
+        Number (R,) of points of each.
+    seed
+        Of the draws.
+    draws
+        How often all R are drawn.
+    """
+    R = len(counts)
+    times = np.random.default_rng([seed, R]).multinomial(R, np.full(R, 1 / R), size=draws)
+    drawn = np.tensordot(times, sums, axes=1) / (times @ counts).reshape(-1, *(1,) * (sums.ndim - 1))
+    return np.asarray(np.swapaxes(drawn, 0, 1))
+
+
+def bootstrap_error(drawn: FloatArray, replicates: int, axis: int) -> FloatArray:
+    """Standard error from estimates drawn by `bootstrap`, with replicates − 1 degrees of freedom."""
+    return np.asarray(drawn.std(axis=axis) * np.sqrt(replicates / (replicates - 1)))
+
+
+def jackknife_error(left_out: FloatArray) -> FloatArray:
+    """Standard error from estimates (R, …) that leave one of R replicates out each."""
+    R = len(left_out)
+    return np.asarray(np.sqrt((R - 1) / R * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)))
+
+
+# --- fields --------------------------------------------------------------------------------------------------------
+
+
+def field_indices(
+    variance: FloatArray, first: FloatArray, total: FloatArray
+) -> dict[str, tuple[tuple[str, ...], FloatArray | NDArray[np.int64]]]:
+    """Return the generalised indices of a field, its indices by node, and which parameter dominates there.
+
+    Parameters
+    ----------
+    variance, first, total
+        V (nodes,), and V_i and T_i (d, nodes) of d parameters, sums over the components.
+
+    Returns
+    -------
+    dict
+        `field_sobol_first` and `field_sobol_total` (parameter); `node_sobol_first` and `node_sobol_total` (parameter,
+        node), zero where nothing moves; and `dominating` (node), the number of the parameter with the largest total
+        index, or −1 where nothing moves.
+    """
+    moving = variance > MOVES * variance.max(initial=0.0)
+    at_node = np.where(moving, variance, 0.0)
+    return {
+        "field_sobol_first": (("parameter",), shares(first.sum(axis=1), variance.sum())),
+        "field_sobol_total": (("parameter",), shares(total.sum(axis=1), variance.sum())),
+        "node_sobol_first": (("parameter", "node"), shares(first, at_node)),
+        "node_sobol_total": (("parameter", "node"), shares(total, at_node)),
+        "dominating": (("node",), np.where(moving, total.argmax(axis=0), -1)),
+    }
