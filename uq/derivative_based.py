@@ -239,9 +239,15 @@ class _Samples:
         bounding = tangents * np.where(logarithmic, self.points[some, :each], 1.0)[:, :, None, :]
         scaled = tangents * self._inputs.std
         d = scaled.shape[-1]
+        first, second = deviation, deviation**2
+        if ok.all():
+            # The tangent at the mean parameters is a control variate of both, as in `uq.moments`.
+            prediction = (self.points[some, :each] - self._centre.point) @ self._centre.tangents.T
+            variance = ((self._centre.tangents * self._inputs.std) ** 2).sum(axis=1)
+            first, second = deviation - prediction, second - prediction**2 + variance
         parts = [
-            deviation[..., None],
-            (deviation**2)[..., None],
+            first[..., None],
+            second[..., None],
             tangents**2,
             bounding**2,
             (scaled[..., :, None] * scaled[..., None, :]).reshape(*deviation.shape, d * d),
