@@ -152,7 +152,7 @@ class HomogeneousModel:
         return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
 
     def _one(self, parameters: FloatArray) -> FloatArray:
-        values = self.stresses(parameters[None, :])[0]
+        values = np.asarray(self.stresses(parameters[None, :])[0])
         if not np.isfinite(values).all():
             name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
             message = f"no stress in the test {name}: the material has no energy, or no equilibrium, there"
