@@ -1,6 +1,6 @@
 """The posterior density of a few random parameters given measured outputs, in standard normal coordinates.
 
-With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) + e and independent errors e_i ~ N(0, (s σ_i)²),
+With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) + e and independent e_i ~ N(0, (s σ_i)²),
 
     −ln p(y | x) = ½ r·r + Σ ln(s σ_i) + (m/2) ln 2π,   r_i = (ψ_i(ω) − y_i)/(s σ_i),
 
@@ -9,9 +9,9 @@ depend on the model, so that evidences of different models compare:
 
     Z = ∫ p(y | x) N(x; 0, I) dx.
 
-Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what multiplies
-∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J. Wright, Numerical
-Optimization (2006), section 10.2.
+Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
+multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
+Wright, Numerical Optimization (2006), section 10.2.
 """
 
 from __future__ import annotations
