@@ -1,4 +1,4 @@
-"""The evidence Z = ∫ p(y | x) N(x; 0, I) dx of a model by importance sampling, with its error.
+"""The evidence Z = ∫ p(y | x) N(x; 0, I) dx of a model by weighted points, with its error, by a route that is chosen.
 
 Points are drawn from a mixture of the Gaussian of Laplace, made wider, and of the prior, at independent scrambles of
 Sobol' points. A point that either half could have drawn is weighted by the whole mixture,
@@ -9,23 +9,36 @@ so that no weight is large because the Gaussian is narrow (T. Hesterberg, Techno
 weight of a scramble is an unbiased estimate of Z; their scatter gives the error. What the weights are worth beside that
 is told by the effective sample size (Σw)²/Σw² and the shape k̂ of their tail (A. Vehtari et al., J. Mach. Learn. Res. 25
 (2024) 72): above 0.7 they are not to be trusted.
+
+The first quarter of the points decides. Where the posterior is a Gaussian to rounding, Laplace's formula is the answer.
+Where the weights are even, the other points follow from the same mixture. Else a polynomial is fitted to the points
+(`inverse.surrogate`), the next quarter is drawn from the posterior of the polynomial, the fit is repeated with them, and
+the last half is drawn from the better one: with probabilities p ∝ p̃(y | x) N/q in a cloud of N points drawn from q,
+
+    Z = E[p(y | x) N(x; 0, I)/(N q(x) p(x))],
+
+whose weights are even where the polynomial is right, and tell where it is not.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from forward.model import FloatArray
+from forward.model import FloatArray, SolveError
 from inverse.laplace import Laplace
 from inverse.posterior import Density, Posterior
+from inverse.surrogate import SCRAMBLES, Mixture, fit, sample
 from uq.sampling import sobol_points
 
-WIDER = 1.3  # τ: standard deviations of the proposal over those of Laplace
-SHARE = 0.7  # α: of the points from the Gaussian
-SCRAMBLES = 8
 TRUSTED = 0.7  # k̂ up to which weights are worth what they say
+EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
+LEAST = 4 * SCRAMBLES  # solves of an estimate
+ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding
+
+Route = Literal["closed form", "importance", "surrogate"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +48,9 @@ class Evidence:
     Attributes
     ----------
     log_evidence, error
-        ln Z, and its standard error from the scatter of the scrambles.
+        ln Z, and its standard error: from the scatter of eight independent replicates.
+    route
+        How it was found, and `why`.
     effective
         Effective number of points.
     tail
@@ -44,19 +59,24 @@ class Evidence:
         The posterior at the points.
     log_weights
         ln w (n,).
+    solves
+        Number of solves, those that a proposal was fitted to among them.
     """
 
     log_evidence: float
     error: float
+    route: Route
+    why: str
     effective: float
     tail: float
     density: Density
     log_weights: FloatArray
+    solves: int
 
     @property
     def trusted(self) -> bool:
-        """Whether the weights are worth what they say."""
-        return bool(self.tail <= TRUSTED)
+        """Whether the estimate is worth what it says."""
+        return self.route == "closed form" or self.tail <= TRUSTED
 
     @property
     def weights(self) -> FloatArray:
@@ -65,53 +85,111 @@ class Evidence:
         return np.asarray(w / w.sum())
 
 
-def importance(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
-    """Estimate the evidence at `samples` points around a Gaussian.
+def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
+    """Estimate the evidence with so many solves around a Gaussian, by the route that the first of them tell.
 
     Parameters
     ----------
     posterior, gaussian
         What is weighted, and where.
     samples
-        Number of solves, rounded down to 8 scrambles of as many points.
+        Number of solves, at least 32, rounded down to a multiple of that.
     seed
-        Of the scrambles.
+        Of all draws.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at any of the points.
     """
-    from scipy.special import ndtri
-
-    each = samples // SCRAMBLES
-    if each < 2:
-        message = f"{samples} samples, expected at least {2 * SCRAMBLES}"
+    if samples < LEAST:
+        message = f"{samples} samples, expected at least {LEAST}"
         raise ValueError(message)
-    c = gaussian.mode.size
-    cubes = np.concatenate([sobol_points(seed, r, 0, each, c + 1) for r in range(SCRAMBLES)])
-    z = ndtri(cubes[:, 1:])
-    from_gaussian = cubes[:, 0] < SHARE
-    x = np.where(from_gaussian[:, None], gaussian.mode + WIDER * z @ gaussian.root.T, z)
-    density = posterior.at(x)
-    log_weights = density.log_likelihood - _log_mixture_over_prior(x, gaussian)
-    return weighed(density, log_weights)
+    quarter = samples // LEAST * SCRAMBLES
+    mixture = Mixture.of(gaussian)
+    first = _drawn(posterior, mixture, seed, 0, quarter, derivatives=True)
+    pilot = weighed(*first, "importance", "", quarter)
+    misfit = np.abs(_from_gaussian(gaussian, pilot.density))
+    even = pilot.effective / quarter
+    share = f"the first {quarter} points are worth {pilot.effective:.0f}"
+    if (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
+        near = misfit[pilot.weights > 1e-6 / quarter]
+        whole = _continued(posterior, mixture, first, seed, quarter)
+        why = "the posterior is a Gaussian at every point that was tried"
+        return replace(
+            whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why
+        )
+    if even >= EVEN and pilot.tail <= TRUSTED:
+        whole = _continued(posterior, mixture, first, seed, quarter)
+        return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights", 4 * quarter)
+    try:
+        return _by_surrogate(posterior, gaussian, first[0], seed, quarter, f"{share}: uneven weights")
+    except SolveError as error:
+        whole = _continued(posterior, mixture, first, seed, quarter)
+        return weighed(whole.density, whole.log_weights, "importance", f"{share}; {error}", 4 * quarter)
 
 
-def weighed(density: Density, log_weights: FloatArray) -> Evidence:
+def weighed(density: Density, log_weights: FloatArray, route: Route, why: str, solves: int) -> Evidence:
     """Make an estimate of weights (n,) of which every eighth part, in order, is an independent replicate."""
     shift = log_weights.max()
+    if not np.isfinite(shift):
+        message = "the model has no answer at any of the points drawn for the evidence"
+        raise SolveError(message)
     w = np.exp(log_weights - shift)
     means = w.reshape(SCRAMBLES, -1).mean(axis=1)
     total = float(means.mean())
     error = float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / total)
-    return Evidence(
-        float(shift + np.log(total)), error, float(w.sum() ** 2 / (w**2).sum()), tail_shape(w), density, log_weights
-    )
+    effective = float(w.sum() ** 2 / (w**2).sum())
+    log_evidence = float(shift + np.log(total))
+    return Evidence(log_evidence, error, route, why, effective, tail_shape(w), density, log_weights, solves)
 
 
-def _log_mixture_over_prior(x: FloatArray, gaussian: Laplace) -> FloatArray:
-    """Ln of (α N(x; x̂, τ²H⁻¹) + (1 − α) N(x; 0, I)) / N(x; 0, I), (n,)."""
-    deviation = (x - gaussian.mode) / WIDER
-    exponent = -np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) / 2
-    log_gaussian = exponent + np.linalg.slogdet(gaussian.hessian)[1] / 2 - gaussian.mode.size * np.log(WIDER)
-    log_prior = -(x**2).sum(axis=1) / 2
-    return np.asarray(np.logaddexp(np.log(SHARE) + log_gaussian - log_prior, np.log(1 - SHARE)))
+def _drawn(
+    posterior: Posterior, mixture: Mixture, seed: int, start: int, stop: int, *, derivatives: bool
+) -> tuple[Density, FloatArray]:
+    """Solve at the points from number `start` to `stop` of a mixture, all scrambles together; ln w."""
+    c = mixture.centres.shape[1]
+    ends = (start // SCRAMBLES, stop // SCRAMBLES)
+    x = mixture.draw(np.concatenate([sobol_points(seed, r, *ends, c + 1) for r in range(SCRAMBLES)]))
+    density = posterior.at(x, derivatives=derivatives)
+    return density, density.log_likelihood - mixture.log_over_prior(x)
+
+
+def _continued(
+    posterior: Posterior, mixture: Mixture, first: tuple[Density, FloatArray], seed: int, quarter: int
+) -> Evidence:
+    """Draw the other three quarters."""
+    rest = _drawn(posterior, mixture, seed, quarter, 4 * quarter, derivatives=False)
+    replicate = np.concatenate([np.arange(n) // (n // SCRAMBLES) for n in (quarter, 3 * quarter)])
+    order = np.argsort(replicate, kind="stable")
+    density = Density.joined([first[0], rest[0]], order)
+    return weighed(density, np.concatenate([first[1], rest[1]])[order], "importance", "", 4 * quarter)
+
+
+def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
+    """Difference (n,) of the log posterior from that of the Gaussian; nothing counts as far where there is none."""
+    deviation = density.x - gaussian.mode
+    quadratic = gaussian.log_posterior - np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) / 2
+    return np.asarray(density.log_posterior - quadratic)
+
+
+def _by_surrogate(
+    posterior: Posterior, gaussian: Laplace, first: Density, seed: int, quarter: int, why: str
+) -> Evidence:
+    near = _near(posterior, gaussian, first, seed, quarter, derivatives=True)[0]
+    known = Density.joined([first, near])
+    density, log_over, error = _near(posterior, gaussian, known, seed + 100, 2 * quarter, derivatives=False)
+    found = weighed(density, density.log_likelihood - log_over, "surrogate", why, 4 * quarter)
+    return replace(found, error=float(np.hypot(found.error, error)))
+
+
+def _near(
+    posterior: Posterior, gaussian: Laplace, known: Density, seed: int, count: int, *, derivatives: bool
+) -> tuple[Density, FloatArray, float]:
+    """Solve at points of the posterior of a polynomial fitted to what is known; what likelihoods are divided by."""
+    cloud = sample(fit(posterior, known), gaussian, seed)
+    x, log_over = cloud.pick(seed, count)
+    return posterior.at(x, derivatives=derivatives), log_over, cloud.error
 
 
 def tail_shape(weights: FloatArray) -> float:

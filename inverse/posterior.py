@@ -16,9 +16,11 @@ Wright, Numerical Optimization (2006), section 10.2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.distributions import Distribution
@@ -42,6 +44,10 @@ class Density:
         ψ (n, m); NaN where the model has no answer.
     log_likelihood
         ln p(y | x) (n,); −∞ where the model has no answer.
+    everything
+        All outputs (n, M) of the model, of which ψ are those that were measured.
+    tangents
+        ∂ψ/∂ω (n, M, d) of all outputs, where derivatives were asked for.
     gradient, curvature
         Of −ln p(y | x) + ½|x|²: (n, c), and its second derivatives (n, c, c) but for those of ψ; NaN where the model
         has no answer, empty where they were not asked for.
@@ -51,6 +57,8 @@ class Density:
     parameters: FloatArray
     outputs: FloatArray
     log_likelihood: FloatArray
+    everything: FloatArray
+    tangents: FloatArray | None
     gradient: FloatArray
     curvature: FloatArray
 
@@ -58,6 +66,20 @@ class Density:
     def log_posterior(self) -> FloatArray:
         """Ln p(y | x) − ½|x|² (n,): what the mode is the largest value of."""
         return np.asarray(self.log_likelihood - (self.x**2).sum(axis=1) / 2)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Density], order: NDArray[np.intp] | None = None) -> Density:
+        """Put points together, in a new order if one is given; with derivatives where all parts have them."""
+
+        def column(name: str) -> FloatArray:
+            values = np.concatenate([getattr(part, name) for part in parts])
+            return values if order is None else np.asarray(values[order])
+
+        n, differentiated = sum(len(part.x) for part in parts), all(part.tangents is not None for part in parts)
+        plain = [column(name) for name in ("x", "parameters", "outputs", "log_likelihood", "everything")]
+        if not differentiated:
+            return cls(*plain, None, np.zeros((n, 0)), np.zeros((n, 0, 0)))
+        return cls(*plain, column("tangents"), column("gradient"), column("curvature"))
 
 
 @dataclass(frozen=True)
@@ -130,7 +152,7 @@ class Posterior:
         log_likelihood = np.where(found.ok, -misfit, -np.inf)
         if not derivatives:
             empty = np.zeros((n, 0))
-            return Density(x, points, outputs, log_likelihood, empty, empty[:, :, None])
+            return Density(x, points, outputs, log_likelihood, found.outputs, None, empty, empty[:, :, None])
         assert found.tangents is not None
         A = np.zeros((n, m, c))
         A[:, :, :d] = found.tangents[:, which] @ slopes / scale[:, :, None]
@@ -143,4 +165,4 @@ class Posterior:
             curvature[:, d, :] += cross
             curvature[:, :, d] += cross
             curvature[:, d, d] += 2 * squares * ln_s_slope**2
-        return Density(x, points, outputs, log_likelihood, gradient, curvature)
+        return Density(x, points, outputs, log_likelihood, found.outputs, found.tangents, gradient, curvature)
