@@ -12,8 +12,8 @@ is told by the effective sample size (Σw)²/Σw² and the shape k̂ of their ta
 
 The first quarter of the points decides. Where the posterior is a Gaussian to rounding, Laplace's formula is the answer.
 Where the weights are even, the other points follow from the same mixture. Else a polynomial is fitted to the points
-(`inverse.surrogate`), the next quarter is drawn from the posterior of the polynomial, the fit is repeated with them, and
-the last half is drawn from the better one: with probabilities p ∝ p̃(y | x) N/q in a cloud of N points drawn from q,
+(`inverse.surrogate`), the next quarter is drawn from the posterior of the polynomial, the fit is repeated with them,
+and the last half is drawn from the better one: with probabilities p ∝ p̃(y | x) N/q in a cloud of N points drawn from q,
 
     Z = E[p(y | x) N(x; 0, I)/(N q(x) p(x))],
 
@@ -35,6 +35,7 @@ from uq.sampling import sobol_points
 
 TRUSTED = 0.7  # k̂ up to which weights are worth what they say
 EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
+ALIKE = 0.9  # effective share from which on weights are equal for all that matters
 LEAST = 4 * SCRAMBLES  # solves of an estimate
 ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding
 
@@ -76,13 +77,25 @@ class Evidence:
     @property
     def trusted(self) -> bool:
         """Whether the estimate is worth what it says."""
-        return self.route == "closed form" or self.tail <= TRUSTED
+        # The tail of weights that are all but equal says nothing.
+        alike = self.effective > ALIKE * len(self.log_weights)
+        return self.route == "closed form" or self.tail <= TRUSTED or alike
 
     @property
     def weights(self) -> FloatArray:
         """Weights (n,) of the points in the posterior, of sum 1."""
         w = np.exp(self.log_weights - self.log_weights.max())
         return np.asarray(w / w.sum())
+
+    def reweighted(self, change: FloatArray) -> tuple[float, float]:
+        """Return ln Z and its error with ln of the prior density changed by `change` (n,) at the points."""
+        top = change.max()
+        changed, plain = (
+            w.reshape(SCRAMBLES, -1).sum(axis=1) for w in (self.weights * np.exp(change - top), self.weights)
+        )
+        ratio = changed.sum()
+        scatter = (changed - ratio * plain).std(ddof=1) * np.sqrt(SCRAMBLES) / ratio
+        return float(self.log_evidence + top + np.log(ratio)), float(np.hypot(self.error, scatter))
 
 
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
@@ -116,9 +129,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         near = misfit[pilot.weights > 1e-6 / quarter]
         whole = _continued(posterior, mixture, first, seed, quarter)
         why = "the posterior is a Gaussian at every point that was tried"
-        return replace(
-            whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why
-        )
+        return replace(whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why)
     if even >= EVEN and pilot.tail <= TRUSTED:
         whole = _continued(posterior, mixture, first, seed, quarter)
         return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights", 4 * quarter)

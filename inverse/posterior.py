@@ -76,10 +76,16 @@ class Density:
             return values if order is None else np.asarray(values[order])
 
         n, differentiated = sum(len(part.x) for part in parts), all(part.tangents is not None for part in parts)
-        plain = [column(name) for name in ("x", "parameters", "outputs", "log_likelihood", "everything")]
-        if not differentiated:
-            return cls(*plain, None, np.zeros((n, 0)), np.zeros((n, 0, 0)))
-        return cls(*plain, column("tangents"), column("gradient"), column("curvature"))
+        return cls(
+            x=column("x"),
+            parameters=column("parameters"),
+            outputs=column("outputs"),
+            log_likelihood=column("log_likelihood"),
+            everything=column("everything"),
+            tangents=column("tangents") if differentiated else None,
+            gradient=column("gradient") if differentiated else np.zeros((n, 0)),
+            curvature=column("curvature") if differentiated else np.zeros((n, 0, 0)),
+        )
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,10 @@
 
 The outputs are fitted by least squares to values and derivatives at points that were solved, in Hermite polynomials
 about the weighted mean of these points; far points count less. Polynomials of the parameters or of their standard
-normal coordinates, and their degree: the ones that predict left-out points best. The posterior of the polynomial costs nothing, so it can be sampled as densely as it takes: from
-a mixture of Gaussians, each as wide as the posterior is about its centre, whose centres are drawn from the points of
-the round before (population Monte Carlo: O. Cappé et al., Stat. Comput. 18 (2008) 447–459).
+normal coordinates, and their degree: the ones that predict left-out points best. The posterior of the polynomial costs
+nothing, so it can be sampled as densely as it takes: from a mixture of Gaussians, each as wide as the posterior is
+about its centre, whose centres are drawn from the points of the round before (population Monte Carlo: O. Cappé et al.,
+Stat. Comput. 18 (2008) 447–459).
 """
 
 from __future__ import annotations
@@ -291,7 +292,9 @@ def _mixture(surrogate: Posterior, cloud: Cloud, seed: int) -> Mixture:
     tempered = _tempered(cloud.log_weights, 2 * CENTRES)
     places = (np.arange(CENTRES) + np.random.default_rng([seed, CENTRES]).random()) / CENTRES
     order = np.argsort(cloud.x[:, 0], kind="stable")
-    centres = cloud.x[order[np.searchsorted(np.cumsum(tempered[order]), places * tempered.sum()).clip(0, len(order) - 1)]]
+    centres = cloud.x[
+        order[np.searchsorted(np.cumsum(tempered[order]), places * tempered.sum()).clip(0, len(order) - 1)]
+    ]
     there = surrogate.at(centres, derivatives=True)
     c = centres.shape[1]
     values, vectors = np.linalg.eigh(there.curvature)

@@ -24,6 +24,7 @@ BARS = 15  # parameters that a tornado chart shows
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
 LOW, HIGH = "#0b6bb8", "#d1622b"
+COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
 
 
 def running_estimates(
@@ -67,7 +68,7 @@ def band(dataset: xr.Dataset) -> float:
 
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
-    ax = ax or _axes()
+    ax = ax or axes()
     series = _series(dataset, output)
     for label, colour, counts, mean, error in series:
         half = band(dataset) * error
@@ -83,7 +84,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
     """Draw the standard error of the mean of an output against the number of samples, plain and controlled."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-    ax = ax or _axes()
+    ax = ax or axes()
     series = _series(dataset, output)
     for label, colour, counts, _, error in series:
         ax.plot(counts, error, color=colour, label=label)
@@ -101,7 +102,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the density of an output, of its expansion or else of its samples, with its mean and quantiles."""
-    ax = ax or _axes()
+    ax = ax or axes()
     if "density" in dataset:
         density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
         ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
@@ -134,7 +135,7 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw how much an output changes, to first order, with each parameter one standard deviation off its mean."""
     effects = dataset["derivative_per_std"].sel(output=output).to_numpy()
     order = np.argsort(np.abs(effects))[-BARS:]
-    ax = ax or _axes(height=1.3 + 0.42 * len(order))
+    ax = ax or axes(height=1.3 + 0.42 * len(order))
     for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
         ax.barh(np.arange(len(order)), sign * effects[order], height=0.6, color=colour, label=label)
     ax.axvline(0, color=DARK, linewidth=0.8)
@@ -163,7 +164,7 @@ def comparison(
         Where to draw.
     """
     shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
-    ax = ax or _axes(height=1.2 + 0.42 * len(shown))
+    ax = ax or axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
     errors = [band(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
@@ -186,7 +187,7 @@ def png(ax: Axes) -> bytes:
     return file.getvalue()
 
 
-def _axes(height: float = 3.2) -> Axes:
+def axes(height: float = 3.2) -> Axes:
     """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
