@@ -12,16 +12,15 @@ is told by the effective sample size (Σw)²/Σw² and the shape k̂ of their ta
 
 The first quarter of the points decides. Where the posterior is a Gaussian to rounding, Laplace's formula is the answer.
 Where the weights are even, the other points follow from the same mixture. Else a polynomial is fitted to the points
-(`inverse.surrogate`), the next quarter is drawn from the posterior of the polynomial, the fit is repeated with them,
-and the last half is drawn from the better one: with probabilities p ∝ p̃(y | x) N/q in a cloud of N points drawn from q,
-
-    Z = E[p(y | x) N(x; 0, I)/(N q(x) p(x))],
-
-whose weights are even where the polynomial is right, and tell where it is not.
+(`inverse.surrogate`), the next quarter is drawn from the posterior of the polynomial, and so on. Then all points are
+weighted by the mixture of all the densities they were drawn from (adaptive multiple importance sampling: J.-M. Cornuet
+et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the polynomials are right, and none is large where
+they are wrong and the first mixture was not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -36,7 +35,8 @@ from uq.sampling import sobol_points
 TRUSTED = 0.7  # k̂ up to which weights are worth what they say
 EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
 ALIKE = 0.9  # effective share from which on weights are equal for all that matters
-LEAST = 4 * SCRAMBLES  # solves of an estimate
+QUARTERS = 4
+LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
 ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding
 
 Route = Literal["closed form", "importance", "surrogate"]
@@ -60,8 +60,6 @@ class Evidence:
         The posterior at the points.
     log_weights
         ln w (n,).
-    solves
-        Number of solves, those that a proposal was fitted to among them.
     """
 
     log_evidence: float
@@ -72,7 +70,6 @@ class Evidence:
     tail: float
     density: Density
     log_weights: FloatArray
-    solves: int
 
     @property
     def trusted(self) -> bool:
@@ -121,7 +118,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     quarter = samples // LEAST * SCRAMBLES
     mixture = Mixture.of(gaussian)
     first = _drawn(posterior, mixture, seed, 0, quarter, derivatives=True)
-    pilot = weighed(*first, "importance", "", quarter)
+    pilot = weighed(*first, "importance", "")
     misfit = np.abs(_from_gaussian(gaussian, pilot.density))
     even = pilot.effective / quarter
     share = f"the first {quarter} points are worth {pilot.effective:.0f}"
@@ -132,15 +129,15 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         return replace(whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why)
     if even >= EVEN and pilot.tail <= TRUSTED:
         whole = _continued(posterior, mixture, first, seed, quarter)
-        return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights", 4 * quarter)
+        return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights")
     try:
-        return _by_surrogate(posterior, gaussian, first[0], seed, quarter, f"{share}: uneven weights")
+        return _by_surrogate(posterior, mixture, first[0], gaussian, seed, quarter, f"{share}: uneven weights")
     except SolveError as error:
         whole = _continued(posterior, mixture, first, seed, quarter)
-        return weighed(whole.density, whole.log_weights, "importance", f"{share}; {error}", 4 * quarter)
+        return weighed(whole.density, whole.log_weights, "importance", f"{share}; {error}")
 
 
-def weighed(density: Density, log_weights: FloatArray, route: Route, why: str, solves: int) -> Evidence:
+def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -> Evidence:
     """Make an estimate of weights (n,) of which every eighth part, in order, is an independent replicate."""
     shift = log_weights.max()
     if not np.isfinite(shift):
@@ -152,7 +149,7 @@ def weighed(density: Density, log_weights: FloatArray, route: Route, why: str, s
     error = float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / total)
     effective = float(w.sum() ** 2 / (w**2).sum())
     log_evidence = float(shift + np.log(total))
-    return Evidence(log_evidence, error, route, why, effective, tail_shape(w), density, log_weights, solves)
+    return Evidence(log_evidence, error, route, why, effective, tail_shape(w), density, log_weights)
 
 
 def _drawn(
@@ -174,7 +171,7 @@ def _continued(
     replicate = np.concatenate([np.arange(n) // (n // SCRAMBLES) for n in (quarter, 3 * quarter)])
     order = np.argsort(replicate, kind="stable")
     density = Density.joined([first[0], rest[0]], order)
-    return weighed(density, np.concatenate([first[1], rest[1]])[order], "importance", "", 4 * quarter)
+    return weighed(density, np.concatenate([first[1], rest[1]])[order], "importance", "")
 
 
 def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
@@ -185,22 +182,24 @@ def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
 
 
 def _by_surrogate(
-    posterior: Posterior, gaussian: Laplace, first: Density, seed: int, quarter: int, why: str
+    posterior: Posterior, mixture: Mixture, first: Density, gaussian: Laplace, seed: int, quarter: int, why: str
 ) -> Evidence:
-    near = _near(posterior, gaussian, first, seed, quarter, derivatives=True)[0]
-    known = Density.joined([first, near])
-    density, log_over, error = _near(posterior, gaussian, known, seed + 100, 2 * quarter, derivatives=False)
-    found = weighed(density, density.log_likelihood - log_over, "surrogate", why, 4 * quarter)
-    return replace(found, error=float(np.hypot(found.error, error)))
-
-
-def _near(
-    posterior: Posterior, gaussian: Laplace, known: Density, seed: int, count: int, *, derivatives: bool
-) -> tuple[Density, FloatArray, float]:
-    """Solve at points of the posterior of a polynomial fitted to what is known; what likelihoods are divided by."""
-    cloud = sample(fit(posterior, known), gaussian, seed)
-    x, log_over = cloud.pick(seed, count)
-    return posterior.at(x, derivatives=derivatives), log_over, cloud.error
+    """Draw the other quarters each from the posterior of a polynomial that is fitted to those before."""
+    parts = [first]
+    over: list[Callable[[FloatArray], FloatArray]] = [mixture.log_over_prior]
+    errors = []
+    for k in range(1, QUARTERS):
+        cloud = sample(fit(posterior, Density.joined(parts)), gaussian, seed + 100 * k)
+        parts.append(posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1))
+        over.append(cloud.log_over_prior)
+        errors.append(cloud.error)
+    replicate = np.concatenate([np.arange(quarter) // (quarter // SCRAMBLES)] * QUARTERS)
+    density = Density.joined(parts, np.argsort(replicate, kind="stable"))
+    densities = np.array([log_over_prior(density.x) for log_over_prior in over])
+    top = densities.max(axis=0)
+    log_over = top + np.log(np.exp(densities - top).mean(axis=0))
+    found = weighed(density, density.log_likelihood - log_over, "surrogate", why)
+    return replace(found, error=float(np.hypot(found.error, np.sqrt(np.mean(np.square(errors))))))
 
 
 def tail_shape(weights: FloatArray) -> float:

@@ -206,19 +206,24 @@ class Mixture:
 class Cloud:
     """Many points with their weights in the posterior of a polynomial; every eighth part is a scramble of its own.
 
+    Nine of ten points that are picked from it are drawn by their weights w; one by √w, which reaches farther out.
+
     Attributes
     ----------
+    surrogate
+        The posterior of the polynomial.
+    mixture
+        What the points were drawn from.
     x
         Points (N, c).
     log_weights
         ln p(y | x) N(x; 0, I)/q(x), (N,), by the polynomial.
-    log_over_prior
-        ln q(x)/N(x; 0, I), (N,).
     """
 
+    surrogate: Posterior
+    mixture: Mixture
     x: FloatArray
     log_weights: FloatArray
-    log_over_prior: FloatArray
 
     @property
     def weights(self) -> FloatArray:
@@ -237,20 +242,11 @@ class Cloud:
         means = self.weights.reshape(SCRAMBLES, -1).mean(axis=1)
         return float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / means.mean())
 
-    def pick(self, seed: int, count: int) -> tuple[FloatArray, FloatArray]:
-        """Draw points (count, c) by their weights, in eight independent sweeps.
-
-        One in ten is drawn by the roots of the weights, which reach farther out.
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Points, and ln of the probability of each times N q/N(x; 0, I): what a likelihood is divided by.
-        """
-        w = self.weights
-        roots = np.sqrt(w)
-        chance = 0.9 * w + 0.1 * roots / roots.sum()
+    def pick(self, seed: int, count: int) -> FloatArray:
+        """Draw points (count, c), in eight independent sweeps."""
+        chance = np.exp(self._log_picked(self.log_weights)) / len(self.x)
         # Neighbours along the longest axis of the cloud stand beside each other, so that a sweep covers it evenly.
+        w = self.weights
         deviation = self.x - w @ self.x
         axis = np.linalg.eigh((deviation * w[:, None]).T @ deviation)[1][:, -1]
         order = np.argsort(deviation @ axis, kind="stable")
@@ -258,8 +254,19 @@ class Cloud:
         each = count // SCRAMBLES
         offsets = np.random.default_rng([seed, count]).random(SCRAMBLES)
         places = np.concatenate([(np.arange(each) + offset) / each for offset in offsets])
-        picked = order[np.minimum(np.searchsorted(ends, places * ends[-1]), len(w) - 1)]
-        return self.x[picked], np.log(chance[picked] * len(w)) + self.log_over_prior[picked]
+        return self.x[order[np.minimum(np.searchsorted(ends, places * ends[-1]), len(w) - 1)]]
+
+    def log_over_prior(self, x: FloatArray) -> FloatArray:
+        """Ln of the density of picked points at x (n, c) over that of the prior, (n,)."""
+        over = self.mixture.log_over_prior(x)
+        return over + self._log_picked(self.surrogate.at(x).log_likelihood - over)
+
+    def _log_picked(self, log_weights: FloatArray) -> FloatArray:
+        """Ln of the density of picked points over q, where ln w is known."""
+        top = self.log_weights.max()
+        mean, mean_root = (np.exp(power * (self.log_weights - top)).mean() for power in (1.0, 0.5))
+        parts = (0.9 * np.exp(log_weights - top) / mean, 0.1 * np.exp((log_weights - top) / 2) / mean_root)
+        return np.asarray(np.log(np.maximum(parts[0] + parts[1], 1e-300)))
 
 
 def sample(surrogate: Posterior, gaussian: Laplace, seed: int) -> Cloud:
@@ -284,7 +291,7 @@ def _cloud(surrogate: Posterior, mixture: Mixture, seed: int, count: int) -> Clo
     x = mixture.draw(cubes)
     over = mixture.log_over_prior(x)
     pieces = [surrogate.at(piece).log_likelihood for piece in np.array_split(x, max(1, count // 4096))]
-    return Cloud(x, np.concatenate(pieces) - over, over)
+    return Cloud(surrogate, mixture, x, np.concatenate(pieces) - over)
 
 
 def _mixture(surrogate: Posterior, cloud: Cloud, seed: int) -> Mixture:

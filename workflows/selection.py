@@ -69,6 +69,8 @@ class DataFile(Settings):
         "nominal" or "cauchy".
     where
         Rows that are kept: by column, the word that stands there.
+    between
+        Smallest and largest stretch or amount of shear that are kept.
     """
 
     file: str
@@ -82,6 +84,7 @@ class DataFile(Settings):
     unit: Annotated[float, Field(gt=0)] = 1.0
     stress: Literal["nominal", "cauchy"] = "nominal"
     where: dict[str, str] = Field(default={})
+    between: tuple[float, float] | None = None
 
     def read(self, folder: Path) -> dict[str, Any]:
         """Return the block `data` with the tests themselves.
@@ -111,6 +114,9 @@ class DataFile(Settings):
         for (line, _), row in zip(numbered[1:], table, strict=False):
             if any(row[column] != word for column, word in self.where.items()):
                 continue
+            at = _number(row[self.at], f"{path}, line {line}, {self.at}")
+            if self.between is not None and not self.between[0] <= at <= self.between[1]:
+                continue
             word = row[self.mode]
             if self.modes.get(word, word) not in MODES:
                 message = f"data: {path}, line {line}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
@@ -125,7 +131,7 @@ class DataFile(Settings):
                 if column is not None:
                     test.setdefault(key, []).append(unit * _number(row[column], f"{path}, line {line}, {column}"))
         if not tests:
-            message = f"data: {path}: no row is left, expected some where {self.where or 'there are any'}"
+            message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
             raise StudyError(message)
         return {
             "source": [line.lstrip("# ") for line in lines if line.startswith("#")],
