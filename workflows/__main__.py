@@ -83,7 +83,9 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
     init.add_argument(
-        "kind", metavar="KIND", help="monte-carlo, sensitivity-monte-carlo, quasi-monte-carlo or local-sensitivity"
+        "kind",
+        metavar="KIND",
+        help="monte-carlo, sensitivity-monte-carlo, quasi-monte-carlo, chaos, local-sensitivity or select",
     )
     check.set_defaults(command=_check)
     run.set_defaults(command=_run)

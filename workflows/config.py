@@ -261,7 +261,7 @@ def line(item: Any, place: str = "") -> str:
     for step in item["loc"]:
         if isinstance(step, int):
             place += f"[{step}]"
-        elif step not in _TAGS:
+        elif step not in _TAGS or place == "candidates":
             place += f".{step}" if place else step
     message = item["msg"]
     if item["type"] == "missing":
