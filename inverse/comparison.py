@@ -7,8 +7,8 @@ those that it would have if it were true: their squares Σr² ~ χ², and their 
 size of the noise was inferred.
 
 Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i) (A. Vehtari, A. Gelman, J. Gabry, Stat.
-Comput. 27 (2017) 1413–1432). Averaged predictions have the variance Σ P_k V_k within models and Σ P_k (μ_k − μ)² between
-them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
+Comput. 27 (2017) 1413–1432). Averaged predictions have the variance Σ P_k V_k within models and Σ P_k (μ_k − μ)²
+between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
 """
 
 from __future__ import annotations

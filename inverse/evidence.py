@@ -199,8 +199,8 @@ def _by_surrogate(
     top = densities.max(axis=0)
     log_over = top + np.log(np.exp(densities - top).mean(axis=0))
     found = weighed(density, density.log_likelihood - log_over, "surrogate", why)
-    # The sweeps share their polynomials: where their scatter is smaller than that of the weights, it is by chance. And a
-    # density that is wrong by a factor makes its share of the mixture wrong by that.
+    # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density that is
+    # wrong by a factor makes its share of the mixture wrong by that.
     scatter = max(found.error, np.sqrt(1 / found.effective - 1 / len(density.x)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))
 

@@ -274,7 +274,7 @@ class Cloud:
     def log_over_prior(self, x: FloatArray) -> FloatArray:
         """Ln of the density of picked points at x (n, c) over that of the prior, (n,)."""
         over = self.mixture.log_over_prior(x)
-        return over + self._log_picked(self.surrogate.at(x).log_likelihood - over)
+        return np.asarray(over + self._log_picked(self.surrogate.at(x).log_likelihood - over))
 
     def _log_picked(self, log_weights: FloatArray) -> FloatArray:
         """Ln of the density of picked points over q, where ln w is known."""

@@ -98,8 +98,8 @@ _SELECTION = """\
 [data]
 # Tests, here in full. Or a table beside this file, whose lines with # are kept as its source:
 # file = "table.csv"; names of its columns: mode, at, measured and, if there are any, across, sigma, group; unit in Pa;
-# modes = { word = "mode" } translates, where = { column = "word" } and between = [1, 4] choose rows. Groups have constants
-# of their own.
+# modes = { word = "mode" } translates, where = { column = "word" } and between = [1, 4] choose rows. Each group has
+# constants of its own.
 # mode = "uniaxial" | "equibiaxial" | "biaxial" | "pure-shear" | "simple-shear", stress = "nominal" | "cauchy"
 tests = [
     { mode = "uniaxial", at = [0.9, 1.1, 1.2, 1.3], measured = [-330, 280, 520, 750] },
