@@ -34,7 +34,7 @@ from uq.sampling import sobol_points
 
 TRUSTED = 0.7  # k̂ up to which weights are worth what they say
 EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
-ALIKE = 0.9  # effective share from which on weights are equal for all that matters
+ALIKE = 0.8  # effective share from which on weights are equal for all that matters
 QUARTERS = 4
 LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
 ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding

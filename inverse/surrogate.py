@@ -269,7 +269,8 @@ class Cloud:
         each = count // SCRAMBLES
         offsets = np.random.default_rng([seed, count]).random(SCRAMBLES)
         places = np.concatenate([(np.arange(each) + offset) / each for offset in offsets])
-        return self.x[order[np.minimum(np.searchsorted(ends, places * ends[-1]), len(w) - 1)]]
+        picked = order[np.minimum(np.searchsorted(ends, places * ends[-1]), len(w) - 1)]
+        return np.asarray(self.x[picked])
 
     def log_over_prior(self, x: FloatArray) -> FloatArray:
         """Ln of the density of picked points at x (n, c) over that of the prior, (n,)."""
