@@ -23,6 +23,7 @@ from annotated_types import Ge, Gt, Unit
 Number = Annotated[Any, Unit("Pa")]
 NonNegative = Annotated[Any, Ge(0), Unit("Pa")]
 Positive = Annotated[Any, Gt(0), Unit("Pa")]
+Ratio = Annotated[Any, Unit("1")]
 PositiveRatio = Annotated[Any, Gt(0), Unit("1")]
 
 
@@ -103,6 +104,34 @@ def blatz_ko(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive) -> Any:
     return mu / 2 * (I2 / J**2 + 2 * J - 5)
 
 
+def ogden(
+    ops: Any,
+    l1: Any,
+    l2: Any,
+    l3: Any,
+    J: Any,
+    *,
+    mu1: Number,
+    alpha1: Ratio,
+    mu2: Number,
+    alpha2: Ratio,
+    mu3: Number,
+    alpha3: Ratio,
+    D1: Positive,
+) -> Any:
+    """Ogden with three terms: W = Σ_k μ_k/α_k (λ̄₁^α_k + λ̄₂^α_k + λ̄₃^α_k − 3) + D1(J−1)².
+
+    λ̄_i = J^(−1/3) λ_i; mu1, mu2, mu3, D1 in Pa; the exponents are dimensionless and not zero, and μ_k α_k > 0 for each
+    term makes the energy convex. Small strain: μ = ½ Σ μ_k α_k, κ = 2 D1.
+    Source: R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565–584.
+    """
+    scale = J ** (-1 / 3)
+    total = D1 * (J - 1) ** 2
+    for mu, alpha in ((mu1, alpha1), (mu2, alpha2), (mu3, alpha3)):
+        total += mu / alpha * sum((scale * stretch) ** alpha - 1 for stretch in (l1, l2, l3))
+    return total
+
+
 Energy = Callable[..., Any]
 
 MATERIALS: dict[str, Energy] = {
@@ -115,6 +144,9 @@ MATERIALS: dict[str, Energy] = {
     "saint-venant-kirchhoff": saint_venant_kirchhoff,
     "blatz-ko": blatz_ko,
 }
+
+OF_STRETCHES: dict[str, Energy] = {"ogden": ogden}
+"""Energies of the principal stretches l1, l2, l3 and J in place of the invariants: for material-point tests."""
 
 
 _COMPLEX = SimpleNamespace(ln=cmath.log, exp=cmath.exp, sqrt=cmath.sqrt)

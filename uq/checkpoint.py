@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ class Checkpoint:
     def save(self, key: str, block: Evaluations) -> None:
         """Write a finished block and rename it into place."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        _write(self._path(key), block)
+        _write(self._path(key), {"/": block})
 
     def load(self, key: str) -> Evaluations:
         """Read a finished block."""
@@ -66,8 +67,8 @@ class Checkpoint:
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.h5"
 
-    def consolidate(self, evaluations: Evaluations) -> None:
-        """Write all evaluations as `evaluations.h5`; the blocks stay until `clear`."""
+    def consolidate(self, evaluations: Mapping[str, Evaluations]) -> None:
+        """Write all evaluations as `evaluations.h5`, each under its name; the blocks stay until `clear`."""
         _write(self._directory / "evaluations.h5", evaluations)
 
     def clear(self) -> None:
@@ -95,30 +96,33 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(repr(value).encode())
 
 
-def _write(path: Path, block: Evaluations) -> None:
+def _write(path: Path, blocks: Mapping[str, Evaluations]) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     with h5py.File(partial, "w") as file:
-        file["points"] = block.points
-        file["outputs"] = block.outputs
-        file["seconds"] = block.seconds
-        file["work"] = block.work
-        file["work"].attrs["columns"] = list(WORK)
-        file["residuals"] = block.residuals
-        file["converged"] = block.converged
-        file["failures"] = json.dumps([asdict(failure) for failure in block.failures])
-        if block.tangents is not None:
-            file["tangents"] = block.tangents
-        if block.fields.size:
-            file["fields"] = block.fields
+        for name, block in blocks.items():
+            group = file.require_group(name)
+            group["points"] = block.points
+            group["outputs"] = block.outputs
+            group["seconds"] = block.seconds
+            group["work"] = block.work
+            group["work"].attrs["columns"] = list(WORK)
+            group["residuals"] = block.residuals
+            group["converged"] = block.converged
+            group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
+            if block.tangents is not None:
+                group["tangents"] = block.tangents
+            if block.fields.size:
+                group["fields"] = block.fields
         file.flush()
     with partial.open("rb") as written:
         os.fsync(written.fileno())
     partial.replace(path)
 
 
-def load(path: Path) -> Evaluations:
-    """Read evaluations, such as those of an `evaluations.h5`."""
-    with h5py.File(path, "r") as file:
+def load(path: Path, name: str = "/") -> Evaluations:
+    """Read evaluations, such as those of an `evaluations.h5`, which has several under their names if there were."""
+    with h5py.File(path, "r") as whole:
+        file = whole[name]
         failures = tuple(
             Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))
             for f in json.loads(file["failures"][()])

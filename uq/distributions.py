@@ -14,6 +14,7 @@ from forward.model import FloatArray
 from forward.settings import Settings
 
 PositiveFloat = Annotated[float, Gt(0)]
+TAIL = 1e-16  # nearest to 0 and 1 that a probability is taken to a quantile
 
 
 class _Distribution(Settings):
@@ -56,6 +57,16 @@ class _Distribution(Settings):
         p = np.asarray(probability, dtype=float)
         return np.asarray(self.dist.inv(p.ravel()), dtype=float).reshape(p.shape)
 
+    def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map standard normal values z, of any shape, to values of the parameter F⁻¹(Φ(z)), with the derivatives."""
+        from scipy.special import ndtr
+
+        z = np.asarray(z, dtype=float)
+        value = self.quantile(np.clip(ndtr(z), TAIL, 1 - TAIL))
+        density = np.asarray(self.dist.pdf(value.ravel()), dtype=float).reshape(z.shape)
+        bell = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
+        return value, np.where(density > 0, bell / np.where(density > 0, density, 1.0), 0.0)
+
     def at(self, probability: float) -> float:
         """Quantile of one probability."""
         return float(self.quantile(np.array([probability]))[0])
@@ -86,6 +97,12 @@ class Uniform(_Bounded):
     def _chaospy(self, cp: Any) -> Any:
         return cp.Uniform(self.lower, self.upper)
 
+    def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every distribution, in closed form."""
+        share, slope = _unit(z)
+        width = self.upper - self.lower
+        return self.lower + width * share, width * slope
+
 
 class LogUniform(_Bounded):
     """Logarithm uniform on [ln lower, ln upper], lower > 0."""
@@ -95,6 +112,13 @@ class LogUniform(_Bounded):
 
     def _chaospy(self, cp: Any) -> Any:
         return cp.LogUniform(np.log(self.lower), np.log(self.upper))
+
+    def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every distribution, in closed form."""
+        share, slope = _unit(z)
+        width = np.log(self.upper / self.lower)
+        value = self.lower * np.exp(width * share)
+        return value, value * width * slope
 
 
 class Triangular(_Bounded):
@@ -146,6 +170,11 @@ class Normal(_Distribution):
     def _chaospy(self, cp: Any) -> Any:
         return cp.Normal(self.mean, self.std)
 
+    def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every distribution, in closed form."""
+        z = np.asarray(z, dtype=float)
+        return self.mean + self.std * z, np.full(z.shape, self.std)
+
 
 class LogNormal(_Distribution):
     """Log-normal, given by the `mean` and the standard deviation `std` of the parameter itself."""
@@ -154,9 +183,20 @@ class LogNormal(_Distribution):
     mean: PositiveFloat
     std: PositiveFloat
 
-    def _chaospy(self, cp: Any) -> Any:
+    @property
+    def _of_logarithm(self) -> tuple[float, float]:
+        """Mean and standard deviation of the logarithm."""
         variance = np.log1p((self.std / self.mean) ** 2)
-        return cp.LogNormal(np.log(self.mean) - variance / 2, np.sqrt(variance))
+        return float(np.log(self.mean) - variance / 2), float(np.sqrt(variance))
+
+    def _chaospy(self, cp: Any) -> Any:
+        return cp.LogNormal(*self._of_logarithm)
+
+    def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every distribution, in closed form."""
+        mean, std = self._of_logarithm
+        value = np.exp(mean + std * np.asarray(z, dtype=float))
+        return value, std * value
 
 
 class Gamma(_Distribution):
@@ -175,3 +215,11 @@ Distribution = Annotated[
     Uniform | LogUniform | Triangular | Beta | TruncatedNormal | Normal | LogNormal | Gamma,
     Field(discriminator="kind"),
 ]
+
+
+def _unit(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Φ(z) and its derivative."""
+    from scipy.special import ndtr
+
+    z = np.asarray(z, dtype=float)
+    return np.asarray(ndtr(z)), np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)

@@ -96,15 +96,14 @@ class Inputs:
         marginals = list(self.marginals.values())
         for a, b, rho in self.correlations:
             i, j = self.names.index(a), self.names.index(b)
-            x = _from_normal(marginals[i], nodes) - self.mean[i]
+            x = marginals[i].from_normal(nodes)[0] - self.mean[i]
             second = rho * nodes[:, None] + np.sqrt(1 - rho**2) * nodes[None, :]
-            y = _from_normal(marginals[j], second) - self.mean[j]
+            y = marginals[j].from_normal(second)[0] - self.mean[j]
             covariance[i, j] = covariance[j, i] = float(np.einsum("i,j,i,ij->", weights, weights, x, y))
         return covariance
 
     def points(self, uniforms: FloatArray) -> FloatArray:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
-        marginals = self.marginals.values()
         if not self.correlations:
             points = np.empty_like(uniforms)
             for marginal, columns in self._columns.items():  # many parameters have few distributions
@@ -112,8 +111,20 @@ class Inputs:
             return points
         from scipy.special import ndtri
 
-        normals = ndtri(uniforms) @ np.linalg.cholesky(self._copula).T
-        return np.column_stack([_from_normal(m, z) for m, z in zip(marginals, normals.T, strict=True)])
+        return self.from_normals(ndtri(uniforms))[0]
+
+    def from_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map independent standard normal coordinates x (n, d) to the parameters ω (n, d).
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            ω, and the derivatives ∂ω_i/∂x_j (n, d, d).
+        """
+        factor = np.linalg.cholesky(self._copula)
+        columns = zip(self.marginals.values(), (normals @ factor.T).T, strict=True)
+        values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
+        return np.column_stack(values), np.column_stack(slopes)[:, :, None] * factor
 
 
 @runtime_checkable
@@ -122,9 +133,3 @@ class Restricted(Protocol):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters do not allow it, or nothing."""
-
-
-def _from_normal(marginal: Distribution, normals: FloatArray) -> FloatArray:
-    from scipy.special import ndtr
-
-    return marginal.quantile(np.clip(ndtr(normals), 1e-16, 1 - 1e-16))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -20,6 +20,9 @@ from uq.linearisation import LocalSensitivity
 from uq.multilevel import MultilevelMonteCarlo
 from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
+
+if TYPE_CHECKING:
+    from workflows.selection import Selection
 
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
@@ -184,7 +187,7 @@ class Study(Settings):
                 yield ("method", "reference", "values"), message, list(given)
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Selection:
     """Check a document and make a study of it.
 
     Parameters
@@ -193,6 +196,8 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
         The blocks of the study, as read from TOML.
     overrides
         Assignments such as ``method.samples=512`` that come on top; values are TOML, or else plain text.
+    folder
+        Where tables of data are that it names.
 
     Raises
     ------
@@ -203,12 +208,16 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = ()) -> Study:
     for assignment in overrides:
         _override(blocks, assignment)
     try:
+        if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
+            from workflows.selection import Selection, expanded
+
+            return Selection.model_validate(expanded(blocks, folder))
         return Study.model_validate(blocks)
     except ValidationError as error:
-        raise StudyError(*dict.fromkeys(_line(item) for item in error.errors(include_url=False))) from None
+        raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study:
+def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -221,15 +230,15 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study:
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
         raise StudyError(message) from None
-    return parse(document, overrides)
+    return parse(document, overrides, path.parent)
 
 
-def document(study: Study) -> dict[str, Any]:
+def document(study: Study | Selection) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study) -> str:
+def dump(study: Study | Selection) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 
@@ -306,13 +315,12 @@ def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     raise StudyError(message)
 
 
-def _line(item: Any) -> str:
-    """Say one mistake: place, what was given, what was expected."""
-    place = ""
+def line(item: Any, place: str = "") -> str:
+    """Say one mistake in a block at a place: where, what was given, what was expected."""
     for step in item["loc"]:
         if isinstance(step, int):
             place += f"[{step}]"
-        elif step not in _TAGS:
+        elif step not in _TAGS or place == "candidates":
             place += f".{step}" if place else step
     message = item["msg"]
     if item["type"] == "missing":

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
+
+if TYPE_CHECKING:
+    from workflows.selection import Selection
 
 
 def bytes_per_model(unknowns: int) -> float:
@@ -12,8 +17,14 @@ def bytes_per_model(unknowns: int) -> float:
     return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
 
 
-def plan(study: Study, groups: int = 1) -> list[str]:
+SECONDS_PER_STRESS = 4e-4  # a material point with its derivatives
+SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
+
+
+def plan(study: Study | Selection, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
+    if not isinstance(study, Study):
+        return _comparison(study)
     method, body = study.method, study.model.body
     textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
@@ -52,6 +63,22 @@ def plan(study: Study, groups: int = 1) -> list[str]:
             " few quadrature points see the transition, and derivatives by place and size are rough"
             for inclusion in narrow
         ),
+    ]
+
+
+def _comparison(study: Selection) -> list[str]:
+    method, tests = study.method, study.data.tests
+    evidences = len(study.pairs) * method.variants
+    seconds = SECONDS_PER_STRESS * study.planned + SECONDS_PER_SURROGATE * evidences
+    check = " and nested sampling, which takes minutes" if method.check else ""
+    groups = f" in {len(study.data.groups)} groups" if len(study.data.groups) > 1 else ""
+    return [
+        f"method      {method.kind}",
+        f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
+        f"data        {sum(len(test.at) for test in tests)} stresses of {len(tests)} tests{groups}",
+        f"evidences   {evidences}{check}",
+        f"solves      about {study.planned:,}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
     ]
 
 

@@ -28,6 +28,7 @@ SHARES = 8  # parameters that have a colour of their own in stacked bars
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
 METHOD_COLOURS = ("#8a97a6", "#0b6bb8", "#d1622b", "#2a8c4a", "#8a4fbf", "#c23b6b", "#b08900", "#1d9aa8", "#5b4636")
 LOW, HIGH = "#0b6bb8", "#d1622b"
+COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
 
 
 def running_estimates(
@@ -62,7 +63,7 @@ def running_estimates(
 
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
-    ax = ax or _axes()
+    ax = ax or axes()
     series = _series(dataset, output)
     for label, colour, counts, mean, error in series:
         half = half_width(dataset) * error
@@ -78,7 +79,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
     """Draw the standard error of the mean of an output against the number of samples, plain and controlled."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-    ax = ax or _axes()
+    ax = ax or axes()
     series = _series(dataset, output)
     for label, colour, counts, _, error in series:
         ax.plot(counts, error, color=colour, label=label)
@@ -96,7 +97,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the density of an output, of its expansion or else of its samples, with its mean and quantiles."""
-    ax = ax or _axes()
+    ax = ax or axes()
     if "density" in dataset:
         density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
         ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
@@ -129,7 +130,7 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw how much an output changes, to first order, with each parameter one standard deviation off its mean."""
     effects = dataset["derivative_per_std"].sel(output=output).to_numpy()
     order = np.argsort(np.abs(effects))[-BARS:]
-    ax = ax or _axes(height=1.3 + 0.42 * len(order))
+    ax = ax or axes(height=1.3 + 0.42 * len(order))
     for sign, colour, label in ((-1, LOW, "one standard deviation below its mean"), (1, HIGH, "above")):
         ax.barh(np.arange(len(order)), sign * effects[order], height=0.6, color=colour, label=label)
     ax.axvline(0, color=DARK, linewidth=0.8)
@@ -145,7 +146,7 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
     """Draw the Sobol' indices of an output with 95 % confidence intervals, the parameter with the largest on top."""
     totals = dataset["sobol_total"].sel(output=output).to_numpy()
     order = np.argsort(totals)[-BARS:]
-    ax = ax or _axes(height=1.3 + 0.5 * len(order))
+    ax = ax or axes(height=1.3 + 0.5 * len(order))
     for which, colour, side in (("first", CONTROLLED, 0.19), ("total", HIGH, -0.19)):
         values, errors = (dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error"))
         label = "first order" if which == "first" else "total"
@@ -172,7 +173,7 @@ def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
         names.append("displacement field")
     order = np.argsort(-first.mean(axis=0))
     places = np.arange(len(names))[::-1]
-    ax = ax or _axes(height=1.7 + 0.42 * len(names))
+    ax = ax or axes(height=1.7 + 0.42 * len(names))
     left = np.zeros(len(names))
     for rank, i in enumerate(order[:SHARES]):
         width = np.clip(first[:, i], 0, 1)
@@ -189,7 +190,7 @@ def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
 
 def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the total Sobol' indices of an output against the number of samples, with 95 % confidence bands."""
-    ax = ax or _axes()
+    ax = ax or axes()
     counts = dataset["index_round"].to_numpy()
     totals = dataset["sobol_total"].sel(output=output).to_numpy()
     for rank, i in enumerate(np.argsort(-totals)[:SHARES]):
@@ -210,7 +211,7 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
 
 def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw an output against the leading direction of its active subspace, sample by sample."""
-    ax = ax or _axes()
+    ax = ax or axes()
     ok = dataset["ok"].to_numpy()
     steps = (dataset["points"] - dataset["parameter_mean"]) / dataset["parameter_std"]
     direction = dataset["active_direction"].sel(output=output).to_numpy()
@@ -227,7 +228,7 @@ def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the eigenvalues of the active subspace of an output with their 95 % ranges."""
     from matplotlib.ticker import MaxNLocator
 
-    ax = ax or _axes()
+    ax = ax or axes()
     of_output = dataset.sel(output=output)
     values, lower, upper = (of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper"))
     reach = np.abs([np.minimum(lower - values, 0), np.maximum(upper - values, 0)])
@@ -243,7 +244,7 @@ def spectrum(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 def levels(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw the residuals of the samples and the change of the moments, level by level."""
-    ax = ax or _axes()
+    ax = ax or axes()
     places = dataset["level"].to_numpy()
     for name, label, colour, dash in (
         ("level_residual", "largest residual", CONTROLLED, "-"),
@@ -278,7 +279,7 @@ def comparison(
         Where to draw.
     """
     shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
-    ax = ax or _axes(height=1.2 + 0.42 * len(shown))
+    ax = ax or axes(height=1.2 + 0.42 * len(shown))
     places = np.arange(len(shown))[::-1]
     values = [float(d[estimated]) for d in shown.values()]
     errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
@@ -341,7 +342,7 @@ def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Ax
 
 def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the predicted time of sampling against the error of the mean, over meshes and on the finest mesh alone."""
-    ax = ax or _axes()
+    ax = ax or axes()
     found, (variances, costs) = _levels(dataset, output), _sampling(dataset, output)
     finest = float(dataset["mesh_cost"][-1])
     plain, ratio = found["difference_variance"], found["difference_variance_ratio"]
@@ -377,7 +378,7 @@ def _sampling(dataset: xr.Dataset, output: str) -> tuple[NDArray[np.float64], ND
 
 
 def _level_axis(dataset: xr.Dataset, ax: Axes | None) -> Axes:
-    ax = ax or _axes()
+    ax = ax or axes()
     ax.set_xticks(dataset["level"].to_numpy())
     ax.set_xlabel("level (0 is the coarsest mesh)")
     return ax
@@ -419,7 +420,7 @@ def errors(
     ax
         Where to draw.
     """
-    ax = ax or _axes(height=4.2, width=8.6)
+    ax = ax or axes(height=4.2, width=8.6)
     of_output = dataset.sel(output=output)
     costs, rmse, rows = (of_output[name].to_numpy() for name in (against, f"{estimated}_rmse", "row_method"))
     resolved, scatter = (of_output[f"{estimated}_{name}"].to_numpy() for name in ("resolved", "rmse_error"))
@@ -479,7 +480,7 @@ def png(ax: Axes) -> bytes:
     return file.getvalue()
 
 
-def _axes(height: float = 3.2, width: float = 5.4) -> Axes:
+def axes(height: float = 3.2, width: float = 5.4) -> Axes:
     """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workflows import bodies, plots, tables
-from workflows.config import parse
+from workflows.config import Study, StudyError, parse
 from workflows.results import read_dataset, read_summary, write_text
 from workflows.tables import Results, Table
 from workflows.words import model_in_words, number
@@ -21,6 +21,8 @@ from workflows.words import model_in_words, number
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
+
+    from workflows.selection import Selection
 
 LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
@@ -45,7 +47,11 @@ def write_report(directory: Path) -> Path:
         If the directory holds no results.
     """
     path = directory / "report.html"
-    write_text(path, _render("report.html.jinja", _context(_read(directory))))
+    dataset, summary, study = _read(directory)
+    if isinstance(study, Study):
+        write_text(path, _render("report.html.jinja", _context(Results(dataset, summary, study))))
+    else:
+        write_text(path, _render("selection.html.jinja", _comparison(dataset, summary, study)))
     return path
 
 
@@ -58,7 +64,13 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
         If one of the directories holds no results.
     """
     names = _names(directories)
-    studies = {name: _read(directory) for name, directory in zip(names, directories, strict=True)}
+    studies = {}
+    for name, directory in zip(names, directories, strict=True):
+        dataset, summary, study = _read(directory)
+        if not isinstance(study, Study):
+            message = f"{directory}: compares models, expected studies that estimate outputs to lay side by side"
+            raise StudyError(message)
+        studies[name] = Results(dataset, summary, study)
     outputs = dict.fromkeys(output for results in studies.values() for output in results.outputs)
     context = {
         "count": len(studies),
@@ -69,13 +81,13 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     return out
 
 
-def _read(directory: Path) -> Results:
+def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], Study | Selection]:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
         message = f"{directory}: holds no summary.json, expected the directory of a finished study"
         raise FileNotFoundError(message)
-    return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"])))
+    return dataset, summary, parse(tomllib.loads(dataset.attrs["config"]))
 
 
 def _render(template: str, context: dict[str, Any]) -> str:
@@ -129,6 +141,25 @@ def _context(results: Results) -> dict[str, Any]:
         "times": list(tables.times(summary)),
         "provenance": list(tables.provenance(summary)),
         "config": dataset.attrs["config"],
+    }
+
+
+def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: Selection) -> dict[str, Any]:
+    """Everything that the template of a comparison of models shows."""
+    from workflows import selection_report
+
+    return {
+        "title": f"Study {summary['study']}",
+        "method": str(type(study.method).__doc__).partition("\n")[0],
+        "amount": f"{tables.solves(summary)}, {summary['failed']:,} failed",
+        "failed_line": tables.failures_line(summary) if summary["failures"] else "none failed",
+        "times": list(tables.times(summary)),
+        "provenance": list(tables.provenance(summary)),
+        "config": dataset.attrs["config"],
+        "charts": [
+            (heading, [_picture(*drawn) for drawn in shown]) for heading, shown in selection_report.pictures(dataset)
+        ],
+        **selection_report.context(dataset, study),
     }
 
 

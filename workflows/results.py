@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
+from workflows.verdict import findings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -70,7 +71,16 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
-    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`."""
+    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
+    if "log_evidence" in dataset:
+        shown = ("log_evidence", "log_evidence_error", "probability")
+        return {
+            "models": {
+                str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
+                for model in dataset.model.values
+            },
+            "findings": findings(dataset),
+        }
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
     if "mean" in dataset:

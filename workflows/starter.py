@@ -148,6 +148,47 @@ kind = "local-sensitivity"
 }
 
 
+_SELECTION = """\
+# A comparison of material models with tissuq. Check it with `tissuq check FILE`, run it with `tissuq run FILE`.
+
+[data]
+# Tests, here in full. Or a table beside this file, whose lines with # are kept as its source:
+# file = "table.csv"; names of its columns: mode, at, measured and, if there are any, across, sigma, group; unit in Pa;
+# modes = { word = "mode" } translates, where = { column = "word" } and between = [1, 4] choose rows. Each group has
+# constants of its own.
+# mode = "uniaxial" | "equibiaxial" | "biaxial" | "pure-shear" | "simple-shear", stress = "nominal" | "cauchy"
+tests = [
+    { mode = "uniaxial", at = [0.9, 1.1, 1.2, 1.3], measured = [-330, 280, 520, 750] },
+    { mode = "simple-shear", at = [0.1, 0.2, 0.3], measured = [99, 205, 298] },
+]
+
+# A candidate: constants that do not vary stand in material, priors of the others in parameters. Without D1, an energy
+# that has it is that of an incompressible material. Energies as of other studies, and "ogden".
+[candidates.neo-hookean]
+material = { kind = "neo-hookean" }
+parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
+
+[candidates.mooney-rivlin]
+material = { kind = "mooney-rivlin" }
+parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
+parameters.C2 = { kind = "uniform", lower = 0, upper = 500 }
+# weight = 1          # its probability before the data, up to a common factor
+
+[method]
+"""
+
+_METHODS["select"] = """\
+kind = "select"
+samples = 256         # solves for each evidence
+seed = 1
+# Standard deviation of the errors: max(relative × stress, absolute), or that of the data; times a factor, if unknown.
+noise = { relative = 0.05, absolute = 10 }  # factor = { kind = "log-uniform", lower = 0.2, upper = 20 }
+other_noises = { "twice the errors" = { relative = 0.1, absolute = 20 } }
+subsets = { "tension alone" = ["uniaxial"] }
+# check = "dynesty"   # nested sampling beside it, for minutes
+"""
+
+
 def starter(kind: str) -> str:
     """Return a commented study that runs as it is.
 
@@ -159,4 +200,4 @@ def starter(kind: str) -> str:
     if kind not in _METHODS:
         message = f"init {kind}: unknown kind of study; {nearest(kind, tuple(_METHODS))}"
         raise StudyError(message)
-    return _MODEL + _METHODS[kind]
+    return (_SELECTION if kind == "select" else _MODEL) + _METHODS[kind]

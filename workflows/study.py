@@ -8,9 +8,12 @@ import platform
 import sys
 import time
 import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,16 +35,18 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.finite_element import HyperelasticModel
-    from forward.model import FloatArray
+    from forward.model import FloatArray, ForwardModel
     from uq.checkpoint import Checkpoint
+    from uq.ensemble import Ensemble
     from uq.inputs import Inputs
+    from workflows.selection import Selection
 
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 REALISATIONS = 3  # of random fields, to look at
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
-def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int:
+def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = False) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
     Parameters
@@ -92,31 +97,20 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
     from uq.ensemble import Ensemble
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
-    inputs = study.inputs
-    model = study.model.build(ensemble.group, inputs.names)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
-    recorders: list[Recorder] = []
-    # Rank 0 may leave the next line by an exception: nothing that needs the other ranks may follow it.
-    cells, kind = model.layout.cells()
-    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
-
-    def task(evaluate: Evaluate) -> xr.Dataset:
-        recorders.append(Recorder(evaluate))
-        return study.method.run(inputs, recorders[0])
-
-    others = [partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]]
-    dataset = ensemble.run(model, task, others=others, checkpoint=checkpoint, progress=progress)
+    job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study)
+    kept = checkpoint if job.costly else None
+    dataset = ensemble.run(job.model, job.task, others=job.others, checkpoint=kept, progress=progress)
     if dataset is None:
         return DONE
     progress.close()
-    dataset = label(dataset, _units(study), model.layout.coordinates, cells, kind)
-    dataset = with_random_fields(dataset, factors, model.variance_kept)
+    dataset = job.labelled(dataset)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
-    evaluations = merge(recorders[0].log)
+    evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
-    if len(study.meshes) > 1:
-        summary["meshes"] = _meshes(study, recorders[0])
+    if isinstance(study, Study) and len(study.meshes) > 1:
+        summary["meshes"] = _meshes(study, job.recorders["/"])
     _leave(directory, dataset, evaluations, summary, checkpoint)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
@@ -124,7 +118,11 @@ def run(study: Study, name: str, directory: Path, *, quiet: bool = False) -> int
 
 
 def _leave(
-    directory: Path, dataset: xr.Dataset, evaluations: Evaluations, summary: dict[str, Any], checkpoint: Checkpoint
+    directory: Path,
+    dataset: xr.Dataset,
+    evaluations: dict[str, Evaluations],
+    summary: dict[str, Any],
+    checkpoint: Checkpoint,
 ) -> None:
     """Write all results, in an order that a kill cannot spoil."""
     write_dataset(directory / "results.nc", dataset)
@@ -142,11 +140,81 @@ def _report(directory: Path) -> None:
     write_report(directory)
 
 
-def _identity(study: Study) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Job:
+    """What the ranks do for a study.
+
+    Attributes
+    ----------
+    model, others
+        Models number 0, and 1, 2, …
+    task
+        Runs the method on rank 0.
+    recorders
+        What was evaluated, by the name that it is kept under.
+    labelled
+        Adds to the results what the method does not know.
+    costly
+        Whether solves are worth a file: where they are not, an interrupted study begins again.
+    """
+
+    model: ForwardModel
+    others: list[Callable[[], ForwardModel]]
+    task: Callable[[Evaluate], xr.Dataset]
+    recorders: dict[str, Recorder]
+    labelled: Callable[[xr.Dataset], xr.Dataset]
+    costly: bool = True
+
+
+def _sampling(study: Study, ensemble: Ensemble) -> _Job:
+    """One model, and others that the method may want, at the points of a method; collective over the group."""
+    inputs = study.inputs
+    model = study.model.build(ensemble.group, inputs.names)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        return study.method.run(inputs, recorders["/"])
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = label(found, _units(study), model.layout.coordinates, cells, kind)
+        return with_random_fields(found, factors, model.variance_kept)
+
+    others: list[Callable[[], ForwardModel]] = [
+        partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]
+    ]
+    return _Job(model, others, task, recorders, labelled)
+
+
+def _selection(study: Selection) -> _Job:
+    """The candidates, each for each group of data."""
+    from uq.evaluate import SerialEvaluate
+
+    pairs = study.pairs
+    makers = [partial(study.build, *pair) for pair in pairs]
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        def recorded(name: str, group: str) -> Evaluate:
+            recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
+            return recorders[f"{name}/{group}"]
+
+        # What nested sampling solves is too much, and too cheap, to keep.
+        return study.method.run(
+            study.models, study.groups, recorded, lambda name, group: SerialEvaluate(study.build(name, group))
+        )
+
+    return _Job(makers[0](), list(makers[1:]), task, recorders, lambda found: found, costly=False)
+
+
+def _identity(study: Study | Selection) -> dict[str, Any]:
     return {key: value for key, value in document(study).items() if key != "parallel"}
 
 
-def _prepare(study: Study, directory: Path, ranks: int) -> int | None:
+def _prepare(study: Study | Selection, directory: Path, ranks: int) -> int | None:
     """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
     share = study.parallel.ranks_per_model
     if ranks % share:
@@ -212,29 +280,43 @@ def _version() -> str:
 
 
 def _summary(
-    study: Study, name: str, dataset: xr.Dataset, evaluations: Evaluations, ranks: int, groups: int, wall: float
+    study: Study | Selection,
+    name: str,
+    dataset: xr.Dataset,
+    evaluations: dict[str, Evaluations],
+    ranks: int,
+    groups: int,
+    wall: float,
 ) -> dict[str, Any]:
     from forward.model import WORK
 
-    failed = len(evaluations.failures)
+    every = evaluations.values()
+    failed = sum(len(found.failures) for found in every)
+    names = {label: _parameters(study, label) for label in evaluations}
     return {
         "study": name,
         "method": study.method.kind,
         "status": "partial" if failed else "complete",
-        "stopped": dataset.attrs.get("stopped", "one linearisation"),
+        "stopped": dataset.attrs.get(
+            "stopped", "one linearisation" if isinstance(study, Study) else "all evidences found"
+        ),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
-        "evaluations": len(evaluations.points),
+        "evaluations": sum(len(found.points) for found in every),
         "failed": failed,
         "failures": [
-            {
-                "parameters": dict(zip(dataset.parameter.values.tolist(), f.parameters, strict=True)),
-                "reason": f.reason,
-            }
-            for f in evaluations.failures[:LISTED]
+            {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
+            for label, point, reason in islice(
+                (
+                    (label, dict(zip(names[label], f.parameters, strict=True)), f.reason)
+                    for label, found in evaluations.items()
+                    for f in found.failures
+                ),
+                LISTED,
+            )
         ],
         "wall_seconds": wall,
-        "cpu_seconds": float(evaluations.seconds.sum()) * study.parallel.ranks_per_model,
-        "work": dict(zip(WORK, evaluations.work.sum(axis=0).tolist(), strict=True)),
+        "cpu_seconds": float(sum(found.seconds.sum() for found in every)) * study.parallel.ranks_per_model,
+        "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
         **summarise(dataset),
         "provenance": {
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -257,6 +339,13 @@ def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
         solves = sum(len(part.points) for part in parts)
         found.append({"unknowns": study.meshes[number].unknowns, "solves": solves, "cpu_seconds": seconds})
     return found
+
+
+def _parameters(study: Study | Selection, label: str) -> tuple[str, ...]:
+    """Names of the parameters of a model by the name that its evaluations are kept under."""
+    if isinstance(study, Study):
+        return study.inputs.names
+    return tuple(study.candidates[label.partition("/")[0]].parameters)
 
 
 def _versions() -> dict[str, str]:
@@ -285,7 +374,12 @@ def _commit() -> str | None:
 
 
 def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    lines = []
+    lines = [
+        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
+        f"probability {found['probability']:.3g}"
+        for model, found in summary.get("models", {}).items()
+    ]
+    lines += summary.get("findings", [])
     for output, values in summary.get("outputs", {}).items():
         unit = dataset.unit.sel(output=output).item()
         lines.append(

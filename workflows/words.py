@@ -9,7 +9,7 @@ from typing import Any, assert_never
 from forward.fields import RandomField
 from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
-from forward.materials import MATERIALS, units
+from forward.materials import MATERIALS, OF_STRETCHES, units
 from forward.outputs import Output
 from workflows.config import Study
 
@@ -61,7 +61,7 @@ def unit_of(path: str) -> str:
     block, _, name = path.partition(".")
     if block == "material":
         # A name has the same unit in every material.
-        return next(of[name] for of in map(units, MATERIALS.values()) if name in of)
+        return next(of[name] for of in map(units, (MATERIALS | OF_STRETCHES).values()) if name in of)
     if block == "fields":
         return "1"
     if block == "inclusions":

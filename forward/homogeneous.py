@@ -1,0 +1,312 @@
+"""Material-point tests: the stress of a homogeneously deformed specimen, from the energies of the finite elements.
+
+A test prescribes one stretch (or shear) x; free faces leave the lateral stretch y. With the energy W(x, y) of the
+specimen per volume, the nominal stress that does work on x is
+
+    P = (1/k) dW(x, y(x))/dx,
+
+with k = 2 where two equal stretches are prescribed. An incompressible specimen has y(x) from J = 1; a compressible one
+has ∂W/∂y = 0, and then dW/dx = ∂W/∂x. SymPy reads the energy and differentiates it, so that stresses and their
+derivatives with respect to the constants are closed forms (of y, which Newton's method finds where it is not known):
+G. A. Holzapfel, Nonlinear Solid Mechanics (2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import Field, model_validator
+
+from forward.materials import MATERIALS, OF_STRETCHES, constants
+from forward.model import FloatArray, FunctionModel, FunctionSolution, Reference, SolveError
+from forward.settings import Settings
+
+Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
+Positive = Annotated[float, Gt(0)]
+ENERGIES = MATERIALS | OF_STRETCHES
+ITERATIONS = 60  # of Newton's method for the lateral stretch
+ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
+
+
+class MaterialTest(Settings):
+    """One homogeneous test of a material: what is prescribed, and which stress is read.
+
+    Parameters
+    ----------
+    mode
+        "uniaxial" (tension or compression), "equibiaxial", "biaxial" (two stretches, of which the stress along the
+        first is read), "pure-shear" (planar tension: one width is held) or "simple-shear".
+    at
+        Stretches λ > 0, or amounts of shear γ.
+    across
+        Second stretch at each of them (biaxial only).
+    stress
+        "nominal" (force over undeformed area) or "cauchy".
+    name
+        Name of the test in the names of the outputs; by default its mode.
+    """
+
+    mode: Mode
+    at: tuple[float, ...] = Field(min_length=1)
+    across: tuple[Positive, ...] | None = None
+    stress: Literal["nominal", "cauchy"] = "nominal"
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name in outputs."""
+        return self.name or self.mode
+
+    @model_validator(mode="after")
+    def _check(self) -> MaterialTest:
+        if self.mode != "simple-shear" and min(self.at) <= 0:
+            message = f"at: stretch {min(self.at):g}, expected positive ones (1 is undeformed)"
+            raise ValueError(message)
+        if (self.across is not None) != (self.mode == "biaxial"):
+            message = "across: is for mode = 'biaxial', and only for it"
+            raise ValueError(message)
+        if self.across is not None and len(self.across) != len(self.at):
+            message = f"across: {len(self.across)} stretches, expected as many as in at: {len(self.at)}"
+            raise ValueError(message)
+        return self
+
+
+class HomogeneousModel:
+    """A forward model: stresses (Pa) of material tests as outputs, the constants of a material as parameters.
+
+    Parameters
+    ----------
+    energy
+        Kind of the material, see `forward.materials`.
+    values
+        Its constants; without the constant D1, an energy that has one is that of an incompressible material.
+    tests
+        What is measured.
+    parameters
+        Names of the constants that vary; the others keep their values.
+
+    Raises
+    ------
+    ValueError
+        If constants are missing or unknown.
+    """
+
+    differentiable = True
+    displacements = 0
+
+    def __init__(
+        self, energy: str, values: dict[str, float], tests: Sequence[MaterialTest], parameters: Sequence[str]
+    ) -> None:
+        known = constants(ENERGIES[energy])
+        given = dict.fromkeys([*values, *parameters])
+        unknown, missing = set(given) - set(known), set(known) - set(given) - {"D1"}
+        if unknown or missing:
+            message = f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}"
+            raise ValueError(message)
+        self.parameters = tuple(parameters)
+        self._names = tuple(name for name in known if name in given)
+        self._values = np.array([values.get(name, np.nan) for name in self._names])
+        self._varied = [self._names.index(name) for name in parameters]
+        self._tests = tuple(tests)
+        self._readings = [reading(energy, test.mode, self._names) for test in tests]
+        many = {test.label for test in tests if len(test.at) > 1}
+        self.outputs = tuple(
+            f"{test.label}[{i}]" if test.label in many else test.label for test in tests for i in range(len(test.at))
+        )
+
+    def stresses(self, points: FloatArray) -> FloatArray:
+        """Return the stresses (n, m) at parameters (n, d), NaN where there is none (a Gent chain at its end)."""
+        return np.concatenate([values for values, _ in self._evaluate(points, derivatives=False)], axis=1)
+
+    def stresses_and_derivatives(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the stresses (n, m) and their derivatives (n, m, d) at parameters (n, d)."""
+        values, slopes = zip(*self._evaluate(points, derivatives=True), strict=True)
+        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+
+    def _evaluate(self, points: FloatArray, *, derivatives: bool) -> list[tuple[FloatArray, FloatArray]]:
+        points = np.asarray(points, dtype=float)
+        theta = np.tile(self._values[:, None, None], (1, len(points), 1))
+        theta[self._varied] = points.T[:, :, None]
+        found = []
+        for test, read in zip(self._tests, self._readings, strict=True):
+            x, across = np.array(test.at), np.array(test.across if test.across is not None else 1.0)
+            stress, slopes = read(x, across, theta, test.stress == "cauchy", derivatives)
+            found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
+        return found
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> FunctionSolution:
+        """Return the stresses (m,) at `parameters` (d,).
+
+        Raises
+        ------
+        SolveError
+            Where a test has no stress.
+        """
+        return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
+
+    def _one(self, parameters: FloatArray) -> FloatArray:
+        values = np.asarray(self.stresses(parameters[None, :])[0])
+        if not np.isfinite(values).all():
+            name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
+            message = f"no stress in the test {name}: the material has no energy, or no equilibrium, there"
+            raise SolveError(message)
+        return values
+
+    def _jacobian(self, parameters: FloatArray) -> FloatArray:
+        return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])
+
+    def gather(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+
+# --- closed forms --------------------------------------------------------------------------------------------------
+
+
+class _Kinematics(NamedTuple):
+    """Stretches of a mode with x prescribed, z prescribed across and y free; y where the volume does not change."""
+
+    stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of sympy, x, z, y
+    incompressible: Callable[[Any, Any], Any] | None  # of x, z; nothing is free where there is none
+    share: int = 1  # prescribed stretches that are x
+
+
+_MODES: dict[str, _Kinematics] = {
+    "uniaxial": _Kinematics(lambda ops, x, z, y: (x, y, y), lambda x, z: x ** (-0.5)),
+    "equibiaxial": _Kinematics(lambda ops, x, z, y: (x, x, y), lambda x, z: x ** (-2.0), share=2),
+    "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),
+    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, 1, y), lambda x, z: 1 / x),
+    # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
+    "simple-shear": _Kinematics(
+        lambda ops, x, z, y: (ops.sqrt(1 + x**2 / 4) + x / 2, ops.sqrt(1 + x**2 / 4) - x / 2, 1), None
+    ),
+}
+
+Reading = Callable[[FloatArray, FloatArray, FloatArray, bool, bool], tuple[FloatArray, FloatArray]]
+
+
+@cache
+def reading(energy: str, mode: Mode, names: tuple[str, ...]) -> Reading:
+    """Return (x (k,), z (k,), θ (c, n, 1), cauchy, derivatives) → stresses (n, k) and dσ/dθ (c, n, k) of a mode.
+
+    Parameters
+    ----------
+    energy
+        Kind of the material.
+    names
+        The c constants θ; without D1 an energy that has it is read at J = 1.
+    """
+    import sympy
+
+    ops = SimpleNamespace(ln=sympy.log, exp=sympy.exp, sqrt=sympy.sqrt)
+    kinematics = _MODES[mode]
+    x = sympy.Symbol("x", real=True) if mode == "simple-shear" else sympy.Symbol("x", positive=True)
+    z, y = sympy.symbols("z y", positive=True)
+    theta = {name: sympy.Symbol(name, real=True) for name in names}
+    confined = kinematics.incompressible is None
+    incompressible = "D1" in constants(ENERGIES[energy]) and "D1" not in names
+    values = theta if not incompressible else theta | {"D1": sympy.Integer(0)}
+    stretches = kinematics.stretches(sympy, x, z, y)
+    W = _energy(ops, energy, stretches, sympy.Integer(1) if incompressible or confined else None, values)
+    if incompressible and kinematics.incompressible is not None:
+        W = W.subs(y, _exact(kinematics.incompressible(x, z)))
+    P = W.diff(x) / kinematics.share
+    arguments = [x, z, y, *theta.values()]
+
+    def compiled(expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
+        function: Callable[..., Sequence[Any]] = sympy.lambdify(arguments, list(expressions), modules="numpy", cse=True)
+        return function
+
+    free = not incompressible and not confined
+    slopes = [P.diff(symbol) for symbol in theta.values()]
+    # Beyond where an energy ends, its derivatives may be numbers.
+    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *slopes])
+    if free:
+        g = W.diff(y)
+        balance = compiled([g, g.diff(y)])
+        others = compiled([P.diff(y), g.diff(y), *(g.diff(s) for s in theta.values())])
+
+    def read(
+        at: FloatArray, across: FloatArray, constants_: FloatArray, cauchy: bool, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        shape = np.broadcast_shapes(at.shape, constants_.shape[1:])
+        lateral = np.ones(shape)
+        with np.errstate(all="ignore"):
+            if not confined:
+                assert kinematics.incompressible is not None
+                lateral = np.broadcast_to(kinematics.incompressible(at, across), shape)
+            if free:
+                lateral = _lateral(lambda y: balance(at, across, y, *constants_), lateral)
+            arguments = (at, across, lateral, *constants_)
+            results = np.array([np.broadcast_to(r, shape) for r in (slope if derivatives else value)(*arguments)])
+            results = np.where(np.isfinite(defined(*arguments)[0]), results, np.nan)
+            stress, by_constant = results[0], results[1:]
+            if free and derivatives:
+                P_y, g_y, *g_theta = others(*arguments)
+                by_constant = by_constant - np.array([np.broadcast_to(P_y / g_y * g_t, shape) for g_t in g_theta])
+            if cauchy and not confined:
+                if free and derivatives:
+                    # σ = P x / J, and J changes with y by J'(y), y by −g_θ/g_y
+                    J, J_y = _volume(mode, at, across, lateral)
+                    dy = -np.array([np.broadcast_to(g_t / g_y, shape) for g_t in g_theta])
+                    by_constant = by_constant * at / J - stress * at * J_y / J**2 * dy
+                    stress = stress * at / J
+                else:
+                    scale = at / _volume(mode, at, across, lateral)[0] if free else at
+                    stress, by_constant = stress * scale, by_constant * scale
+        return stress, by_constant
+
+    return read
+
+
+def _energy(ops: Any, kind: str, stretches: tuple[Any, Any, Any], J: Any | None, values: dict[str, Any]) -> Any:
+    """W of principal stretches; J is given where it is known."""
+    a, b, c = stretches
+    volume = a * b * c if J is None else J
+    if kind in OF_STRETCHES:
+        return OF_STRETCHES[kind](ops, a, b, c, volume, **values)
+    A, B, C = a**2, b**2, c**2
+    return MATERIALS[kind](ops, A + B + C, A * B + B * C + C * A, volume, **values)
+
+
+def _exact(expression: Any) -> Any:
+    """Powers with exponents such as −1/2 as exact numbers, so that SymPy can combine them."""
+    import sympy
+
+    return sympy.nsimplify(expression)
+
+
+def _volume(mode: str, x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """J and ∂J/∂y."""
+    a, b, c = _MODES[mode].stretches(np, x, z, y)
+    J = np.asarray(a * b * c)
+    return J, (2 if mode == "uniaxial" else 1) * J / y
+
+
+def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
+    """Solve ∂W/∂y = 0 by Newton's method in ln y, in steps of at most a factor of two; NaN where it does not settle."""
+    y = np.array(start)
+    for _ in range(ITERATIONS):
+        g, g_y = balance(y)
+        # At the minimum of W(ln y) the slope of y g is y² g_y + y g; away from it |·| keeps the direction downhill.
+        curvature = np.abs(y * y * g_y + y * g)
+        step = np.clip(-y * g / curvature, -np.log(2), np.log(2))
+        y = y * np.exp(step)
+        if np.nanmax(np.abs(step), initial=0.0) < ROUNDED:
+            break
+    return np.where(np.abs(step) < 1e-8, y, np.nan)

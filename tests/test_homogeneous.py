@@ -1,0 +1,158 @@
+"""Material-point tests: closed forms, derivatives, compressible specimens against finite elements."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from pydantic import ValidationError
+
+from forward.homogeneous import ENERGIES, HomogeneousModel, MaterialTest
+from forward.hyperelastic import Hyperelastic
+from forward.materials import constants, small_strain_moduli
+from forward.model import SolveError
+
+VALUES: dict[str, dict[str, float]] = {
+    "mooney-rivlin": {"C1": 1e4, "C2": 2e4},
+    "neo-hookean": {"C1": 1e4},
+    "neo-hookean-coupled": {"mu": 1e4, "lmbda": 2e4},
+    "yeoh": {"C10": 1e4, "C20": -1e3, "C30": 500.0},
+    "gent": {"mu": 1e4, "Jm": 30.0},
+    "demiray": {"a": 1e4, "b": 0.7},
+    "saint-venant-kirchhoff": {"mu": 1e4, "lmbda": 2e4},
+    "blatz-ko": {"mu": 1e4},
+    "ogden": {"mu1": 1e4, "alpha1": 1.5, "mu2": -2e3, "alpha2": -2.0, "mu3": 100.0, "alpha3": 5.0},
+}
+CASES = [*VALUES.items()] + [
+    (kind, values | {"D1": 3e4}) for kind, values in VALUES.items() if "D1" in constants(ENERGIES[kind])
+]
+STRETCHES = (0.7, 0.9, 1.1, 1.4)
+TESTS = [
+    *(
+        MaterialTest(mode=mode, at=STRETCHES, stress=stress, name=f"{mode} {stress}")
+        for mode in ("uniaxial", "equibiaxial", "pure-shear")
+        for stress in ("nominal", "cauchy")
+    ),
+    MaterialTest(mode="biaxial", at=(1.2, 1.3), across=(1.1, 0.9)),
+    MaterialTest(mode="biaxial", at=(1.2, 1.3), across=(1.1, 0.9), stress="cauchy", name="biaxial cauchy"),
+    MaterialTest(mode="simple-shear", at=(-0.3, 0.0, 0.4)),
+]
+
+
+def model(kind: str, values: dict[str, float], *tests: MaterialTest) -> HomogeneousModel:
+    return HomogeneousModel(kind, values, tests or TESTS, tuple(values))
+
+
+def test_every_energy_is_read():
+    assert set(VALUES) == set(ENERGIES)
+
+
+def test_incompressible_closed_forms():
+    """The formulas of any W(I1, I2), here with its slopes C1 and C2."""
+    x, C1, C2 = np.array([0.6, 0.9, 1.3, 2.5]), 1e4, 3e4
+    modes = ("uniaxial", "pure-shear", "equibiaxial", "simple-shear")
+    tests = [MaterialTest(mode=mode, at=tuple(x)) for mode in modes]
+    found = model("mooney-rivlin", {"C1": C1, "C2": C2}, *tests).stresses(np.array([[C1, C2]])).reshape(4, -1)
+    np.testing.assert_allclose(found[0], 2 * (x - x**-2) * (C1 + C2 / x), rtol=1e-13)
+    np.testing.assert_allclose(found[1], 2 * (x - x**-3) * (C1 + C2), rtol=1e-13)
+    np.testing.assert_allclose(found[2], 2 * (x - x**-5) * (C1 + x**2 * C2), rtol=1e-13)
+    np.testing.assert_allclose(found[3], 2 * x * (C1 + C2), rtol=1e-13)
+
+
+def test_ogden_with_exponents_two_and_minus_two_is_mooney_rivlin():
+    """W = μ1/2 (I1 − 3) − μ2/2 (I2 − 3) for exponents 2 and −2, so that C1 = μ1/2 and C2 = −μ2/2."""
+    for volume in ({}, {"D1": 2e4}):
+        one = model("mooney-rivlin", {"C1": 1e4, "C2": 3e4} | volume)
+        values = {"mu1": 2e4, "alpha1": 2.0, "mu2": -6e4, "alpha2": -2.0, "mu3": 0.0, "alpha3": 1.0}
+        other = model("ogden", values | volume)
+        np.testing.assert_allclose(_at(one), _at(other), rtol=1e-9, atol=1e-6)
+
+
+def _at(model: HomogeneousModel) -> np.ndarray:
+    return model.stresses(model._values[model._varied][None, :])[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"), CASES, ids=lambda v: v if isinstance(v, str) else " D1"[3 * ("D1" not in v) :]
+)
+def test_derivatives(kind, values):
+    """Taylor remainders along every constant fall by four when the step is halved."""
+    it = model(kind, values)
+    point = np.array(list(values.values()))
+    stress, slopes = it.stresses_and_derivatives(point[None, :])
+    assert np.isfinite(stress).all()
+    np.testing.assert_allclose(stress, it.stresses(point[None, :]), rtol=1e-13, atol=1e-9)
+    for i, value in enumerate(point):
+        steps = 1e-2 * value * np.array([1, 0.5])
+        moved = np.tile(point, (2, 1))
+        moved[:, i] += steps
+        remainder = np.abs(it.stresses(moved) - stress - steps[:, None] * slopes[0, :, i]).max(axis=1)
+        linear = remainder.max() < 1e-9 * np.abs(stress).max()
+        assert linear or remainder[0] / remainder[1] == pytest.approx(4, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"), CASES, ids=lambda v: v if isinstance(v, str) else " D1"[3 * ("D1" not in v) :]
+)
+def test_small_strains_are_linear_elasticity(kind, values):
+    e = 1e-5
+    tests = [MaterialTest(mode=mode, at=(1 + e, 1 - e)) for mode in ("uniaxial", "equibiaxial", "pure-shear")]
+    tests.append(MaterialTest(mode="simple-shear", at=(e, -e)))
+    found = _at(model(kind, values, *tests)).reshape(4, 2)
+    slopes = (found[:, 0] - found[:, 1]) / (2 * e)
+    if kind == "ogden":
+        mu, kappa = sum(values[f"mu{k}"] * values[f"alpha{k}"] for k in (1, 2, 3)) / 2, 2 * values.get("D1", np.inf)
+    else:
+        incompressible = "D1" in constants(ENERGIES[kind]) and "D1" not in values
+        mu, kappa = small_strain_moduli(kind, values | ({"D1": 1.0} if incompressible else {}))
+        kappa = np.inf if incompressible else kappa
+    nu = 0.5 if np.isinf(kappa) else (3 * kappa - 2 * mu) / (2 * (3 * kappa + mu))
+    E = 2 * mu * (1 + nu)
+    np.testing.assert_allclose(slopes, [E, E / (1 - nu), E / (1 - nu**2), mu], rtol=1e-6)
+
+
+def test_finite_elements_agree():
+    """A block between smooth plates deforms homogeneously; its force over its area is the stress."""
+    values = {"C1": 1e4, "C2": 2e4, "D1": 5e4}
+    spec = Hyperelastic.model_validate(
+        {
+            "body": {"kind": "box", "size": [1.0, 1.0, 1.0], "cells": [1, 1, 1], "cell": "hexahedron", "degree": 1},
+            "material": {"kind": "mooney-rivlin"} | values,
+            "displacements": [
+                {"on": "x-min", "name": "a", "x": 0.0},
+                {"on": "y-min", "name": "b", "y": 0.0},
+                {"on": "z-min", "name": "c", "z": 0.0},
+                {"on": "x-max", "name": "pull", "x": 0.0},
+            ],
+            "outputs": [{"name": "force", "kind": "reaction", "on": "x-max", "component": "x"}],
+        }
+    )
+    body = spec.build(MPI.COMM_SELF, ("displacements.pull.x",))
+    pulled = [float(body.solve(np.array([stretch - 1])).outputs[0]) for stretch in STRETCHES]
+    point = model("mooney-rivlin", values, MaterialTest(mode="uniaxial", at=STRETCHES))
+    np.testing.assert_allclose(np.abs(pulled), np.abs(_at(point)), rtol=1e-7)
+
+
+def test_many_parameter_sets_at_once():
+    it = model("gent", {"mu": 1e4, "Jm": 30.0})
+    points = np.array([[1e4, 30.0], [2e4, 20.0], [3e4, 0.01]])
+    found = it.stresses(points)
+    np.testing.assert_array_equal(found[1], it.stresses(points[1:2])[0])
+    assert np.isfinite(found[:2]).all()
+    assert np.isnan(found[2]).any()  # the chains are stretched out
+    with pytest.raises(SolveError, match=r"no stress in the test uniaxial nominal\[0\]"):
+        it.solve(points[2])
+    solution = it.solve(points[0])
+    np.testing.assert_array_equal(solution.outputs, found[0])
+    np.testing.assert_allclose(solution.tangent(np.array([1e4, 0.0])), found[0], rtol=1e-12)  # P is linear in μ
+
+
+def test_mistakes_are_named():
+    for settings, told in (
+        ({"mode": "uniaxial", "at": (0.0,)}, "stretch 0"),
+        ({"mode": "biaxial", "at": (1.1,)}, "across"),
+        ({"mode": "uniaxial", "at": (1.1,), "across": (1.0,)}, "across"),
+        ({"mode": "biaxial", "at": (1.1, 1.2), "across": (1.0,)}, "1 stretches, expected as many as in at: 2"),
+    ):
+        with pytest.raises(ValidationError, match=told):
+            MaterialTest.model_validate(settings)
+    with pytest.raises(ValueError, match="expected: C1, C2, D1"):
+        HomogeneousModel("mooney-rivlin", {"C1": 1.0}, TESTS, ("C3",))

@@ -1,0 +1,310 @@
+"""Model selection: what is recovered, what is criticised, and the studies from the command line."""
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from forward.homogeneous import HomogeneousModel, MaterialTest
+from inverse.comparison import Candidate, Data, criticise, probabilities
+from inverse.evidence import evidence
+from inverse.laplace import laplace
+from inverse.posterior import Posterior
+from inverse.selection import Noise, Select, posterior
+from tests.launch import run, run_script
+from tests.rubber import CONFIGS, FACTOR, treloar
+from uq.distributions import LogNormal, LogUniform, Normal, Uniform
+from uq.evaluate import SerialEvaluate
+from uq.inputs import Inputs
+from workflows.config import StudyError, dump, load, parse
+from workflows.plan import plan
+from workflows.starter import starter
+from workflows.verdict import findings, grade
+
+TISSUQ = Path(sys.executable).parent / "tissuq"
+STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
+MODES = ("uniaxial", "equibiaxial", "pure-shear")
+TESTS = [MaterialTest(mode=mode, at=STRETCHES) for mode in MODES]
+FIVE = {
+    "neo-hookean": {"C1": LogNormal(mean=2e5, std=1e5)},
+    "mooney-rivlin": {"C1": LogNormal(mean=2e5, std=1e5), "C2": Uniform(lower=0.0, upper=5e4)},
+    "yeoh": {
+        "C10": LogNormal(mean=2e5, std=1e5),
+        "C20": Normal(mean=0.0, std=5e3),
+        "C30": LogUniform(lower=1.0, upper=1e3),
+    },
+    "gent": {"mu": LogNormal(mean=4e5, std=2e5), "Jm": LogUniform(lower=30.0, upper=300.0)},
+    "demiray": {"a": LogNormal(mean=4e5, std=2e5), "b": LogUniform(lower=0.002, upper=0.05)},
+}
+
+
+def model(kind, tests=TESTS):
+    return HomogeneousModel(kind, {}, tests, tuple(FIVE[kind]))
+
+
+def compare(values, kinds=tuple(FIVE), tests=TESTS, noise=None, **settings):
+    labels = tuple(test.label for test in tests for _ in test.at)
+    data = Data(values, None, labels, np.concatenate([test.at for test in tests]))
+    candidates = {kind: Candidate(Inputs(FIVE[kind])) for kind in kinds}
+    method = Select(samples=settings.pop("samples", 64), noise=noise or Noise(relative=0.1, absolute=5e3), **settings)
+    return method.run(candidates, {"all": data}, lambda kind, _: SerialEvaluate(model(kind, tests)))
+
+
+def measured(kind, rng, noise=0.1, tests=TESTS):
+    """Data from constants that are drawn from the prior."""
+    x = rng.standard_normal((1, len(FIVE[kind])))
+    stress = model(kind, tests).stresses(Inputs(FIVE[kind]).from_normals(x)[0])[0]
+    return stress + np.maximum(noise * np.abs(stress), 5e3) * rng.standard_normal(stress.size)
+
+
+def test_probabilities():
+    np.testing.assert_allclose(
+        probabilities(np.array([-700.0, -701.0]), np.ones(2)), [1 / (1 + np.exp(-1)), 0.268941], 1e-5
+    )
+    np.testing.assert_allclose(probabilities(np.zeros(2), np.array([3.0, 1.0])), [0.75, 0.25])
+    assert [grade(x) for x in (0.5, 2.0, 4.0, 6.0)][1:] == ["positive", "strong", "very strong"]
+
+
+def test_a_parameter_that_is_not_needed_loses():
+    """Data of neo-Hookean rubber: Mooney–Rivlin and Yeoh fit them as well, and are less probable."""
+    stress = model("neo-hookean").stresses(np.array([[2e5]]))[0]
+    found = compare(stress, ("neo-hookean", "mooney-rivlin", "yeoh"))
+    P = found["probability"].to_numpy()
+    assert P[0] > 0.5
+    assert P[0] > P[1]
+    assert P[0] > P[2]
+    assert P.sum() == pytest.approx(1)
+
+
+def test_variance_of_averages_is_that_of_the_mixture():
+    stress = model("gent").stresses(np.array([[4e5, 60.0]]))[0] * 1.02
+    found = compare(stress, ("yeoh", "gent", "demiray"))
+    P = found["probability"].to_numpy()[:, None]
+    mean, std = found["prediction_mean"].to_numpy(), found["prediction_std"].to_numpy()
+    second = (P * (std**2 + mean**2)).sum(axis=0)
+    total = found["average_within"] + found["average_between"]
+    np.testing.assert_allclose(total, second - (P * mean).sum(axis=0) ** 2, rtol=1e-6, atol=1e-3)
+
+
+def test_uniaxial_data_alone_mislead():
+    """Up to fourfold stretch Mooney–Rivlin fits tension, and Yeoh all three modes: what is said in the report."""
+    study = load(CONFIGS / "treloar.toml", ["data.between=[1, 4]", "method.samples=64", "method.other_noises={}"])
+    names = ("neo-hookean", "mooney-rivlin", "yeoh", "gent")
+    models = {pair: study.build(*pair) for pair in study.pairs}
+    chosen = {name: study.models[name] for name in names}
+    found = study.method.run(chosen, study.groups, lambda *pair: SerialEvaluate(models[pair]))
+    assert "It depends: the most probable is mooney-rivlin with uniaxial tension alone." in findings(found)
+    assert findings(found)[0].startswith("yeoh is the most probable")
+
+
+def test_discrepancy_is_found_when_no_candidate_is_right():
+    """Stiffening rubber and two models that cannot stiffen, with known and with inferred errors; not where one can."""
+    rng = np.random.default_rng(2)
+    tests = [MaterialTest(mode=mode, at=tuple(np.linspace(1.2, 4.5, 15))) for mode in MODES]
+    point = np.array([[1.5e5, -1e3, 200.0]])
+    stress = model("yeoh", tests).stresses(point)[0]
+    values = stress * (1 + 0.05 * rng.standard_normal(stress.size))
+    for factor in (None, FACTOR):
+        noise = Noise(relative=0.05, absolute=1e3, factor=factor)
+        wrong = compare(values, ("neo-hookean", "mooney-rivlin"), tests, noise)
+        assert any(line.startswith("Best of bad models") for line in findings(wrong))
+        right = compare(values, ("neo-hookean", "yeoh"), tests, noise)
+        assert not any(line.startswith("Best of bad models") for line in findings(right))
+
+
+def test_left_out_scores_of_a_linear_model():
+    """A normal posterior has normal predictions of each left-out datum: closed forms."""
+    priors = {"C1": Normal(mean=2e5, std=1e5), "C2": Normal(mean=0.0, std=1e5)}
+    tests = tuple(TESTS)
+    it = HomogeneousModel("mooney-rivlin", {}, tests, ("C1", "C2"))
+    rng = np.random.default_rng(0)
+    stress = it.stresses(np.array([[1.8e5, 1e4]]))[0]
+    values = stress * (1 + 0.1 * rng.standard_normal(stress.size))
+    labels = tuple(test.label for test in tests for _ in test.at)
+    data = Data(values, None, labels, np.concatenate([test.at for test in tests]))
+    inputs = Inputs(priors)
+    whole = posterior(Candidate(inputs), data, Noise(relative=0.1), SerialEvaluate(it))
+    found = criticise(evidence(whole, laplace(whole), 2048), whole, data)
+    A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
+    r, sigma = values - it.stresses(inputs.mean[None])[0], 0.1 * np.abs(values)
+    for j in (0, 7, 17):
+        rest = np.arange(values.size) != j
+        H = np.eye(2) + (A[rest] / sigma[rest, None] ** 2).T @ A[rest]
+        mean = A[j] @ np.linalg.solve(H, A[rest].T @ (r[rest] / sigma[rest] ** 2))
+        variance = sigma[j] ** 2 + A[j] @ np.linalg.solve(H, A[j])
+        exact = -((r[j] - mean) ** 2) / (2 * variance) - np.log(2 * np.pi * variance) / 2
+        assert found.scores[j] == pytest.approx(exact, abs=0.02)
+
+
+def test_least_squares_are_modes_with_wide_priors():
+    """Yeoh on all of Treloar's tests: the mode is the solution of the normal equations."""
+    study = treloar()
+    data = study.groups["all"]
+    it = HomogeneousModel("yeoh", {}, study.data.tests, ("C10", "C20", "C30"))
+    sigma = np.full(data.values.size, 5e4)
+    A = it.stresses_and_derivatives(np.zeros((1, 3)))[1][0]
+    fitted = np.linalg.lstsq(A, data.values, rcond=None)[0]
+    wide = {"C10": Normal(mean=0.0, std=1e8), "C20": Normal(mean=0.0, std=1e6), "C30": Normal(mean=0.0, std=1e5)}
+    found = Posterior(Inputs(wide), SerialEvaluate(it), data.values, sigma)
+    mode = found.physical(laplace(found).mode[None, :])[0]
+    np.testing.assert_allclose(mode, fitted, rtol=1e-5)
+    assert fitted[0] > 0 > fitted[1]
+    assert fitted[2] > 0
+
+
+def test_brain_cortex_is_in_the_second_invariant():
+    """Non-negative Mooney–Rivlin puts all of the stiffness of cortex into C2."""
+    from scipy.optimize import nnls
+
+    study = load(CONFIGS / "brain.toml")
+    assert study.data.groups == ("basal_ganglia", "corona_radiata", "corpus_callosum", "cortex")
+    data = study.groups["cortex"]
+    A = study.build("mooney-rivlin", "cortex").stresses_and_derivatives(np.full((1, 2), 100.0))[1][0]
+    (C1, C2), _ = nnls(A, data.values)
+    assert C1 < 1e-6 * C2
+    assert 200 < C2 < 2000
+
+
+def test_shipped_studies_say_where_their_data_are_from():
+    for name, first, count in (("treloar", "Treloar", 53), ("brain", "Budday", 288)):
+        study = load(CONFIGS / f"{name}.toml")
+        assert first in study.data.source[0]
+        assert any("licence" in line for line in study.data.source)
+        assert sum(len(test.at) for test in study.data.tests) == count
+        assert parse(tomllib.loads(dump(study))) == study
+
+
+SMALL = """
+[data]
+file = "table.csv"
+unit = 1e3
+
+[candidates.neo-hookean]
+material = { kind = "neo-hookean" }
+parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
+
+[candidates.mooney-rivlin]
+material = { kind = "mooney-rivlin", C2 = 10 }
+parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
+weight = 2
+
+[method]
+kind = "select"
+samples = 32
+noise = { relative = 0.1, absolute = 20 }
+"""
+TABLE = "# measured by hand\nmode,stretch,stress\nuniaxial,1.1,0.3\nuniaxial,1.2,0.55\nsimple-shear,0.1,0.1\n"
+
+
+@pytest.fixture
+def small(tmp_path):
+    (tmp_path / "small.toml").write_text(SMALL)
+    (tmp_path / "table.csv").write_text(TABLE)
+    return tmp_path / "small.toml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("table.csv", "tabel.csv", "data.file: .*tabel.csv: cannot be read: No such file"),
+        ("unit = 1e3", 'measured = "stres"', "has no column 'stres'; did you mean 'stress'"),
+        ("unit = 1e3", "units = 1e3", "data.units: unknown key; did you mean 'unit'"),
+        ("unit = 1e3", 'where = { mode = "torsion" }', "no row is left"),
+        ('"neo-hookean" }', '"neo-hokean" }', "candidates.neo-hookean: material.kind: 'neo-hokean'; did you mean"),
+        ("parameters.C1", "parameters.C3", "'C3' is no constant of 'neo-hookean'"),
+        ("mean = 500", 'mean = "soft"', "candidates.neo-hookean.parameters.C1.mean"),
+        ("C2 = 10", "C1 = 10", "stands in material and in parameters"),
+        (", C2 = 10", "", "missing: C2"),
+        ('"log-normal", mean = 500', '"normal", mean = 500', "reaches .* where the material is impossible"),
+        ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
+        ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
+        ("weight = 2", "weight = 0", "candidates.mooney-rivlin.weight"),
+    ],
+)
+def test_one_line_for_a_mistake(small, old, new, told):
+    small.write_text(SMALL.replace(old, new, 1))
+    with pytest.raises(StudyError, match=told) as caught:
+        load(small)
+    assert len(caught.value.args) == 1
+
+
+@pytest.mark.parametrize(
+    ("row", "told"),
+    [
+        ("torsion,1.1,2", "line 6: unknown mode 'torsion'"),
+        ("uniaxial,1.1,much", "line 6, stress: 'much', expected a number"),
+        ("uniaxial,1.1", "line 6, stress: None, expected a number"),
+        ("uniaxial,nan,1", "line 6, stretch: 'nan', expected a number"),
+        ("uniaxial,-1,1", "data.tests.0.: at: stretch -1"),
+    ],
+)
+def test_one_line_for_a_bad_row(small, row, told):
+    (small.parent / "table.csv").write_text(TABLE + row + "\n")
+    with pytest.raises(StudyError, match=told) as caught:
+        load(small)
+    assert len(caught.value.args) == 1
+
+
+def test_subsets_are_of_known_tests(small):
+    with pytest.raises(StudyError, match=r"method\.subsets\.x: no test has this name; did you mean 'uniaxial'"):
+        load(small, ['method.subsets={x = ["uniaxal"]}'])
+    study = load(small, ['method.subsets={x = ["uniaxial"]}', "method.samples=64"])
+    assert "evidences   4" in plan(study)
+
+
+def test_the_starter_is_valid():
+    study = parse(tomllib.loads(starter("select")))
+    assert study.method.kind == "select"
+
+
+def test_other_studies_do_not_import_inversion():
+    script = "import sys, workflows.study, workflows.report; print('inverse' in sys.modules)"
+    assert run_script(None, script).stdout.strip() == "False"
+
+
+def test_a_study_from_the_command_line(small):
+    """One rank or two: the same bytes; a report; nothing to do the second time."""
+    done = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
+    assert done.returncode == 0, done.stderr
+    assert "neo-hookean: ln Z" in done.stdout
+    summary = json.loads((small.parent / "one" / "summary.json").read_text())
+    assert set(summary["models"]) == {"neo-hookean", "mooney-rivlin"}
+    for found in summary["models"].values():
+        assert set(found) == {"log_evidence", "log_evidence_error", "probability"}
+    assert sum(found["probability"] for found in summary["models"].values()) == pytest.approx(1)
+    done = run(2, TISSUQ, "run", small, "--out", small.parent / "two")
+    assert done.returncode == 0, done.stderr
+    assert (small.parent / "one/results.nc").read_bytes() == (small.parent / "two/results.nc").read_bytes()
+    page = (small.parent / "one" / "report.html").read_text()
+    for words in ("Evidences and probabilities", "measured by hand", "Is the best one good?", "data:image/png"):
+        assert words in page
+    again = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
+    assert "nothing to do" in again.stdout
+    assert run(None, TISSUQ, "report", small.parent / "one").returncode == 0
+    both = run(None, TISSUQ, "report", small.parent / "one", small.parent / "two")
+    assert both.returncode == 2
+    assert "compares models" in both.stderr
+    found = xr.load_dataset(small.parent / "one" / "results.nc")
+    assert found["prior_probability"].to_numpy() == pytest.approx([1 / 3, 2 / 3])
+
+
+@pytest.mark.slow
+def test_probabilities_are_calibrated():
+    """Constants drawn from the prior of each model in turn: of events with probability P, a share P happens."""
+    rng = np.random.default_rng(7)
+    said, happened = [], []
+    for _ in range(20):
+        for k, kind in enumerate(FIVE):
+            found = compare(measured(kind, rng, noise=0.15), noise=Noise(relative=0.15, absolute=5e3))
+            said.append(found["probability"].to_numpy())
+            happened.append(np.arange(len(FIVE)) == k)
+    P, true = np.concatenate(said), np.concatenate(happened)
+    assert np.concatenate([p[h] for p, h in zip(said, happened, strict=True)]).mean() > 0.5
+    for low, high in ((0.0, 0.05), (0.05, 0.3), (0.3, 0.7), (0.7, 0.95), (0.95, 1.0)):
+        members = (low <= P) & (high >= P)
+        spread = np.sqrt((P[members] * (1 - P[members])).sum()) + 0.5
+        assert abs(true[members].sum() - P[members].sum()) < 3 * spread, (low, high)

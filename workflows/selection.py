@@ -1,0 +1,373 @@
+"""A study that compares material models: tests with their data, candidates, and the method."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from forward.homogeneous import ENERGIES, HomogeneousModel, MaterialTest, Mode
+from forward.materials import constants
+from forward.settings import Settings, nearest
+from inverse.comparison import Candidate, Data
+from inverse.selection import Select
+from uq.distributions import Distribution
+from uq.inputs import Inputs
+from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError
+
+MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
+WHOLE = "all"  # name of the group where there is one
+
+
+class MeasuredTest(MaterialTest):
+    """A test with what was measured.
+
+    Parameters
+    ----------
+    measured
+        Stresses (Pa) at each stretch or amount of shear.
+    sigma
+        Standard deviations (Pa) of their errors, where they are known.
+    group
+        Specimen, region, …: each group has constants of its own.
+    """
+
+    measured: tuple[float, ...]
+    sigma: tuple[Annotated[float, Field(gt=0)], ...] | None = None
+    group: str = WHOLE
+
+    @model_validator(mode="after")
+    def _check_sizes(self) -> MeasuredTest:
+        for name, values in (("measured", self.measured), ("sigma", self.sigma)):
+            if values is not None and len(values) != len(self.at):
+                message = f"{name}: {len(values)} values, expected as many as in at: {len(self.at)}"
+                raise ValueError(message)
+        return self
+
+
+class DataFile(Settings):
+    """Tests in a table of comma-separated values; lines that begin with # say where they are from.
+
+    Parameters
+    ----------
+    file
+        The table, beside the study.
+    mode, at, across, measured, sigma, group
+        Names of the columns: kind of test, stretch or amount of shear, second stretch, stress and, if there are any,
+        its standard deviation and the group.
+    modes
+        What the words of the column of modes mean, where they are not modes themselves.
+    unit
+        Pa in the unit of stresses.
+    stress
+        "nominal" or "cauchy".
+    where
+        Rows that are kept: by column, the word that stands there.
+    between
+        Smallest and largest stretch or amount of shear that are kept.
+    """
+
+    file: str
+    mode: str = "mode"
+    at: str = "stretch"
+    across: str | None = None
+    measured: str = "stress"
+    sigma: str | None = None
+    group: str | None = None
+    modes: dict[str, Mode] = Field(default={})
+    unit: Annotated[float, Field(gt=0)] = 1.0
+    stress: Literal["nominal", "cauchy"] = "nominal"
+    where: dict[str, str] = Field(default={})
+    between: tuple[float, float] | None = None
+
+    def read(self, folder: Path) -> dict[str, Any]:
+        """Return the block `data` with the tests themselves.
+
+        Raises
+        ------
+        StudyError
+            If the table cannot be read, lacks a column, or holds what is no number.
+        """
+        path = folder / self.file
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except UnicodeDecodeError:
+            message = f"data.file: {path}: not a text file in UTF-8"
+            raise StudyError(message) from None
+        except OSError as error:
+            message = f"data.file: {path}: cannot be read: {error.strerror}"
+            raise StudyError(message) from None
+        numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
+        table = csv.DictReader(line for _, line in numbered)
+        columns = [self.mode, self.at, self.measured, self.across, self.sigma, self.group, *self.where]
+        for column in columns:
+            if column is not None and column not in (table.fieldnames or ()):
+                message = f"data: {path} has no column '{column}'; {nearest(column, tuple(table.fieldnames or ()))}"
+                raise StudyError(message)
+        tests: dict[tuple[str, str], dict[str, list[float]]] = {}
+        for (line, _), row in zip(numbered[1:], table, strict=False):
+            if any(row[column] != word for column, word in self.where.items()):
+                continue
+            at = _number(row[self.at], f"{path}, line {line}, {self.at}")
+            if self.between is not None and not self.between[0] <= at <= self.between[1]:
+                continue
+            word = row[self.mode]
+            if self.modes.get(word, word) not in MODES:
+                message = f"data: {path}, line {line}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
+                raise StudyError(message)
+            test = tests.setdefault((row[self.group] if self.group else WHOLE, word), {})
+            for key, column, unit in (
+                ("at", self.at, 1.0),
+                ("across", self.across, 1.0),
+                ("measured", self.measured, self.unit),
+                ("sigma", self.sigma, self.unit),
+            ):
+                if column is not None:
+                    test.setdefault(key, []).append(unit * _number(row[column], f"{path}, line {line}, {column}"))
+        if not tests:
+            message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
+            raise StudyError(message)
+        return {
+            "source": [line.lstrip("# ") for line in lines if line.startswith("#")],
+            "tests": [
+                {"mode": self.modes.get(word, word), "name": word, "group": group, "stress": self.stress, **columns}
+                for (group, word), columns in tests.items()
+            ],
+        }
+
+
+class Measurements(Settings):
+    """What was measured.
+
+    Parameters
+    ----------
+    tests
+        Material tests with their data.
+    source
+        Where they are from, line by line.
+    """
+
+    tests: tuple[MeasuredTest, ...] = Field(min_length=1)
+    source: tuple[str, ...] = ()
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups."""
+        return tuple(dict.fromkeys(test.group for test in self.tests))
+
+
+class CandidateModel(Settings):
+    """A material that may be the right one, with its prior.
+
+    Parameters
+    ----------
+    material
+        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible.
+    parameters
+        Priors of the constants that do.
+    correlations
+        Correlations between them.
+    weight
+        Its probability before the data, up to a common factor.
+    """
+
+    material: dict[str, float | str]
+    parameters: dict[str, Distribution] = Field(min_length=1)
+    correlations: tuple[Correlation, ...] = ()
+    weight: Annotated[float, Field(gt=0)] = 1.0
+
+    @property
+    def kind(self) -> str:
+        """Kind of the material."""
+        return str(self.material["kind"])
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random constants."""
+        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Constants that do not vary."""
+        return {name: float(value) for name, value in self.material.items() if name != "kind"}
+
+    @model_validator(mode="after")
+    def _check(self) -> CandidateModel:
+        kind = self.material.get("kind")
+        if kind not in ENERGIES:
+            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(ENERGIES))}"
+            raise ValueError(message)
+        words = [name for name, value in self.material.items() if name != "kind" and isinstance(value, str)]
+        if words:
+            message = f"material.{words[0]}: {self.material[words[0]]!r}, expected a number"
+            raise ValueError(message)
+        known = constants(ENERGIES[self.kind])
+        given = dict.fromkeys([*self.fixed, *self.parameters])
+        for name in given:
+            if name not in known:
+                message = f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
+                raise ValueError(message)
+            if name in self.fixed and name in self.parameters:
+                message = f"'{name}' stands in material and in parameters, expected one of them"
+                raise ValueError(message)
+        missing = [name for name in known if name not in given and name != "D1"]
+        if missing:
+            message = f"missing: {', '.join(missing)}, expected in material or parameters"
+            raise ValueError(message)
+        for name, distribution in self.parameters.items():
+            ends = distribution.support or (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+            for end in ends:
+                try:
+                    TypeAdapter(Annotated[(float, *known[name].__metadata__)]).validate_python(end)
+                except ValidationError as error:
+                    reason = str(error.errors()[0]["msg"]).lower()
+                    message = f"parameters.{name}: reaches {end:.4g}, where the material is impossible ({reason})"
+                    raise ValueError(message) from None
+        return self
+
+
+class Selection(Settings):
+    """What to compare.
+
+    Parameters
+    ----------
+    data
+        Tests and what was measured.
+    candidates
+        Models by name.
+    predict
+        Tests that are predicted beside those that were measured, in every group.
+    method
+        How the candidates are compared.
+    parallel
+        Use of ranks.
+    """
+
+    data: Measurements
+    candidates: dict[str, CandidateModel] = Field(min_length=1)
+    predict: tuple[MaterialTest, ...] = ()
+    method: Select
+    parallel: Parallel = Parallel()
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Candidates and groups, in the order of the models."""
+        return [(name, group) for name in self.candidates for group in self.data.groups]
+
+    @property
+    def planned(self) -> int:
+        """Number of solves, roughly: the searches for the modes take as many as they take."""
+        searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
+        return (self.method.samples * len(self.pairs) + searches) * self.method.variants
+
+    @property
+    def groups(self) -> dict[str, Data]:
+        """Data by group."""
+        found = {}
+        for group in self.data.groups:
+            tests = self._measured(group)
+            known = all(test.sigma is not None for test in tests)
+            labels = [test.label for test in self._tests(group) for _ in test.at]
+            found[group] = Data(
+                np.concatenate([test.measured for test in tests]),
+                np.concatenate([test.sigma for test in tests if test.sigma is not None]) if known else None,
+                tuple(labels),
+                np.concatenate([test.at for test in self._tests(group)]),
+            )
+        return found
+
+    @property
+    def models(self) -> dict[str, Candidate]:
+        """The candidates as the method wants them."""
+        return {name: Candidate(candidate.inputs, candidate.weight) for name, candidate in self.candidates.items()}
+
+    def build(self, name: str, group: str) -> HomogeneousModel:
+        """Make the model of a candidate in a group."""
+        candidate = self.candidates[name]
+        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), tuple(candidate.parameters))
+
+    def _measured(self, group: str) -> list[MeasuredTest]:
+        return [test for test in self.data.tests if test.group == group]
+
+    def _tests(self, group: str) -> list[MaterialTest]:
+        return [*self._measured(group), *self.predict]
+
+    @model_validator(mode="after")
+    def _check(self) -> Selection:
+        mistakes = list(self._mistakes())
+        if mistakes:
+            raise ValidationError.from_exception_data(
+                "Selection",
+                [
+                    InitErrorDetails(
+                        type=PydanticCustomError("study", "{message}", {"message": message}), loc=place, input=given
+                    )
+                    for place, message, given in mistakes
+                ],
+            )
+        return self
+
+    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        for group in self.data.groups:
+            labels = [test.label for test in self._tests(group)]
+            twice = next((label for label in labels if labels.count(label) > 1), None)
+            if twice is not None:
+                yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
+                return
+        known = tuple(dict.fromkeys(test.label for test in self.data.tests))
+        for name, tests in self.method.subsets.items():
+            for test in tests:
+                if test not in known:
+                    yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
+        for name, candidate in self.candidates.items():
+            try:
+                candidate.inputs  # noqa: B018 - checks the correlations
+            except ValueError as error:
+                yield ("candidates", name, "correlations"), str(error), name
+        for place, noise in (
+            (("noise",), self.method.noise),
+            *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
+        ):
+            for data in self.groups.values():
+                try:
+                    noise.sigma(data.values, data.sigma)
+                except ValueError as error:
+                    yield ("method", *place), str(error), noise.model_dump(exclude_none=True)
+                    break
+
+
+def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a document whose table of data, if it names one, has been read.
+
+    Raises
+    ------
+    StudyError
+        If that cannot be done.
+    """
+    data = document.get("data")
+    if not isinstance(data, Mapping) or "file" not in data:
+        return dict(document)
+    try:
+        table = DataFile.model_validate(dict(data))
+    except ValidationError as error:
+        from workflows.config import line
+
+        raise StudyError(*(line(item, "data") for item in error.errors(include_url=False))) from None
+    return {**document, "data": table.read(folder)}
+
+
+def _number(text: str | None, place: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        message = f"data: {place}: {text!r}, expected a number"
+        raise StudyError(message)
+    return value

@@ -1,0 +1,270 @@
+"""The report of a comparison of models: its tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workflows import plots
+from workflows.tables import Table
+from workflows.verdict import bayes_factor, conflicts, findings, grade, ranking
+from workflows.words import NONE, number, settings, unit_of, with_error, with_unit
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+    from workflows.selection import Selection
+
+
+def context(dataset: xr.Dataset, study: Selection) -> dict[str, Any]:
+    """Return what the template shows beside what all reports have."""
+    return {
+        "findings": findings(dataset),
+        "source": study.data.source,
+        "priors": priors(study),
+        "evidences": evidences(dataset),
+        "routes": routes(dataset),
+        "variants": variants(dataset),
+        "criticism": criticism(dataset),
+        "constants": constants(dataset),
+        "averages": averages(dataset),
+    }
+
+
+def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]]:
+    """Draw evidences, probabilities and, test by test, the curves over the data; headings, each with its pictures."""
+    yield (
+        "Evidences",
+        [
+            (evidence_bars(dataset), "ln Z less that of the most probable model, with three standard errors."),
+            (probability_bars(dataset), "Probability of each model, and with other errors, data and priors."),
+        ],
+    )
+    tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
+    several = dataset.sizes["group"] > 1
+    yield (
+        "Curves over the data",
+        [
+            (curves(dataset, str(group), str(test)), f"{test}{f' of {group}' if several else ''}: mean and 90 % band.")
+            for group, test in tests
+        ],
+    )
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def priors(study: Selection) -> Table:
+    """The candidates with the priors of their constants."""
+    rows = []
+    for name, candidate in study.candidates.items():
+        for constant, distribution in candidate.parameters.items():
+            block = distribution.model_dump()
+            unit = unit_of(f"material.{constant}")
+            rows.append((name, candidate.kind, constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
+    return Table(("candidate", "material", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
+
+
+def evidences(dataset: xr.Dataset) -> Table:
+    """Evidence, Bayes factor and probability of each model, nested sampling beside it."""
+    order = ranking(dataset["log_evidence"])
+    nested = "nested_log_evidence" in dataset
+    rows = []
+    for model in order:
+        of_model = dataset.sel(model=model)
+        ln_B, error = bayes_factor(dataset, order[0], model)
+        row = [
+            model,
+            with_error(float(of_model["log_evidence"]), float(of_model["log_evidence_error"])),
+            number(float(of_model["laplace_log_evidence"].sum()), 6),
+            "" if model == order[0] else with_error(ln_B, error),
+            "" if model == order[0] else grade(ln_B),
+            f"{number(100 * float(of_model['prior_probability']), 3)} %",
+            f"{number(100 * float(of_model['probability']), 4)} %",
+        ]
+        if nested:
+            value = float(of_model["nested_log_evidence"].sum())
+            row.append(with_error(value, float(np.sqrt((of_model["nested_log_evidence_error"] ** 2).sum()))))
+        rows.append(row)
+    head = [
+        "model",
+        "ln Z",
+        "by Laplace alone",
+        "ln of the first's Bayes factor",
+        "which is",
+        "before",
+        "P(model | data)",
+    ]
+    return Table([*head, *(["ln Z by nested sampling"] if nested else [])], rows, text=frozenset({0, 4}))
+
+
+def routes(dataset: xr.Dataset) -> Table:
+    """How each evidence was found, and what its weights are worth."""
+    rows = []
+    for model in dataset.model.values:
+        for group in dataset.group.values:
+            one = dataset.sel(model=model, group=group)
+            rows.append(
+                (
+                    str(model),
+                    str(group),
+                    with_error(float(one["group_log_evidence"]), float(one["group_log_evidence_error"])),
+                    str(one["route"].item()),
+                    str(one["why"].item()),
+                    number(float(one["effective"]), 3),
+                    number(float(one["tail"]), 2),
+                    "yes" if bool(one["trusted"]) else "no",
+                )
+            )
+    head = ("model", "group", "ln Z", "route", "because", "effective points", "k̂", "to be trusted")
+    return Table(head, rows, text=frozenset({0, 1, 3, 4, 7}), long=frozenset({4}))
+
+
+def variants(dataset: xr.Dataset) -> Table:
+    """Evidence and probability with other errors, data and priors."""
+    rows = []
+    for variant in dataset.variant.values:
+        one = dataset.sel(variant=variant)
+        cells = [
+            f"{with_error(float(z), float(e))} ({number(100 * float(p), 3)} %)"
+            for z, e, p in zip(
+                one["variant_log_evidence"].values,
+                one["variant_log_evidence_error"].values,
+                one["variant_probability"].values,
+                strict=True,
+            )
+        ]
+        rows.append((str(variant), *cells))
+    return Table(("", *map(str, dataset.model.values)), rows)
+
+
+def criticism(dataset: xr.Dataset) -> Table:
+    """Predictive scores and checks."""
+    rows = []
+    for model in ranking(dataset["score"]):
+        one = dataset.sel(model=model)
+        behind = float(one["score_behind"])
+        rows.append(
+            (
+                model,
+                with_error(float(one["score"]), float(one["score_error"])),
+                with_error(behind, float(one["score_behind_error"])) if behind else NONE,
+                number(float(one["score_tail"]), 2),
+                number(float(one["misfit_probability"].min()), 2),
+                number(float(one["correlation_probability"].min()), 2),
+                "; ".join(conflicts(dataset, model)) or "none",
+            )
+        )
+    head = (
+        "model",
+        "Σ ln p(left-out datum)",
+        "behind the best",
+        "largest k̂",
+        "p of larger residuals",
+        "p of more alike neighbours",
+        "conflict",
+    )
+    return Table(head, rows, text=frozenset({0, 6}), long=frozenset({6}))
+
+
+def constants(dataset: xr.Dataset) -> Table:
+    """Posterior of every constant."""
+    rows = []
+    for model in dataset.model.values:
+        for group in dataset.group.values:
+            one = dataset.sel(model=model, group=group)
+            for name in dataset.parameter.values:
+                of_name = one.sel(parameter=name)
+                if np.isnan(float(of_name["constant_mode"])):
+                    continue
+                unit = "1" if name == "noise" else unit_of(f"material.{name}")
+                low, high = of_name["constant_quantiles"].values
+                values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
+                rows.append((str(model), str(group), str(name), *(with_unit(number(float(v)), unit) for v in values)))
+    head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
+    return Table(head, rows, text=frozenset({0, 1, 2}))
+
+
+def averages(dataset: xr.Dataset) -> Table:
+    """Predictions averaged over the models at the end of each test, with both parts of their variance."""
+    rows = []
+    tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
+    for group, test in dict.fromkeys(tests):
+        members = [i for i, pair in enumerate(tests) if pair == (group, test)]
+        at = dataset["output_at"].values[members]
+        one = dataset.isel(output=members[int(np.argmax(np.abs(at - at[0]) if len(at) > 1 else [0]))])
+        stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))
+        rows.append(
+            (
+                str(group),
+                str(test),
+                number(float(one["output_at"])),
+                with_unit(number(float(one["measured"])), "Pa"),
+                with_unit(number(float(one["average_mean"])), "Pa"),
+                *(with_unit(number(std, 3), "Pa") for std in stds),
+            )
+        )
+    head = ("group", "test", "at", "measured", "averaged prediction", "std within models", "std between models")
+    return Table(head, rows, text=frozenset({0, 1}))
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw ln Z of each model less the largest, with three standard errors."""
+    order = ranking(dataset["log_evidence"])[::-1]
+    ax = ax or plots.axes(height=1.2 + 0.42 * len(order))
+    values = dataset["log_evidence"].sel(model=order).values
+    errors = dataset["log_evidence_error"].sel(model=order).values
+    places = np.arange(len(order))
+    below = values - values.max()
+    ax.barh(places, below, xerr=3 * errors, color=plots.CONTROLLED, ecolor=plots.DARK, capsize=4, height=0.6)
+    ax.set_yticks(places, order)
+    ax.set_xlim(1.15 * min(below.min(), -1.0), 0.05 * abs(below.min()) + 3 * errors.max())
+    ax.set_xlabel("ln Z − ln Z of the most probable")
+    return ax
+
+
+def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw the probabilities of the models side by side, a bar for each variant."""
+    names = [str(variant) for variant in dataset.variant.values]
+    ax = ax or plots.axes(height=1.6 + 0.36 * len(names))
+    places = np.arange(len(names))[::-1]
+    left = np.zeros(len(names))
+    for k, model in enumerate(dataset.model.values):
+        share = dataset["variant_probability"].sel(model=model).values
+        ax.barh(places, share, left=left, color=plots.COLOURS[k % len(plots.COLOURS)], label=str(model), height=0.6)
+        left = left + share
+    ax.set_yticks(places, names)
+    ax.set_xlim(0, 1)
+    ax.set_xlabel("probability")
+    ax.figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    return ax
+
+
+def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -> Axes:
+    """Draw the posterior curves of all models over the data of a test."""
+    ax = ax or plots.axes(height=3.4)
+    chosen = (dataset["output_group"].values == group) & (dataset["output_test"].values == test)
+    one = dataset.isel(output=np.flatnonzero(chosen))
+    one = one.isel(output=np.argsort(one["output_at"].values, kind="stable"))
+    at = one["output_at"].values
+    for k, model in enumerate(dataset.model.values):
+        low, high = one["prediction_quantiles"].sel(model=model).values
+        ax.fill_between(at, low, high, color=plots.COLOURS[k % len(plots.COLOURS)], alpha=0.25, linewidth=0)
+        P = float(dataset["probability"].sel(model=model))
+        ax.plot(
+            at,
+            one["prediction_mean"].sel(model=model).values,
+            color=plots.COLOURS[k % len(plots.COLOURS)],
+            label=f"{model} ({P:.2g})",
+        )
+    ax.errorbar(at, one["measured"].values, yerr=one["sigma"].values, fmt=".", color=plots.DARK, label="measured")
+    ax.set_xlabel(f"{test}: stretch or amount of shear")
+    ax.set_ylabel("stress (Pa)")
+    ax.legend(fontsize="small", frameon=False)
+    return ax

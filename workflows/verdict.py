@@ -1,0 +1,96 @@
+"""What a comparison of models says, in sentences."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from workflows.words import number, with_error
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
+GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
+
+
+def grade(log_bayes_factor: float) -> str:
+    """Return the word for ln B ≥ 0 (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995) 773–795)."""
+    return next((word for limit, word in GRADES if log_bayes_factor < limit), "very strong")
+
+
+def ranking(values: xr.DataArray) -> list[str]:
+    """Names of the models, the one with the largest value first."""
+    return [str(name) for name in values.model.values[np.argsort(-values.to_numpy(), kind="stable")]]
+
+
+def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
+    """Say in which way the residuals of a model are not what it says of them; nothing where they may be."""
+    of_model = dataset.sel(model=model)
+    asked = 2 * dataset.sizes["group"]
+    said = []
+    for name, words in (
+        ("misfit_probability", "are larger than the errors"),
+        ("correlation_probability", "follow one another along the tests, as errors would not"),
+    ):
+        chances = of_model[name]
+        bad = [
+            str(group) for group, p in zip(dataset.group.values, chances.values, strict=True) if p * asked < SUSPICIOUS
+        ]
+        if bad:
+            where = f" in {', '.join(bad)}" if dataset.sizes["group"] > 1 else ""
+            smallest = float(chances.min())
+            said.append(f"{words}{where} ({_chance(smallest)})")
+    return said
+
+
+def findings(dataset: xr.Dataset) -> list[str]:
+    """Say which model the data support, by how much, how sure that is and what it depends on."""
+    order = ranking(dataset["log_evidence"])
+    best = order[0]
+    P = float(dataset["probability"].sel(model=best))
+    said = []
+    if len(order) > 1:
+        ln_B, error = bayes_factor(dataset, best, order[1])
+        said.append(
+            f"{best} is the most probable of the candidates, with {number(100 * P, 4)} %; ln of the Bayes factor over "
+            f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B)}."
+        )
+    else:
+        said.append(f"{best} is the only candidate.")
+    wrong = conflicts(dataset, best)
+    if wrong:
+        said.append(f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}.")
+    changed = []
+    for variant in dataset.variant.values[1:]:
+        other = ranking(dataset["variant_log_evidence"].sel(variant=variant))
+        if other[0] != best:
+            changed.append(f"{other[0]} with {variant}")
+        elif other != order:
+            said.append(f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+    if changed:
+        said.append(f"It depends: the most probable is {'; '.join(changed)}.")
+    predicts = ranking(dataset["score"])[0]
+    if predicts != best:
+        said.append(f"Left-out data are predicted best by {predicts}.")
+    doubtful = [
+        f"{model}" + (f" ({group})" if dataset.sizes["group"] > 1 else "")
+        for model in order
+        for group in dataset.group.values
+        if not bool(dataset["trusted"].sel(model=model, group=group))
+    ]
+    if doubtful:
+        said.append(f"Evidences not to be trusted, by the tail of their weights: {', '.join(doubtful)}.")
+    return said
+
+
+def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:
+    """Return ln of the Bayes factor of one model over another, and its standard error."""
+    values, errors = (dataset[name] for name in ("log_evidence", "log_evidence_error"))
+    difference = float(values.sel(model=one) - values.sel(model=other))
+    return difference, float(np.hypot(errors.sel(model=one), errors.sel(model=other)))
+
+
+def _chance(p: float) -> str:
+    return "p < 0.0003" if p < 3e-4 else f"p = {number(p, 2)}"
