@@ -38,7 +38,6 @@ def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[fl
         lambda u: ndtri(np.clip(u, 1e-15, 1 - 1e-15)),
         len(posterior.names),
         nlive=live,
-        sample="rwalk",
         rstate=np.random.default_rng(seed),
     )
     sampler.run_nested(print_progress=False, dlogz=0.01)
