@@ -74,7 +74,7 @@ def test_checkpoint_returns_what_was_saved(tmp_path):
     np.testing.assert_array_equal(found.outputs, evaluations.outputs)
     np.testing.assert_array_equal(found.tangents, evaluations.tangents)
     assert found.failures == evaluations.failures
-    checkpoint.consolidate(evaluations)
+    checkpoint.consolidate({"/": evaluations})
     checkpoint.clear()
     assert not (tmp_path / "evaluations").exists()
     np.testing.assert_array_equal(load_evaluations(tmp_path / "evaluations.h5").outputs, evaluations.outputs)
