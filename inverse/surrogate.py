@@ -35,7 +35,7 @@ SHARE = 0.7  # α: of the points from the Gaussians; the others are from the pri
 CENTRES = 64
 REACH = 0.4  # most that a Gaussian of the mixture is wide, in standard deviations of the prior
 SCRAMBLES = 8
-FIRST, LAST = 2**12, 2**15  # points of the first clouds and of the last one
+FIRST, LAST = 2**11, 2**13  # points of the first clouds and of the last one
 ROUNDS = 4
 ENOUGH = 0.2  # effective share of a cloud that needs no better proposal
 
