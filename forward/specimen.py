@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector
 from forward.hyperelastic import Hyperelastic, Material, Scalar
-from forward.fields import RandomField
 from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
 from forward.model import FloatArray, Reference, SolveError, Work
@@ -156,34 +156,39 @@ class Specimen(Settings):
         return self
 
     def _mistakes(self) -> Iterator[InitErrorDetails]:
-        def mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErrorDetails:
-            return InitErrorDetails(
-                type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given
-            )
-
         names = tuple(case.name for case in self.cases)
         for block, labels in (("cases", names), ("observed", tuple(item.label for item in self.observed))):
             for label, count in Counter(labels).items():
                 if count > 1:
-                    yield mistake((block,), f"{count} of them are called '{label}', expected different names", label)
+                    yield _mistake((block,), f"{count} of them are called '{label}', expected different names", label)
         for i, case in enumerate(self.cases):
             try:
                 self.loaded(case)
             except ValidationError as error:
                 for line in error.errors(include_url=False):
-                    yield mistake(("cases", i, *line["loc"]), line["msg"], line["input"])
+                    yield _mistake(("cases", i, *line["loc"]), line["msg"], line["input"])
             if not self.seen(case):
-                yield mistake(("cases", i), "nothing is measured in this load case", case.name)
+                yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
         for i, item in enumerate(self.observed):
-            if item.on is not None and item.on not in self.body.boundaries:
-                message = f"unknown boundary; {nearest(item.on, self.body.boundaries)}"
-                yield mistake(("observed", i, "on"), message, item.on)
-            for name in item.cases:
-                if name not in names:
-                    yield mistake(("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name)
-            for point in item.at:
-                if not self.body.contains(point):
-                    yield mistake(("observed", i, "at"), "outside the body", list(point))
+            yield from self._mistakes_of(i, item)
+
+    def _mistakes_of(self, i: int, item: Observed) -> Iterator[InitErrorDetails]:
+        names = tuple(case.name for case in self.cases)
+        if item.on is not None and item.on not in self.body.boundaries:
+            message = f"unknown boundary; {nearest(item.on, self.body.boundaries)}"
+            yield _mistake(("observed", i, "on"), message, item.on)
+        for name in item.cases:
+            if name not in names:
+                yield _mistake(("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name)
+        for point in item.at:
+            if not self.body.contains(point):
+                yield _mistake(("observed", i, "at"), "outside the body", list(point))
+
+
+def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErrorDetails:
+    return InitErrorDetails(
+        type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given
+    )
 
 
 class SpecimenModel:
@@ -201,12 +206,26 @@ class SpecimenModel:
         Which case (n,) it belongs to.
     models
         The models of the cases.
+    positions
+        Where the parameters of each case stand among all.
+    observations
+        B (n, U_local) of each case, sparse.
     """
 
     def __init__(self, spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> None:
         self.spec = spec
         self.parameters = parameters
-        self.models = tuple(spec.loaded(case).build(comm, parameters) for case in spec.cases)
+        known = {*spec.scalars, *spec.coefficients}
+        for path in parameters:
+            if path not in known:
+                message = f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}"
+                raise ValueError(message)
+        bodies = [spec.loaded(case) for case in spec.cases]
+        self.positions = [np.flatnonzero(np.isin(parameters, [*body.scalars, *body.coefficients])) for body in bodies]
+        self.models = tuple(
+            body.build(comm, tuple(parameters[i] for i in where))
+            for body, where in zip(bodies, self.positions, strict=True)
+        )
         self.displacements = 0  # states of several cases are no displacement field
         self.differentiable = True
         self.observations: list[csr_matrix] = []
@@ -240,13 +259,15 @@ class SpecimenModel:
             With the case that has no answer.
         """
         starts = [None] * len(self.models) if start is None else self.states(start)
-        references: list[Reference | None] = [None] * len(self.models)
+        references: list[FloatArray | None] = [None] * len(self.models)
         if reference is not None:
-            references = [Reference(reference.parameters, state) for state in self.states(reference.state)]
+            references = list(self.states(reference.state))
         solutions = []
-        for case, model, begin, near in zip(self.spec.cases, self.models, starts, references, strict=True):
+        parts = zip(self.spec.cases, self.models, self.positions, starts, references, strict=True)
+        for case, model, where, begin, state in parts:
+            near = None if reference is None or state is None else Reference(reference.parameters[where], state)
             try:
-                solutions.append(model.solve(parameters, begin, near, iterations))
+                solutions.append(model.solve(parameters[where], begin, near, iterations))
             except SolveError as error:
                 message = f"load case '{case.name}': {error.reason}"
                 raise SolveError(message, error.history, error.work) from error
@@ -294,18 +315,26 @@ class SpecimenSolution:
         parts = zip(self._model.models, self._model.observations, states, strict=True)
         return np.concatenate([model.body.total((B @ u.T).T) for model, B, u in parts], axis=-1)
 
+    def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
+        parts = zip(self.solutions, self._model.positions, strict=True)
+        return [solution.state_tangent(direction[..., where]) for solution, where in parts]
+
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        return np.concatenate([solution.state_tangent(direction) for solution in self.solutions], axis=-1)
+        return np.concatenate(self._state_tangents(direction), axis=-1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
-        return self._observe([solution.state_tangent(direction) for solution in self.solutions])
+        return self._observe(self._state_tangents(direction))
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
-        parts = zip(self.solutions, self._model.observations, self._model.values(weights), strict=True)
-        return np.asarray(sum(solution.state_adjoint((B.T @ w.T).T) for solution, B, w in parts))
+        model = self._model
+        gradients = np.zeros((*np.shape(weights)[:-1], len(model.parameters)))
+        parts = zip(self.solutions, model.positions, model.observations, model.values(weights), strict=True)
+        for solution, where, B, w in parts:
+            gradients[..., where] += solution.state_adjoint((B.T @ w.T).T)
+        return gradients
 
 
 def _observe(model: HyperelasticModel, item: Observed) -> tuple[csr_matrix, FloatArray, NDArray[np.int64]]:

@@ -144,7 +144,7 @@ class Point:
 
     @cached_property
     def residual(self) -> FloatArray:
-        """r (n,); zero where nothing was measured."""
+        """R (n,); zero where nothing was measured."""
         posterior = self.posterior
         gap = np.where(posterior.measured > 0, self.solution.outputs - posterior.data, 0.0)
         return np.asarray(posterior.weights * gap)

@@ -21,8 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from forward.model import FloatArray
-from inverse.field_posterior import BLOCK, FieldPosterior, Prior
-from inverse.newton_cg import Mode
+from inverse.field_posterior import BLOCK, Point, Prior
 
 CUTOFF = 0.1  # λ of pairs that are left out: they change a variance by at most λ/(1+λ)
 ACCURACY = 1e-2  # ‖AᵀAu − λu‖/λ of pairs that are kept: λ is known to about its square
@@ -57,6 +56,14 @@ class Spectrum:
     residuals: FloatArray
     neglected: float
     products: int
+
+    def solve(self, noise: FloatArray) -> FloatArray:
+        """Multiply (I + UΛUᵀ)⁻¹ with (N,), or (k, N)."""
+        return noise - (noise @ self.vectors.T * (self.values / (1 + self.values))) @ self.vectors
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Multiply (I + UΛUᵀ)^{−1/2} with (N,), or (k, N)."""
+        return noise + (noise @ self.vectors.T * ((1 + self.values) ** -0.5 - 1)) @ self.vectors
 
 
 def leading_pairs(
@@ -102,8 +109,8 @@ def leading_pairs(
         Q = np.concatenate([Q, new])
         values, turn = np.linalg.eigh(AQ @ AQ.T)
         values, turn = np.maximum(values[::-1], 0), turn[:, ::-1].T
-        largest = max(float(values[0]), np.finfo(float).tiny)
-        kept = min(int((values > max(cutoff, VANISHING * largest)).sum()), wanted)
+        rounding = VANISHING * float(values[0])
+        kept = min(int((values > max(cutoff, rounding)).sum()), wanted)
         residuals = np.linalg.norm(turn[:kept] @ HQ - values[:kept, None] * (turn[:kept] @ Q), axis=1)
         # What is found below the cutoff shows that nothing above it was missed (but for λ that more than `block`
         # directions share exactly).
@@ -112,7 +119,7 @@ def leading_pairs(
         if settled or len(Q) == size:
             break
         room = size - len(Q)
-        new = _orthonormal(products, Q, VANISHING * largest)[:room]
+        new = _orthonormal(products, Q, rounding)[:room]
         if len(new) == 0:  # the space is invariant: only other vectors can show more
             new = _orthonormal(rng.standard_normal((min(block, room), size)), Q, 0.0)
     neglected = float(values[kept]) if kept < len(values) else 0.0
@@ -160,7 +167,7 @@ class LowRankPosterior:
     @classmethod
     def at(
         cls,
-        mode: Mode,
+        mode: Point,
         *,
         cutoff: float = CUTOFF,
         rank: int | None = None,
@@ -169,10 +176,10 @@ class LowRankPosterior:
         seed: int = 0,
     ) -> LowRankPosterior:
         """Find the directions at a mode that the data constrain, as `leading_pairs` does."""
-        point, posterior = mode.point, mode.point.posterior
+        posterior = mode.posterior
         spectrum = leading_pairs(
-            point.image,
-            point.pull,
+            mode.image,
+            mode.pull,
             posterior.size,
             cutoff=cutoff,
             rank=rank,
@@ -180,7 +187,7 @@ class LowRankPosterior:
             block=block,
             seed=seed,
         )
-        return cls(point.values, point.noise, point.residual, posterior.weights, posterior.prior, spectrum)
+        return cls(mode.values, mode.noise, mode.residual, posterior.weights, posterior.prior, spectrum)
 
     # --- the field ---------------------------------------------------------------------------------------------------
 
@@ -214,14 +221,11 @@ class LowRankPosterior:
 
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply Γ_post with g (N,), or (k, N)."""
-        U, values = self.spectrum.vectors, self.spectrum.values
-        noise = self.prior.root_transposed(g)
-        return self.prior.root(noise - (noise @ U.T * (values / (1 + values))) @ U)
+        return self.prior.root(self.spectrum.solve(self.prior.root_transposed(g)))
 
     def samples(self, noise: FloatArray) -> FloatArray:
         """Return samples (N,) of standard normal noises (N,), or (k, N)."""
-        U = self.spectrum.vectors
-        return self.mean + self.prior.root(noise + (noise @ U.T * (self.narrowing - 1)) @ U)
+        return self.mean + self.prior.root(self.spectrum.root(noise))
 
     def marginal(self, g: FloatArray) -> tuple[float, float]:
         """Mean and standard deviation of the linear functional g·m (N,), for example the mean over a region."""

@@ -1,9 +1,13 @@
 """The mode of a posterior of a field: inexact Gauss–Newton steps by conjugate gradients, and a line search.
 
-Conjugate gradients on (I + AᵀA) δ = −g are those of the density of m, preconditioned by the prior covariance. They end
-at ‖(I + AᵀA) δ + g‖ ≤ η‖g‖ with η = min(½, √(‖g‖/‖g_0‖)): S. C. Eisenstat, H. F. Walker, SIAM J. Sci. Comput. 17
-(1996) 16–32. Steps are halved until they descend by a share of what their slope promises (L. Armijo, Pacific J. Math.
-16 (1966) 1–3), also where the model has no answer.
+Conjugate gradients on (I + AᵀA) δ = −g are those of the density of m, preconditioned by the prior covariance. Where
+they become long, the directions that the data constrain most are found (`inverse.low_rank`), and P = I + UΛUᵀ of these
+preconditions all that follow. They end at ‖(I + AᵀA) δ + g‖ ≤ η‖g‖ with η = min(0.1, √(‖g‖/‖g_0‖)), in the norm of
+P⁻¹: S. C. Eisenstat, H. F. Walker, SIAM J. Sci. Comput. 17 (1996) 16–32. Steps are halved until they descend by a share
+of what their slope promises (L. Armijo, Pacific J. Math. 16 (1966) 1–3), also where the model has no answer.
+
+In this norm the gradient says how far the mode is: P ≤ I + AᵀA, so that ‖g‖ is no smaller than the length of the step
+to the mode in standard deviations of the posterior.
 
 Second derivatives of the model are left out. They count as much as the residuals, which are noise at the mode; there
 the steps converge fast enough without them.
@@ -11,16 +15,22 @@ the steps converge fast enough without them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from forward.model import FloatArray, SolveError
 from inverse.field_posterior import FieldPosterior, Point
+from inverse.low_rank import Spectrum, leading_pairs
 
 ARMIJO = 1e-4
 HALVINGS = 20
 ROUNDING = 1e-12  # of the cost: what it cannot be expected to descend below
+CLOSE = 1e-2  # ‖g‖ at which the search ends
+FORCING = 0.1  # largest η: a solve costs as much as many products
+LONG = 20  # products of one step at which the step ends, and pairs are found
+STRONG = 10.0  # λ of these pairs: what is left takes few products
+ROUGH = 0.5  # their accuracy
 
 
 @dataclass(frozen=True)
@@ -32,9 +42,11 @@ class Iteration:
     misfit, penalty
         ½ r·r and ½ ξ·ξ where the step starts.
     gradient
-        ‖g‖ there.
+        ‖g‖ there, in the norm of P⁻¹.
+    pairs
+        Pairs of which P is made.
     products
-        Hessian products that the step took.
+        Hessian products that the step took, with those of new pairs.
     length
         Fraction of the step that was gone; zero in the last row.
     solves
@@ -44,6 +56,7 @@ class Iteration:
     misfit: float
     penalty: float
     gradient: float
+    pairs: int
     products: int
     length: float
     solves: int
@@ -58,7 +71,7 @@ class Mode:
     point
         The mode.
     converged
-        Whether the gradient has fallen to the tolerance, or the cost to rounding.
+        Whether the gradient has fallen to the tolerance.
     iterations
         The steps; the last row is the mode.
     """
@@ -82,7 +95,7 @@ def find_mode(
     posterior: FieldPosterior,
     start: FloatArray | None = None,
     *,
-    tolerance: float = 1e-6,
+    tolerance: float = CLOSE,
     steps: int = 50,
     products: int = 500,
 ) -> Mode:
@@ -95,11 +108,11 @@ def find_mode(
     start
         ξ (N,) where the search starts; by default zero, the centre of the prior.
     tolerance
-        ‖g‖ over ‖g_0‖ at the centre of the prior, or at the start, at which the search ends.
+        Distance to the mode, in standard deviations of the posterior, at which the search ends.
     steps
         Largest number of steps.
     products
-        Largest number of Hessian products of one step.
+        Largest number of Hessian products of the conjugate gradients of one step, once pairs are found.
 
     Raises
     ------
@@ -107,42 +120,53 @@ def find_mode(
         If the model has no answer at the start.
     """
     here = posterior.at(np.zeros(posterior.size) if start is None else start)
-    first = np.linalg.norm(here.gradient)
+    pairs: Spectrum | None = None
+    largest, used = 0.0, 0
     table: list[Iteration] = []
-    converged = False
-    for _ in range(steps):
-        size = float(np.linalg.norm(here.gradient))
-        converged = size <= tolerance * first
-        if converged:
+    for number in range(steps + 1):
+        spent = 0
+        if pairs is None and used == LONG:
+            pairs = leading_pairs(here.image, here.pull, posterior.size, cutoff=STRONG, accuracy=ROUGH)
+            largest, spent = 0.0, pairs.products  # the norm is another
+        size = _norm(here.gradient, pairs)
+        largest = max(largest, size)
+        rank = 0 if pairs is None else len(pairs.values)
+        row = Iteration(here.misfit, here.penalty, size, rank, spent, 0.0, 0)
+        if size <= tolerance or number == steps:
             break
-        forcing = min(0.5, float(np.sqrt(size / first)))
-        step, used = conjugate_gradients(here, forcing, products)
+        forcing = min(FORCING, float(np.sqrt(size / largest)))
+        step, used = conjugate_gradients(here, pairs, forcing, LONG if pairs is None else products)
+        row = replace(row, products=spent + used)
         there, length, solves = _search(here, step)
-        table.append(Iteration(here.misfit, here.penalty, size, used, length, solves))
+        row = replace(row, length=length, solves=solves)
         if there is None:
-            converged = -float(here.gradient @ step) <= np.sqrt(ROUNDING) * max(here.cost, 1.0)
             break
+        table.append(row)
         here = there
-    table.append(Iteration(here.misfit, here.penalty, float(np.linalg.norm(here.gradient)), 0, 0.0, 0))
-    return Mode(here, converged, tuple(table))
+    return Mode(here, row.gradient <= tolerance, (*table, row))
 
 
-def conjugate_gradients(here: Point, forcing: float, products: int) -> tuple[FloatArray, int]:
+def _norm(g: FloatArray, pairs: Spectrum | None) -> float:
+    return float(np.sqrt(g @ (g if pairs is None else pairs.solve(g))))
+
+
+def conjugate_gradients(here: Point, pairs: Spectrum | None, forcing: float, products: int) -> tuple[FloatArray, int]:
     """Solve (I + AᵀA) δ = −g to a relative residual; return δ (N,) and the number of products."""
     residual = -here.gradient
-    target = forcing * np.linalg.norm(residual)
     step = np.zeros_like(residual)
-    direction = residual
-    square = float(residual @ residual)
+    direction = residual if pairs is None else pairs.solve(residual)
+    square = float(residual @ direction)
+    target = forcing**2 * square
     for used in range(products):
-        if np.sqrt(square) <= target:
+        if square <= target:
             return step, used
-        curved = direction + here.product(direction)
-        along = square / float(direction @ curved)
-        step = step + along * direction
-        residual = residual - along * curved
-        before, square = square, float(residual @ residual)
-        direction = residual + square / before * direction
+        along = direction + here.product(direction)
+        length = square / float(direction @ along)
+        step = step + length * direction
+        residual = residual - length * along
+        conditioned = residual if pairs is None else pairs.solve(residual)
+        before, square = square, float(residual @ conditioned)
+        direction = conditioned + square / before * direction
     return step, products
 
 

@@ -53,12 +53,14 @@ class Linear:
         gain = self.prior_covariance @ K.T @ np.linalg.inv(self.scatter)
         self.mean = self.m_0 + gain @ (self.data[seen] - K @ self.m_0)
         self.covariance = self.prior_covariance - gain @ K @ self.prior_covariance
-        self.values = np.linalg.eigvalsh((K @ root / self.sigma[seen, None]).T @ (K @ root / self.sigma[seen, None]))[::-1]
+        self.values = np.linalg.eigvalsh((K @ root / self.sigma[seen, None]).T @ (K @ root / self.sigma[seen, None]))[
+            ::-1
+        ]
 
 
 def solved(problem, **settings):
-    mode = find_mode(problem.posterior, tolerance=1e-13)
-    return mode, LowRankPosterior.at(mode, **settings)
+    mode = find_mode(problem.posterior, tolerance=1e-9)
+    return mode, LowRankPosterior.at(mode.point, **settings)
 
 
 @pytest.mark.parametrize("holes", [0, 7])
@@ -163,7 +165,7 @@ def test_calibration():
         truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
         data = problem.G @ truth + problem.sigma * rng.standard_normal(DATA)
         posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
-        found = LowRankPosterior.at(find_mode(posterior, tolerance=1e-9), cutoff=1e-3)
+        found = LowRankPosterior.at(find_mode(posterior).point, cutoff=1e-3)
         low, high = found.interval(0.8)
         inside.append(((low <= truth) & (truth <= high)).mean())
         probabilities.append(found.residual_test[1])
@@ -199,16 +201,15 @@ def test_gradient_and_product_are_derivatives():
     rng = np.random.default_rng(0)
     noise, direction = rng.standard_normal((2, 12))
     point = posterior.at(noise)
-    slope, errors = point.gradient @ direction, []
-    for h in (1e-2, 1e-3):
-        errors.append(abs(posterior.at(noise + h * direction).cost - point.cost - h * slope))
+    slope, steps = point.gradient @ direction, (1e-2, 1e-3)
+    errors = [abs(posterior.at(noise + h * direction).cost - point.cost - h * slope) for h in steps]
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
     # Where nothing is left of the residual, the product is that of all second derivatives.
     exact = FieldPosterior(posterior.model, point.solution.outputs, posterior.sigma, posterior.prior)
-    point, errors = exact.at(noise), []
+    point = exact.at(noise)
     curve = direction + point.product(direction)
-    for h in (1e-3, 1e-4):
-        errors.append(np.linalg.norm(exact.at(noise + h * direction).gradient - point.gradient - h * curve))
+    moved = [(h, exact.at(noise + h * direction).gradient - point.gradient) for h in (1e-3, 1e-4)]
+    errors = [np.linalg.norm(change - h * curve) for h, change in moved]
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
 
@@ -217,7 +218,7 @@ def test_the_mode_is_stationary_also_where_steps_leave_what_can_be_solved(limit)
     posterior = curved(limit)
     mode = find_mode(posterior, tolerance=1e-10)
     assert mode.converged
-    assert np.linalg.norm(mode.point.gradient) <= 1e-10 * mode.iterations[0].gradient
+    assert np.linalg.norm(mode.point.gradient) <= 1e-8
     assert len(mode.iterations) < 25
     costs = [row.misfit + row.penalty for row in mode.iterations]
     assert (np.diff(costs) <= 1e-9).all()
