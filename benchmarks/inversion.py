@@ -22,9 +22,9 @@ CONTRAST = 3.0
 FIELD = RandomField(of="stiffness", length=0.5, std=0.6, basis="nodes")
 
 
-def specimen(cells: int) -> Specimen:
+def specimen(cells: int, points_along: int = 5) -> Specimen:
     """Return the unit cube, held below and pulled above along three directions, observed at points of four faces."""
-    lines = np.linspace(0, 1, 9).tolist()
+    lines = np.linspace(0, 1, points_along).tolist()
     faces = [((0.0, a, b), (1.0, a, b), (a, 1.0, b), (a, b, 1.0)) for a, b in product(lines, lines)]
     points = sorted({point for four in faces for point in four if point[2] > 0})
     directions = {"shear": (1.0, 0.0, 0.0), "extension": (0.0, 0.0, 1.0), "compression": (0.0, 0.0, -1.0)}
