@@ -282,24 +282,27 @@ def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
     return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
 
 
-def point_weights(space: Any, point: tuple[float, float, float]) -> tuple[NDArray[np.int32], FloatArray] | None:
-    """Return nodes and weights that interpolate at a point, where this rank owns a cell around it; collective."""
+def point_weights(space: Any, points: FloatArray) -> list[tuple[NDArray[np.int32], FloatArray] | None]:
+    """Return nodes and weights that interpolate at each point (n, 3) that this rank owns a cell around; collective."""
     msh = space.mesh
     probe = fem.Function(space)  # on every rank: making one is collective
     tree = geometry.BoundingBoxTree(msh, 3, padding=1e-10)
-    position = np.asarray(point, dtype=float)
-    candidates = geometry.compute_collisions(tree, position[None, :])
-    cells = geometry.compute_colliding_cells(msh, candidates, position[None, :]).links(0)
-    cells = cells[cells < msh.topology.index_map(3).size_local]
-    if len(cells) == 0:
-        return None
-    nodes = space.dofmap.cell_dofs(cells[0])
-    weights = np.empty(len(nodes))
-    for k, node in enumerate(nodes):
-        probe.x.array[:] = 0
-        probe.x.array[3 * node] = 1
-        weights[k] = probe.eval(position, cells[0])[0]
-    return nodes, weights
+    colliding = geometry.compute_colliding_cells(msh, geometry.compute_collisions(tree, points), points)
+    found: list[tuple[NDArray[np.int32], FloatArray] | None] = []
+    for i, position in enumerate(points):
+        cells = colliding.links(i)
+        cells = cells[cells < msh.topology.index_map(3).size_local]
+        if len(cells) == 0:
+            found.append(None)
+            continue
+        nodes = space.dofmap.cell_dofs(cells[0])
+        weights = np.empty(len(nodes))
+        for k, node in enumerate(nodes):
+            probe.x.array[3 * node] = 1
+            weights[k] = probe.eval(position, cells[0])[0]
+            probe.x.array[3 * node] = 0
+        found.append((nodes, weights))
+    return found
 
 
 def quadrature_points(space: Any, degree: int) -> FloatArray:

@@ -94,6 +94,10 @@ class RandomField(Settings):
             raise ValueError(message)
         return self
 
+    def prior(self, body: Body) -> NodalPrior:
+        """Return the distribution of the values at the vertices of a body: what `basis` "nodes" has as parameters."""
+        return NodalPrior(Matern.on(body, self.length, self.smoothness), self.log_std)
+
     def on(self, body: Body) -> Expansion:
         """Expand the field on the vertices of a body, in this process: one factorisation, and a solve per vertex."""
         if self.basis == "nodes":
@@ -174,6 +178,30 @@ class Nodal:
     def pull(self, slopes: FloatArray) -> FloatArray:
         """Return the slopes."""
         return slopes
+
+
+@dataclass(frozen=True)
+class NodalPrior:
+    """The normal distribution N(0, std² C) of values at the N vertices, with C a Matérn covariance.
+
+    Rows are vectors. The root is that of `Matern`, so that no covariance is ever formed.
+    """
+
+    matern: Matern
+    std: float
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance (N,) at the vertices."""
+        return np.full(len(self.matern.mass), self.std**2)
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Return the field (N,) of a standard normal noise (N,), or (k, N) for k of them."""
+        return self.std * self.matern.root(noise.T).T
+
+    def root_transposed(self, g: FloatArray) -> FloatArray:
+        """Apply the transpose of `root` to (N,) or (k, N)."""
+        return self.std * self.matern.root_transposed(g.T).T
 
 
 class Matern:

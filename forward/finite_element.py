@@ -849,7 +849,14 @@ class FiniteElementSolution:
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        loads = np.atleast_2d(weights) @ self._gradients
+        return self.state_adjoint(weights @ self._gradients) + weights @ self._partials
+
+    def state_adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the state weighted by `weights` (U_local,), or (k, d) for k of them; collective.
+
+        The transpose of `state_tangent`, summed over the ranks.
+        """
+        loads = np.atleast_2d(weights)
         multipliers = self._solve(loads, transpose=True)
         body = self._model.body
         gradients = np.zeros((len(loads), len(self.parameters)))
@@ -858,4 +865,4 @@ class FiniteElementSolution:
             body = self._model.visit(self)
             multipliers[:, body.fixed] = 0
             gradients -= np.array([body.field_products(multiplier) for multiplier in multipliers])
-        return gradients.reshape(*np.shape(weights)[:-1], -1) + weights @ self._partials
+        return gradients.reshape(*np.shape(weights)[:-1], -1)

@@ -83,7 +83,7 @@ class _Linear:
 
 
 def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
-    found = fenicsx.point_weights(body.space, output.at)
+    (found,) = fenicsx.point_weights(body.space, np.array([output.at]))
     owners = body.comm.allgather(found is not None)
     if not any(owners):
         message = f"output '{output.name}': the point {list(output.at)} lies outside the body"

@@ -68,11 +68,14 @@ class Layout:
         """Take this rank's part (k, U_local) of (k, U) in canonical order."""
         return np.ascontiguousarray(rows[:, self._unknowns])
 
+    def nodes(self) -> NDArray[np.int64]:
+        """Return the canonical positions of this rank's nodes, ghosts included."""
+        return np.asarray(self._canonical[fenicsx.global_node_numbers(self._space)])
+
     def cells(self) -> tuple[NDArray[np.int64], int]:
         """Return all cells (n_cells, k) as canonical nodes in VTK's order, and VTK's number of the type; collective."""
         local, kind = fenicsx.vtk_cells(self._space)
-        numbers = self._canonical[fenicsx.global_node_numbers(self._space)]
-        cells = np.concatenate(self._comm.allgather(numbers[local]))
+        cells = np.concatenate(self._comm.allgather(self.nodes()[local]))
         return cells[np.lexsort(cells.T[::-1])], kind
 
 

@@ -1,0 +1,380 @@
+"""A specimen under several load cases: one body with the same parameters, of which displacements are observed.
+
+Every case has a model of its own, and with it a factor of its own: products with the derivatives of all cases, however
+they alternate, use the factors of one solution. What is observed of a case is Bu with a sparse B.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from forward.fields import RandomField
+from forward.geometry import AXES, Body, Vector
+from forward.hyperelastic import Hyperelastic, Material, Scalar
+from forward.inclusions import Inclusion
+from forward.loads import Displacement, Load
+from forward.model import FloatArray, Reference, SolveError, Work
+from forward.newton import SolverSettings
+from forward.outputs import Output
+from forward.settings import Settings, nearest
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+    from forward.finite_element import FiniteElementSolution, HyperelasticModel
+
+
+class LoadCase(Settings):
+    """What acts on a specimen at one time.
+
+    Parameters
+    ----------
+    name
+        In names of observations.
+    clamp, displacements, loads
+        As of `Hyperelastic`.
+    """
+
+    name: str = Field(pattern=r"^[^.\s]+$")
+    clamp: tuple[str, ...] = ()
+    displacements: tuple[Displacement, ...] = ()
+    loads: tuple[Load, ...] = ()
+
+
+class Observed(Settings):
+    """Displacements (m) that are measured.
+
+    Parameters
+    ----------
+    name
+        In names of observations; by default the boundary, or "points".
+    on
+        Boundary at all of whose nodes they are measured.
+    at
+        Points of the undeformed body (m); either these or `on`.
+    components
+        Those that are measured.
+    cases
+        Names of the load cases in which they are measured; by default all.
+    """
+
+    name: str = Field(default="", pattern=r"^[^.\s]*$")
+    on: str | None = None
+    at: tuple[Vector, ...] = ()
+    components: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = "xyz"
+    cases: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """The name in names of observations."""
+        return self.name or self.on or "points"
+
+    @model_validator(mode="after")
+    def _check(self) -> Observed:
+        if (self.on is None) == (not self.at):
+            message = "expected either a boundary ('on') or points ('at')"
+            raise ValueError(message)
+        return self
+
+
+class _Loaded(Hyperelastic):
+    """The body in one load case; what is observed of it are no outputs."""
+
+    outputs: tuple[Output, ...] = ()
+
+
+class Specimen(Settings):
+    """A body that is tested in several load cases.
+
+    Parameters
+    ----------
+    body, material, inclusions, fields, solver, formulation
+        As of `Hyperelastic`; the same in all cases.
+    cases
+        Load cases.
+    observed
+        What is measured.
+    """
+
+    kind: Literal["specimen"] = "specimen"
+    body: Body
+    material: Material
+    inclusions: tuple[Inclusion, ...] = ()
+    fields: tuple[RandomField, ...] = ()
+    solver: SolverSettings = SolverSettings()
+    formulation: Literal["displacement", "mixed", "auto"] = "auto"
+    cases: tuple[LoadCase, ...] = Field(min_length=1)
+    observed: tuple[Observed, ...] = Field(min_length=1)
+
+    def loaded(self, case: LoadCase) -> Hyperelastic:
+        """Return the body in one load case."""
+        shared = {name: getattr(self, name) for name in ("body", "material", "inclusions", "fields", "solver")}
+        acting = {name: getattr(case, name) for name in ("clamp", "displacements", "loads")}
+        return _Loaded(formulation=self.formulation, **shared, **acting)
+
+    def seen(self, case: LoadCase) -> tuple[Observed, ...]:
+        """Return what is measured in one load case."""
+        return tuple(item for item in self.observed if not item.cases or case.name in item.cases)
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Every number of every case that can be made a parameter, by its path; equal paths are one parameter."""
+        found: dict[str, Scalar] = {}
+        for case in self.cases:
+            found |= self.loaded(case).scalars
+        return found
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Paths of the coefficients of the random fields, which can be parameters too."""
+        return tuple(path for field in self.fields for path in field.paths(self.body))
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
+        """Mesh the body and compile the forms of every case on a communicator; collective.
+
+        Parameters
+        ----------
+        comm
+            mpi4py communicator of the ranks that share the model.
+        parameters
+            As of `Hyperelastic.build`.
+        """
+        return SpecimenModel(self, comm, parameters)
+
+    @model_validator(mode="after")
+    def _check(self) -> Specimen:
+        mistakes = list(self._mistakes())
+        if mistakes:
+            raise ValidationError.from_exception_data(type(self).__name__, mistakes)
+        return self
+
+    def _mistakes(self) -> Iterator[InitErrorDetails]:
+        names = tuple(case.name for case in self.cases)
+        for block, labels in (("cases", names), ("observed", tuple(item.label for item in self.observed))):
+            for label, count in Counter(labels).items():
+                if count > 1:
+                    yield _mistake((block,), f"{count} of them are called '{label}', expected different names", label)
+        for i, case in enumerate(self.cases):
+            try:
+                self.loaded(case)
+            except ValidationError as error:
+                for line in error.errors(include_url=False):
+                    yield _mistake(("cases", i, *line["loc"]), line["msg"], line["input"])
+            if not self.seen(case):
+                yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
+        for i, item in enumerate(self.observed):
+            yield from self._mistakes_of(i, item)
+
+    def _mistakes_of(self, i: int, item: Observed) -> Iterator[InitErrorDetails]:
+        names = tuple(case.name for case in self.cases)
+        if item.on is not None and item.on not in self.body.boundaries:
+            message = f"unknown boundary; {nearest(item.on, self.body.boundaries)}"
+            yield _mistake(("observed", i, "on"), message, item.on)
+        for name in item.cases:
+            if name not in names:
+                yield _mistake(("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name)
+        for point in item.at:
+            if not self.body.contains(point):
+                yield _mistake(("observed", i, "at"), "outside the body", list(point))
+
+
+def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErrorDetails:
+    return InitErrorDetails(
+        type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given
+    )
+
+
+class SpecimenModel:
+    """A specimen as a `ForwardModel`: its outputs are what is observed in all cases, its states those of all cases.
+
+    Attributes
+    ----------
+    parameters, outputs
+        Names.
+    places
+        Where (n, 3) each output is observed (m, undeformed).
+    axes
+        Its component (n,): 0, 1 or 2.
+    cases
+        Which case (n,) it belongs to.
+    models
+        The models of the cases.
+    positions
+        Where the parameters of each case stand among all.
+    observations
+        B (n, U_local) of each case, sparse.
+    """
+
+    def __init__(self, spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> None:
+        self.spec = spec
+        self.parameters = parameters
+        known = {*spec.scalars, *spec.coefficients}
+        for path in parameters:
+            if path not in known:
+                message = f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}"
+                raise ValueError(message)
+        bodies = [spec.loaded(case) for case in spec.cases]
+        self.positions = [np.flatnonzero(np.isin(parameters, [*body.scalars, *body.coefficients])) for body in bodies]
+        self.models = tuple(
+            body.build(comm, tuple(parameters[i] for i in where))
+            for body, where in zip(bodies, self.positions, strict=True)
+        )
+        self.displacements = 0  # states of several cases are no displacement field
+        self.differentiable = True
+        self.observations: list[csr_matrix] = []
+        names: list[str] = []
+        places, axes, cases = [], [], []
+        for number, (case, model) in enumerate(zip(spec.cases, self.models, strict=True)):
+            found = [_observe(model, item) for item in spec.seen(case)]
+            for item, (matrix, where, components) in zip(spec.seen(case), found, strict=True):
+                k = len(item.components)
+                names += [f"{case.name}.{item.label}.{i // k}.{AXES[a]}" for i, a in enumerate(components)]
+                places.append(where)
+                axes.append(components)
+                cases.append(np.full(matrix.shape[0], number))
+            self.observations.append(_stacked([matrix for matrix, _, _ in found]))
+        self.outputs = tuple(names)
+        self.places, self.axes, self.cases = (np.concatenate(parts) for parts in (places, axes, cases))
+        self._ends = np.cumsum([matrix.shape[0] for matrix in self.observations])[:-1]
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> SpecimenSolution:
+        """Find the equilibria of all cases at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
+
+        Raises
+        ------
+        SolveError
+            With the case that has no answer.
+        """
+        starts = [None] * len(self.models) if start is None else self.states(start)
+        references: list[FloatArray | None] = [None] * len(self.models)
+        if reference is not None:
+            references = list(self.states(reference.state))
+        solutions = []
+        parts = zip(self.spec.cases, self.models, self.positions, starts, references, strict=True)
+        for case, model, where, begin, state in parts:
+            near = None if reference is None or state is None else Reference(reference.parameters[where], state)
+            try:
+                solutions.append(model.solve(parameters[where], begin, near, iterations))
+            except SolveError as error:
+                message = f"load case '{case.name}': {error.reason}"
+                raise SolveError(message, error.history, error.work) from error
+        return SpecimenSolution(self, tuple(solutions))
+
+    def states(self, rows: FloatArray) -> list[FloatArray]:
+        """Split this rank's states (…, U_local) into those of the cases."""
+        return np.split(rows, np.cumsum([model.body.size for model in self.models])[:-1], axis=-1)
+
+    def values(self, rows: FloatArray) -> list[FloatArray]:
+        """Split what is observed (…, n) into that of the cases."""
+        return np.split(rows, self._ends, axis=-1)
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) as (k, U), case after case, on the first rank."""
+        parts = [model.gather(part) for model, part in zip(self.models, self.states(rows), strict=True)]
+        whole = [part for part in parts if part is not None]
+        return np.concatenate(whole, axis=1) if whole else None
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U)."""
+        parts = np.split(rows, len(self.models), axis=1)  # the cases have as many unknowns
+        return np.concatenate([model.scatter(part) for model, part in zip(self.models, parts, strict=True)], axis=1)
+
+
+class SpecimenSolution:
+    """The equilibria of all cases with their linearisations; k derivatives of a case are solved for together."""
+
+    def __init__(self, model: SpecimenModel, solutions: tuple[FiniteElementSolution, ...]) -> None:
+        self._model = model
+        self.solutions = solutions
+        self.state = np.concatenate([solution.state for solution in solutions])
+        self.outputs = self._observe([solution.state for solution in solutions])
+        for array in (self.state, self.outputs):
+            array.flags.writeable = False
+        self.residual = max(solution.residual for solution in solutions)
+        self.converged = all(solution.converged for solution in solutions)
+
+    @property
+    def work(self) -> Work:
+        """What the solutions of all cases have cost so far."""
+        return Work(*sum(solution.work.as_array() for solution in self.solutions).tolist())  # type: ignore[union-attr]
+
+    def _observe(self, states: list[FloatArray]) -> FloatArray:
+        parts = zip(self._model.models, self._model.observations, states, strict=True)
+        return np.concatenate([model.body.total((B @ u.T).T) for model, B, u in parts], axis=-1)
+
+    def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
+        parts = zip(self.solutions, self._model.positions, strict=True)
+        return [solution.state_tangent(direction[..., where]) for solution, where in parts]
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
+        return np.concatenate(self._state_tangents(direction), axis=-1)
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
+        return self._observe(self._state_tangents(direction))
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
+        model = self._model
+        gradients = np.zeros((*np.shape(weights)[:-1], len(model.parameters)))
+        parts = zip(self.solutions, model.positions, model.observations, model.values(weights), strict=True)
+        for solution, where, B, w in parts:
+            gradients[..., where] += solution.state_adjoint((B.T @ w.T).T)
+        return gradients
+
+
+def _observe(model: HyperelasticModel, item: Observed) -> tuple[csr_matrix, FloatArray, NDArray[np.int64]]:
+    """Return B (n, U_local), the places (n, 3) and the components (n,) of what is observed; collective."""
+    from scipy.sparse import csr_matrix
+
+    from forward import fenicsx
+
+    body, layout = model.body, model.layout
+    numbers = layout.nodes()
+    if item.on is not None:
+        mine = numbers[fenicsx.boundary_nodes(body.space, body.facets[item.on])]
+        nodes = np.unique(np.concatenate(body.comm.allgather(mine)))
+        places = layout.coordinates[nodes]
+        weights = [(i, np.array([node]), np.ones(1)) for i, node in enumerate(nodes)]
+    else:
+        places = np.array(item.at)
+        found = fenicsx.point_weights(body.space, places)
+        mine_too = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
+        held: dict[int, Any] = {}
+        for part in reversed(body.comm.allgather(mine_too)):  # the first rank that has a point counts
+            held |= part
+        weights = [(i, *held[i]) for i in range(len(places))]
+    axes = [AXES.index(axis) for axis in item.components]
+    k = len(axes)
+    local = np.full(len(layout.coordinates), -1)
+    local[layout.positions] = np.arange(len(layout.positions))
+    rows, columns, values = [], [], []
+    for i, at, w in weights:
+        owned = local[at] >= 0
+        for j, a in enumerate(axes):
+            rows.append(np.full(owned.sum(), k * i + j))
+            columns.append(3 * local[at][owned] + a)
+            values.append(w[owned])
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    matrix = csr_matrix(entries, shape=(k * len(places), body.size))
+    return matrix, np.repeat(places, k, axis=0), np.tile(axes, len(places))
+
+
+def _stacked(matrices: list[csr_matrix]) -> csr_matrix:
+    from scipy.sparse import vstack
+
+    return vstack(matrices, format="csr")
