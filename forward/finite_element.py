@@ -19,7 +19,7 @@ import numpy as np
 import ufl
 
 from forward import fenicsx, kinematics
-from forward.acceleration import block_galerkin
+from forward.acceleration import Inverse, block_galerkin
 from forward.functionals import functional
 from forward.geometry import AXES
 from forward.hyperelastic import Hyperelastic
@@ -675,8 +675,8 @@ class HyperelasticModel:
         way = None if reference is None else _Way(self, reference, parameters)
         found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
-        corrected = body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
+        corrected = way is not None and way.rotation is not None and body.work.factorisations == 0
+        return FiniteElementSolution(self, parameters, found, body.work, way if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -729,13 +729,28 @@ class HyperelasticModel:
 
 
 class _Way:
-    """The straight line in parameters from a reference."""
+    """The straight line in parameters from a reference.
+
+    Attributes
+    ----------
+    reference
+        Where it begins.
+    state
+        Of the reference.
+    rotation
+        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    """
 
     def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray) -> None:
-        self._body = model.body
+        self._body, self._factor = model.body, model.reference
         self._from, self._to = reference.parameters, parameters
+        self.reference = reference
         self.state = reference.state
-        self.inverse = model.reference.near
+        self.rotation: FloatArray | None = None
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        self.rotation = self._factor.rotation(u)
+        return self._factor.inverse(self.rotation)
 
     def at(self, fraction: float) -> None:
         self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
@@ -755,7 +770,7 @@ class FiniteElementSolution:
         parameters: FloatArray,
         found: Found,
         work: Work,
-        reference: Reference | None,
+        way: _Way | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
@@ -764,7 +779,8 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self._reference = reference
+        self._reference = None if way is None else way.reference
+        self._rotation = None if way is None else way.rotation
         model.visit(self)
         self.outputs = np.array([f.value() for f in model._functionals])
         self.outputs.flags.writeable = False
@@ -785,29 +801,20 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
-    @cached_property
-    def _rotation(self) -> FloatArray:
-        """Rotations of the nodes from the reference to this solution."""
-        model = self._model
-        assert self._reference is not None
-        factor = model.take_reference(self._reference)
-        model.visit(self)
-        return factor.rotation(self.state)
-
     def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
         """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
         model = self._model
-        if self._reference is not None and len(right) <= FEW:
-            found = self._solve_near(right, self._reference, transpose=transpose, directions=directions)
+        if self._reference is not None and self._rotation is not None and len(right) <= FEW:
+            found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
             if found is not None:
                 return found
         return model.linearise(self).back_substitute(right, transpose=transpose)
 
     def _solve_near(
-        self, right: FloatArray, reference: Reference, *, transpose: bool, directions: FloatArray | None
+        self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
     ) -> FloatArray | None:
-        """Solve with the factor of the reference; nothing if that is too far away."""
-        model, R = self._model, self._rotation
+        """Solve with the factor of the reference, turned as for its prediction; nothing if that is too far away."""
+        model = self._model
         factor = model.take_reference(reference)
         fixed = model.body.fixed
         first = None
