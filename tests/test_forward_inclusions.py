@@ -128,7 +128,7 @@ def test_derivatives_in_every_number_of_an_ellipsoid():
     numbers = [name for name in TURNED if name not in {"kind", "name"}]
     paths = tuple(f"inclusions.tumour.{number}" for number in numbers)
     outputs = ({"kind": "mean-displacement", "name": "mean", "on": "x-max", "component": "y"},)
-    spec = loaded_body("mooney-rivlin", body=BODY, inclusions=(TURNED,), outputs=outputs)
+    spec = loaded_body("neo-hookean-coupled", body=BODY, inclusions=(TURNED,), outputs=outputs)
     point = np.array([TURNED[number] for number in numbers])
     scale = np.where(np.char.startswith(numbers, "turn"), 0.3, 0.1 * np.abs(point))
     model = spec.build(MPI.COMM_SELF, paths)
