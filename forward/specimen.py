@@ -291,9 +291,7 @@ class SpecimenModel:
         other._observing(places, axes, cases, tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels)))
         return other
 
-    def _observing(
-        self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], names: tuple[str, ...]
-    ) -> None:
+    def _observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], names: tuple[str, ...]) -> None:
         self.outputs, self.places = names, places
         self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
         numbers = range(len(self.models))
