@@ -36,7 +36,7 @@ STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of these derivatives, before a factor is made after all
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
-_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh)
+_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh, sin=ufl.sin, cos=ufl.cos)
 
 
 class Discretisation:
