@@ -41,6 +41,7 @@ _OPS = SimpleNamespace(
     exp=ufl.exp,
     sqrt=ufl.sqrt,
     tanh=ufl.tanh,
+    sin=ufl.sin,
     cos=ufl.cos,
     atan2=ufl.atan_2,
     tr=ufl.tr,

@@ -255,7 +255,7 @@ def reading(
     kinematics = _MODES[mode]
     x = sympy.Symbol("x", real=True, positive=None if mode == "simple-shear" else True)
     z, y = sympy.symbols("z y", positive=True)
-    theta = {name: sympy.Symbol(name, real=True) for name in names}
+    theta = dict(zip(names, sympy.symbols(names, real=True), strict=True))
     confined = kinematics.incompressible is None
     incompressible = "D1" in constants(MATERIALS[energy]) and "D1" not in names
     values = theta if not incompressible else theta | {"D1": sympy.Integer(0)}
@@ -275,9 +275,8 @@ def reading(
         return function
 
     free = not incompressible and not confined
-    slopes = [P.diff(symbol) for symbol in theta.values()]
     # Beyond where an energy ends, its derivatives may be numbers.
-    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *slopes])
+    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *(P.diff(s) for s in theta.values())])
     if free:
         g = W.diff(y)
         balance = compiled([g, g.diff(y)])

@@ -119,8 +119,8 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     m = posterior.data.size
     misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
-    drawn = np.sort(_agreement(errors, neighbours))
-    larger = 1 - np.searchsorted(drawn, _agreement(r, neighbours)) / DRAWS
+    drawn = np.sort(agreement(errors, neighbours))
+    larger = 1 - np.searchsorted(drawn, agreement(r, neighbours)) / DRAWS
     return Criticism(scores, tails, misfit, float(w @ larger))
 
 
@@ -136,7 +136,8 @@ def _neighbours(data: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(first), np.concatenate(second)
 
 
-def _agreement(r: FloatArray, neighbours: tuple[Any, Any]) -> FloatArray:
+def agreement(r: FloatArray, neighbours: tuple[Any, Any]) -> FloatArray:
+    """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
     return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
 
 
@@ -253,7 +254,7 @@ def _predictions(
         w, outputs = evidence.weights[used], evidence.density.everything[used]
         mean[k] = w @ outputs
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
-        bands[:, k] = np.array([_quantiles(column, w) for column in outputs.T]).T
+        bands[:, k] = np.array([quantiles(column, w) for column in outputs.T]).T
     average = P @ mean
     missing = np.full(M - m, np.nan)
     sigma = next(posteriors[name, group].sigma for name in names)
@@ -292,7 +293,7 @@ def _constants(
             mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
             mean[k, g, columns] = w @ points
             std[k, g, columns] = np.sqrt(w @ (points - w @ points) ** 2)
-            bands[:, k, g, columns] = np.array([_quantiles(column, w) for column in points.T]).T
+            bands[:, k, g, columns] = np.array([quantiles(column, w) for column in points.T]).T
     dims = ("model", "group", "parameter")
     return {
         "constant_mode": (dims, mode),
@@ -302,7 +303,8 @@ def _constants(
     }
 
 
-def _quantiles(values: FloatArray, weights: FloatArray) -> FloatArray:
+def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:
+    """Return quantiles of values (n,) at points with weights (n,) of sum 1."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order]) - weights[order] / 2
-    return np.interp(QUANTILES, reached, values[order])
+    return np.interp(levels, reached, values[order])

@@ -65,7 +65,9 @@ def unit_of(path: str) -> str:
     if block == "fields":
         return "1"
     if block == "inclusions":
-        return "1" if path.endswith(".contrast") else "m"
+        return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
+            path.rpartition(".")[2], "m"
+        )
     if path.endswith(".density"):
         return "kg/m³"
     return "m" if block == "displacements" else "Pa"
