@@ -272,7 +272,14 @@ class Selection(Settings):
     def planned(self) -> int:
         """Number of solves, roughly: the searches for the modes take as many as they take."""
         searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
-        return (self.method.samples * len(self.pairs) + searches) * self.method.variants
+        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
+
+    @property
+    def evidences(self) -> int:
+        """Number of evidences that are found."""
+        tests = [len({test.label for test in self._measured(group)}) for group in self.data.groups]
+        held_out = sum(count for count in tests if count > 1) if self.method.held_out else 0
+        return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
 
     @property
     def groups(self) -> dict[str, Data]:
