@@ -26,7 +26,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
-from forward.materials import MATERIALS
+from forward.materials import MATERIALS, measures
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Found, Residual, solve
 from forward.reference import ReferenceFactor, turn
@@ -36,7 +36,18 @@ STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of these derivatives, before a factor is made after all
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
-_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh, sin=ufl.sin, cos=ufl.cos)
+_OPS = SimpleNamespace(
+    ln=ufl.ln,
+    exp=ufl.exp,
+    sqrt=ufl.sqrt,
+    tanh=ufl.tanh,
+    sin=ufl.sin,
+    cos=ufl.cos,
+    atan2=ufl.atan_2,
+    tr=ufl.tr,
+    det=ufl.det,
+    positive=lambda x: ufl.max_value(x, 0.0),
+)
 
 
 class Discretisation:
@@ -79,7 +90,15 @@ class Discretisation:
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
-        self._invariants = tuple(ufl.variable(invariant) for invariant in kinematics.invariants(ufl, self.F))
+        self._fibres = [fenicsx.constant(self.mesh, unit) for unit in spec.fibres]
+        self._of_stretches = "l1" in measures(spec.energy)
+        self._gradient = ufl.variable(self.F) if self._of_stretches else self.F
+        self._measures = self.measures_of(self._gradient)
+        if not self._of_stretches:
+            self._measures = {
+                name: tuple(map(ufl.variable, measure)) if name == "I4" else ufl.variable(measure)
+                for name, measure in self._measures.items()
+            }
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._loads = self._virtual_works()
@@ -102,13 +121,21 @@ class Discretisation:
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
-    def energy_of(self, invariants: tuple[Any, Any, Any]) -> Any:
-        """Energy density of I1, I2 and J, as UFL; in the mixed form, without that of the change of volume."""
-        energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
+    def measures_of(self, F: Any) -> dict[str, Any]:
+        """Return what the energy is a function of, by name, from a deformation gradient as UFL."""
+        if self._of_stretches:
+            stretches = kinematics.principal_stretches(_OPS, F, ufl.Identity(3))
+            return {**dict(zip(("l1", "l2", "l3"), stretches, strict=True)), "J": ufl.det(F)}
+        found = dict(zip(("I1", "I2", "J"), kinematics.invariants(ufl, F), strict=True))
+        fibres = {"I4": tuple(kinematics.fibre_stretch(ufl, F, fibre) for fibre in self._fibres)}
+        return found | fibres if self._fibres else found
+
+    def energy_of(self, measures: dict[str, Any]) -> Any:
+        """Energy density of its measures, as UFL; in the mixed form, without that of the change of volume."""
         values = self._numbers("material")
         if self.p is not None:
             values["D1"] = 0
-        return self.stiffness_factor * energy(_OPS, *invariants, **values)
+        return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *measures.values(), **values)
 
     @cached_property
     def stiffness_factor(self) -> Any:
@@ -139,7 +166,7 @@ class Discretisation:
         In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
         keeps its digits however small it is.
         """
-        energy, J, p = self.energy_of(self._invariants), self._invariants[2], self._pressure
+        energy, J, p = self.energy_of(self._measures), self._measures["J"], self._pressure
         if p is None:
             return energy, energy, self.J - 1
         bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
@@ -147,9 +174,16 @@ class Discretisation:
         return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
 
     def _variation_of(self, density: Any) -> Any:
-        """First variation of a density of the invariants and the pressure: P : ∇v, and that of the pressure."""
-        slopes = tuple(ufl.diff(density, invariant) for invariant in self._invariants)
-        work = ufl.inner(kinematics.nominal_stress(ufl, self.F, slopes), ufl.grad(self.test))
+        """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
+        if self._of_stretches:
+            P = ufl.diff(density, self._gradient)
+        else:
+            found = self._measures
+            of_I1, of_I2, of_J = (ufl.diff(density, found[name]) for name in ("I1", "I2", "J"))
+            of_I4 = [ufl.diff(density, squared) for squared in found.get("I4", ())]
+            fibres = list(zip(self._fibres, of_I4, strict=True))
+            P = kinematics.nominal_stress(ufl, self.F, (of_I1, of_I2, of_J), fibres)
+        work = ufl.inner(P, ufl.grad(self.test))
         return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
 
     def derivative(self, form: Any) -> Any:

@@ -86,6 +86,8 @@ class Select(Settings):
         By name: what else the errors might be; all evidences are found again with each.
     subsets
         By name: tests whose data are taken alone; all evidences are found again with each.
+    held_out
+        Predict every test from the others too: all evidences are found again without each of them.
     seed
         Of all draws.
     starts
@@ -99,6 +101,7 @@ class Select(Settings):
     noise: Noise
     other_noises: dict[str, Noise] = Field(default={})
     subsets: dict[str, tuple[str, ...]] = Field(default={})
+    held_out: bool = False
     seed: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 4
     check: Literal["dynesty"] | None = None
@@ -113,7 +116,7 @@ class Select(Settings):
 
     @property
     def variants(self) -> int:
-        """Number of times that all evidences are found."""
+        """Number of times that all evidences are found, without those for tests that are held out."""
         return 1 + len(self.other_noises) + len(self.subsets)
 
     def run(
@@ -171,13 +174,28 @@ class Select(Settings):
             variants[label] = {
                 pair: self._value(_only(posteriors[pair], groups[pair[1]], tests), pair)
                 for pair in pairs
-                if set(tests) & set(groups[pair[1]].tests[: len(groups[pair[1]].values)])
+                if set(tests) & set(_tests(groups[pair[1]]))
             }
         checks = {}
         if self.check is not None:
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
-        return comparison(candidates, groups, posteriors, stated, variants, checks)
+        left_out = (
+            {test: self._without(test, groups, posteriors) for test in _testnames(groups)} if self.held_out else {}
+        )
+        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out)
+
+    def _without(
+        self, test: str, groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
+    ) -> dict[tuple[str, str], tuple[float, float]]:
+        """Return ln Z and its error without a test, in the groups that have it and others."""
+        found = {}
+        for pair, posterior in posteriors.items():
+            rest = _tests(groups[pair[1]])
+            if test in rest and len(rest) > 1:
+                others = tuple(other for other in rest if other != test)
+                found[pair] = self._value(_only(posterior, groups[pair[1]], others), pair)
+        return found
 
     def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> Assessment:
         try:
@@ -196,6 +214,15 @@ def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate
     """Return the posterior of a candidate."""
     sigma = noise.sigma(data.values, data.sigma)
     return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
+
+
+def _tests(data: Data) -> tuple[str, ...]:
+    """Names of the tests that were measured."""
+    return tuple(dict.fromkeys(data.tests[: data.values.size]))
+
+
+def _testnames(groups: Mapping[str, Data]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(test for data in groups.values() for test in _tests(data)))
 
 
 def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:

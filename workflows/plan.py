@@ -68,7 +68,7 @@ def plan(study: Study | Selection, groups: int = 1) -> list[str]:
 
 def _comparison(study: Selection) -> list[str]:
     method, tests = study.method, study.data.tests
-    evidences = len(study.pairs) * method.variants
+    evidences = study.evidences
     seconds = SECONDS_PER_STRESS * study.planned + SECONDS_PER_SURROGATE * evidences
     check = " and nested sampling, which takes minutes" if method.check else ""
     groups = f" in {len(study.data.groups)} groups" if len(study.data.groups) > 1 else ""

@@ -12,8 +12,9 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.homogeneous import ENERGIES, HomogeneousModel, MaterialTest, Mode
-from forward.materials import constants
+from forward.geometry import Vector
+from forward.homogeneous import HomogeneousModel, MaterialTest, Mode, unfit
+from forward.materials import MATERIALS, constants
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
 from inverse.selection import Select
@@ -168,7 +169,8 @@ class CandidateModel(Settings):
     Parameters
     ----------
     material
-        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible.
+        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible. Fibres, where
+        it has them, by their components along the first stretch, along the second one and across both.
     parameters
         Priors of the constants that do.
     correlations
@@ -177,7 +179,7 @@ class CandidateModel(Settings):
         Its probability before the data, up to a common factor.
     """
 
-    material: dict[str, float | str]
+    material: dict[str, float | str | tuple[Vector, ...]]
     parameters: dict[str, Distribution] = Field(min_length=1)
     correlations: tuple[Correlation, ...] = ()
     weight: Annotated[float, Field(gt=0)] = 1.0
@@ -195,19 +197,25 @@ class CandidateModel(Settings):
     @property
     def fixed(self) -> dict[str, float]:
         """Constants that do not vary."""
-        return {name: float(value) for name, value in self.material.items() if name != "kind"}
+        return {name: value for name, value in self.material.items() if isinstance(value, float)}
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Directions of the families of fibres."""
+        return tuple(self.material.get("fibres", ()))  # type: ignore[arg-type]
 
     @model_validator(mode="after")
     def _check(self) -> CandidateModel:
         kind = self.material.get("kind")
-        if kind not in ENERGIES:
-            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(ENERGIES))}"
+        if kind not in MATERIALS:
+            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(MATERIALS))}"
             raise ValueError(message)
-        words = [name for name, value in self.material.items() if name != "kind" and isinstance(value, str)]
+        numbers = {name for name, value in self.material.items() if isinstance(value, float)}
+        words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
         if words:
             message = f"material.{words[0]}: {self.material[words[0]]!r}, expected a number"
             raise ValueError(message)
-        known = constants(ENERGIES[self.kind])
+        known = constants(MATERIALS[self.kind])
         given = dict.fromkeys([*self.fixed, *self.parameters])
         for name in given:
             if name not in known:
@@ -264,7 +272,14 @@ class Selection(Settings):
     def planned(self) -> int:
         """Number of solves, roughly: the searches for the modes take as many as they take."""
         searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
-        return (self.method.samples * len(self.pairs) + searches) * self.method.variants
+        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
+
+    @property
+    def evidences(self) -> int:
+        """Number of evidences that are found."""
+        tests = [len({test.label for test in self._measured(group)}) for group in self.data.groups]
+        held_out = sum(count for count in tests if count > 1) if self.method.held_out else 0
+        return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
 
     @property
     def groups(self) -> dict[str, Data]:
@@ -290,7 +305,12 @@ class Selection(Settings):
     def build(self, name: str, group: str) -> HomogeneousModel:
         """Make the model of a candidate in a group."""
         candidate = self.candidates[name]
-        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), tuple(candidate.parameters))
+        names = tuple(candidate.parameters)
+        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), names, candidate.fibres)
+
+    @property
+    def _all_tests(self) -> tuple[MaterialTest, ...]:
+        return (*self.data.tests, *self.predict)
 
     def _measured(self, group: str) -> list[MeasuredTest]:
         return [test for test in self.data.tests if test.group == group]
@@ -326,6 +346,10 @@ class Selection(Settings):
                 if test not in known:
                     yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
         for name, candidate in self.candidates.items():
+            objections = (unfit(candidate.kind, test.mode, candidate.fibres) for test in self._all_tests)
+            objection = next(filter(None, objections), None)
+            if objection is not None:
+                yield ("candidates", name, "material"), objection, candidate.material
             try:
                 candidate.inputs  # noqa: B018 - checks the correlations
             except ValueError as error:

@@ -29,6 +29,7 @@ def context(dataset: xr.Dataset, study: Selection) -> dict[str, Any]:
         "routes": routes(dataset),
         "variants": variants(dataset),
         "criticism": criticism(dataset),
+        "held_out": held_out(dataset) if "held_out_score" in dataset else None,
         "constants": constants(dataset),
         "averages": averages(dataset),
     }
@@ -52,6 +53,14 @@ def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]
             for group, test in tests
         ],
     )
+    best = ranking(dataset["log_evidence"])[0]
+    pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
+    drawn = [
+        (corner(dataset, *pair), f"{pair[0]}{f' ({pair[1]})' if several else ''}")
+        for pair in pairs
+        if not several or pair[0] == best
+    ]
+    yield "Posteriors of the constants" + (f" of {best}" if several else ""), drawn
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
@@ -170,6 +179,20 @@ def criticism(dataset: xr.Dataset) -> Table:
     return Table(head, rows, text=frozenset({0, 6}), long=frozenset({6}))
 
 
+def held_out(dataset: xr.Dataset) -> Table:
+    """Predictive scores of whole tests."""
+    scores, errors = dataset["held_out_score"], dataset["held_out_score_error"]
+    rows = []
+    for model in ranking(scores.sum("left_out")):
+        cells = [
+            with_error(float(value), float(error))
+            for value, error in zip(scores.sel(model=model).values, errors.sel(model=model).values, strict=True)
+        ]
+        total = with_error(float(scores.sel(model=model).sum()), float(np.sqrt((errors.sel(model=model) ** 2).sum())))
+        rows.append((model, *cells, total))
+    return Table(("model", *map(str, dataset.left_out.values), "sum"), rows)
+
+
 def constants(dataset: xr.Dataset) -> Table:
     """Posterior of every constant."""
     rows = []
@@ -244,6 +267,63 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.set_xlabel("probability")
     ax.figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     return ax
+
+
+def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
+    """Draw the posterior of the constants of a model, each alone and in pairs; large points have large weights."""
+    one = dataset.sel(model=model, group=group)
+    names = [
+        str(name) for name in dataset.parameter.values if np.isfinite(float(one["constant_mode"].sel(parameter=name)))
+    ]
+    n = len(names)
+    first = plots.axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
+    figure = first.get_figure(root=True)
+    assert figure is not None
+    first.remove()
+    grid = figure.subplots(n, n, squeeze=False, sharex="col")
+    weights = one["point_weight"].values
+    used = weights > 1e-6 * weights.max()
+    weights = weights[used]
+    columns = [one["point"].sel(parameter=name).values[used] for name in names]
+    modes = [float(one["constant_mode"].sel(parameter=name)) for name in names]
+    ends = []
+    for x in columns:
+        order = np.argsort(x)
+        low, high = np.interp((0.002, 0.998), np.cumsum(weights[order]), x[order])
+        ends.append((low - 0.1 * (high - low), high + 0.1 * (high - low)))
+    colour = plots.COLOURS[list(dataset.model.values).index(model) % len(plots.COLOURS)]
+    for i, j in np.ndindex(n, n):
+        ax = grid[i, j]
+        if j > i:
+            ax.remove()
+            continue
+        if i == j:
+            ax.hist(columns[i], bins=24, range=ends[i], weights=weights, color=colour, alpha=0.6)
+            ax.axvline(modes[i], color=plots.DARK, linewidth=1)
+            ax.set_yticks([])
+        else:
+            ax.scatter(columns[j], columns[i], s=300 * weights / weights.max() / np.sqrt(len(weights)), color=colour)
+            ax.plot(modes[j], modes[i], "+", color=plots.DARK)
+            ax.set_ylim(ends[i])
+        ax.set_xlim(ends[j])
+        ax.ticklabel_format(style="sci", scilimits=(-2, 3), useMathText=True)
+        ax.tick_params(labelsize="x-small")
+        ax.xaxis.get_offset_text().set_fontsize("x-small")
+        ax.yaxis.get_offset_text().set_fontsize("x-small")
+        ax.spines[["top", "right"]].set_visible(False)
+        if i == n - 1:
+            ax.set_xlabel(_with_unit(names[j]), fontsize="small")
+        if j == 0 and i > 0:
+            ax.set_ylabel(_with_unit(names[i]), fontsize="small")
+        elif j > 0:
+            ax.tick_params(labelleft=False)
+    corner_axes: Axes = grid[0, 0]
+    return corner_axes
+
+
+def _with_unit(constant: str) -> str:
+    unit = "1" if constant == "noise" else unit_of(f"material.{constant}")
+    return constant if unit == "1" else f"{constant} ({unit})"
 
 
 def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -> Axes:

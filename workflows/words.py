@@ -9,7 +9,7 @@ from typing import Any, assert_never
 from forward.fields import RandomField
 from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
-from forward.materials import MATERIALS, OF_STRETCHES, units
+from forward.materials import MATERIALS, constants, units
 from forward.outputs import Output
 from workflows.config import Study
 
@@ -61,7 +61,7 @@ def unit_of(path: str) -> str:
     block, _, name = path.partition(".")
     if block == "material":
         # A name has the same unit in every material.
-        return next(of[name] for of in map(units, (MATERIALS | OF_STRETCHES).values()) if name in of)
+        return next(of[name] for of in map(units, MATERIALS.values()) if name in of)
     if block == "fields":
         return "1"
     if block == "inclusions":
@@ -99,10 +99,11 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
-    kind = str(model.material.model_dump()["kind"])
-    constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
+    kind = model.energy
+    numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(MATERIALS[kind])]
+    fibres = [f"fibres along {' and '.join(map(_value, model.fibres))}"] if model.fibres else []
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
-    yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    yield "material", [law, ", ".join(numbers), *fibres]
     if model.inclusions:
         yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     if model.fields:
