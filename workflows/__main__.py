@@ -8,6 +8,11 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from workflows.config import Study
+    from workflows.selection import Selection
 
 # One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -26,12 +31,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done; 1 failed, with one line that says why; 2 bad study or arguments; 3 finished, but some solves failed.
     """
     options = _parser().parse_args(arguments)
-    from forward.model import SolveError
+    from forward.model import ModelError, SolveError
     from workflows.config import StudyError
 
     try:
         return int(options.command(options))
-    except StudyError as error:
+    except (StudyError, ModelError) as error:
         _say(str(error))
         return BAD
     except (SolveError, FileNotFoundError, PermissionError) as error:
@@ -90,19 +95,25 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check(options: argparse.Namespace) -> int:
+def _load(options: argparse.Namespace) -> Study | Selection:
+    """Read the study; modules of its model are found beside it and in the working directory."""
     from workflows.config import load
-    from workflows.plan import plan
 
     study = load(options.study, options.set)
+    sys.path[:0] = [str(options.study.resolve().parent), str(Path.cwd())]
+    return study
+
+
+def _check(options: argparse.Namespace) -> int:
+    from workflows.plan import plan
+
+    study = _load(options)
     sys.stdout.write("\n".join([f"{options.study}: a valid study", *plan(study)]) + "\n")
     return DONE
 
 
 def _run(options: argparse.Namespace) -> int:
-    from workflows.config import load
-
-    study = load(options.study, options.set)
+    study = _load(options)
     from workflows.study import run
 
     return run(study, options.study.stem, options.out or Path("results") / options.study.stem, quiet=options.quiet)
