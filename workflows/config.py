@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
@@ -264,6 +264,20 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
         message = f"{path}: cannot be read: {error.strerror}"
         raise StudyError(message) from None
     return parse(document, overrides, path.parent)
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema of a study file, by which editors complete and check it."""
+    from workflows.selection import DataFile, Selection
+
+    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection)
+    found = adapter.json_schema(ref_template="#/$defs/{model}")
+    # A file may name a table in place of the data themselves.
+    table = TypeAdapter(DataFile).json_schema(ref_template="#/$defs/{model}")
+    found["$defs"] |= table.pop("$defs", {}) | {"DataFile": table}
+    data = found["$defs"]["Selection"]["properties"]
+    data["data"] = {"anyOf": [data["data"], {"$ref": "#/$defs/DataFile"}]}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A study of tissuq"} | found
 
 
 def document(study: Study | Selection) -> dict[str, Any]:
