@@ -135,7 +135,7 @@ class Hyperelastic(Settings):
     outputs: tuple[Output, ...] = Field(min_length=1)
     solver: SolverSettings = SolverSettings()
 
-    @field_validator("solver", mode="before")
+    @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
     @classmethod
     def _kind_alone(cls, given: Any) -> Any:
         return {"kind": given} if isinstance(given, str) else given

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.external import PythonModel, UmBridgeModel
 from forward.hyperelastic import Hyperelastic
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
@@ -24,6 +25,11 @@ from uq.sobol import Sobol
 if TYPE_CHECKING:
     from workflows.selection import Selection
 
+Model = Annotated[
+    Hyperelastic | PythonModel | UmBridgeModel,
+    Field(discriminator="kind"),
+    BeforeValidator(lambda given: {"kind": "hyperelastic"} | given if isinstance(given, dict) else given),
+]
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
 ]
@@ -63,7 +69,7 @@ class Study(Settings):
     Parameters
     ----------
     model
-        The body.
+        A body, or a model of another program.
     parameters
         Distributions by the paths of the numbers of the model that they override; may be left out where the model has
         random fields, whose coefficients are parameters by themselves.
@@ -75,7 +81,7 @@ class Study(Settings):
         Use of ranks.
     """
 
-    model: Hyperelastic
+    model: Model
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Method
@@ -89,14 +95,23 @@ class Study(Settings):
         return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
-    def meshes(self) -> tuple[Hyperelastic, ...]:
-        """The model, and the same on the finer meshes that a multilevel method may use."""
-        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
-        return self.model, *(self.model.refined(level) for level in range(1, levels))
+    def body(self) -> Hyperelastic | None:
+        """The model, if it is a body."""
+        return self.model if isinstance(self.model, Hyperelastic) else None
 
     @property
-    def models(self) -> tuple[Hyperelastic, ...]:
+    def meshes(self) -> tuple[Hyperelastic, ...]:
+        """The body, and the same on the finer meshes that a multilevel method may use."""
+        if self.body is None:
+            return ()
+        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
+        return self.body, *(self.body.refined(level) for level in range(1, levels))
+
+    @property
+    def models(self) -> tuple[Hyperelastic | PythonModel | UmBridgeModel, ...]:
         """The models that the method may ask for, in the order of their numbers."""
+        if not isinstance(self.model, Hyperelastic):
+            return (self.model,) * 3 if isinstance(self.method, Compare) else (self.model,)
         if not isinstance(self.method, Compare):
             return self.meshes
         solver = self.model.solver
@@ -132,6 +147,7 @@ class Study(Settings):
             message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
         yield from self._mistakes_of_parameters()
+        yield from self._mistakes_without_body()
         try:
             inputs = self.inputs
         except ValueError as error:
@@ -152,12 +168,14 @@ class Study(Settings):
 
     def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         scalars = self.model.scalars
-        if not self.parameters and not self.model.fields:
-            yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
-        if self.model.fields and isinstance(self.method, MultilevelMonteCarlo):
+        fields = self.body.fields if self.body is not None else ()
+        if not self.parameters and not fields:
+            or_field = ", or one of model.fields" if self.body is not None else ""
+            yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
+        if fields and isinstance(self.method, MultilevelMonteCarlo):
             message = "random fields have other coefficients on every mesh, expected a method with one mesh"
             yield ("model", "fields"), message, self.method.kind
-        for i, field in enumerate(self.model.fields):
+        for i, field in enumerate(fields):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
@@ -174,6 +192,21 @@ class Study(Settings):
                     message = f"reaches {end:.4g}, where the model is impossible ({objection})"
                     yield ("parameters", path), message, distribution.model_dump()
                     break
+
+    def _mistakes_without_body(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+        """What only a body has: meshes, a solver, ranks that share it."""
+        if self.body is not None:
+            return
+        kind = self.model.kind
+        if isinstance(self.method, MultilevelMonteCarlo | MultilevelChaos):
+            what = "meshes" if isinstance(self.method, MultilevelMonteCarlo) else "iterations of a solver"
+            message = f"a model of kind '{kind}' has no {what}, expected another method"
+            yield ("method", "kind"), message, self.method.kind
+        if isinstance(self.method, Compare) and self.method.mesh_error:
+            yield ("method", "mesh_error"), f"a model of kind '{kind}' has no mesh, expected false", True
+        if self.parallel.ranks_per_model > 1:
+            message = f"a model of kind '{kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
 
     def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
         for i, entry in enumerate(method.methods):
@@ -231,6 +264,20 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
         message = f"{path}: cannot be read: {error.strerror}"
         raise StudyError(message) from None
     return parse(document, overrides, path.parent)
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema of a study file, by which editors complete and check it."""
+    from workflows.selection import DataFile, Selection
+
+    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection)
+    found = adapter.json_schema(ref_template="#/$defs/{model}")
+    # A file may name a table in place of the data themselves.
+    table = TypeAdapter(DataFile).json_schema(ref_template="#/$defs/{model}")
+    found["$defs"] |= table.pop("$defs", {}) | {"DataFile": table}
+    data = found["$defs"]["Selection"]["properties"]
+    data["data"] = {"anyOf": [data["data"], {"$ref": "#/$defs/DataFile"}]}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A study of tissuq"} | found
 
 
 def document(study: Study | Selection) -> dict[str, Any]:
@@ -339,7 +386,7 @@ def _kinds() -> set[str]:
     from forward import geometry, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
+    unions = (Model, geometry.Body, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 

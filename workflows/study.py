@@ -17,6 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from forward.external import PythonModel
 from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
@@ -98,8 +99,8 @@ def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = F
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
-    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study)
+    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     kept = checkpoint if job.costly else None
     dataset = ensemble.run(job.model, job.task, others=job.others, checkpoint=kept, progress=progress)
     if dataset is None:
@@ -168,24 +169,29 @@ class _Job:
 
 def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
-    inputs = study.inputs
-    model = study.model.build(ensemble.group, inputs.names)
-    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
-    cells, kind = model.layout.cells()
-    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         return study.method.run(inputs, recorders["/"])
 
-    def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = label(found, _units(study), model.layout.coordinates, cells, kind)
-        return with_random_fields(found, factors, model.variance_kept)
-
     others: list[Callable[[], ForwardModel]] = [
         partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]
     ]
+    if study.body is None:
+        function = study.model.build(ensemble.group, inputs.names)
+        return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+
+    model = study.body.build(ensemble.group, inputs.names)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = label(found, units, model.layout.coordinates, cells, kind)
+        return with_random_fields(found, factors, model.variance_kept)
+
     return _Job(model, others, task, recorders, labelled)
 
 
@@ -211,7 +217,11 @@ def _selection(study: Selection) -> _Job:
 
 
 def _identity(study: Study | Selection) -> dict[str, Any]:
-    return {key: value for key, value in document(study).items() if key != "parallel"}
+    """Return what decides on evaluations."""
+    blocks = {key: value for key, value in document(study).items() if key != "parallel"}
+    if isinstance(study, Study) and isinstance(study.model, PythonModel):
+        blocks["source"] = study.model.source
+    return blocks
 
 
 def _prepare(study: Study | Selection, directory: Path, ranks: int) -> int | None:
@@ -262,14 +272,10 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
 
     They are the first samples of Monte Carlo with the seed of the study.
     """
-    if not study.model.fields:
+    if not study.model.coefficients:
         return {}
     seed = getattr(study.method, "seed", 0)
     return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
-
-
-def _units(study: Study) -> dict[str, str]:
-    return {output.name: output.unit for output in study.model.outputs}
 
 
 def _version() -> str:
