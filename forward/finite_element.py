@@ -110,9 +110,8 @@ class Discretisation:
         self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
         self._solver = self.new_solver()
         self._factorised_at = np.zeros(self.size)
-        self._jacobians = fenicsx.compile_expression(
-            self.J, fenicsx.quadrature_points(self.space, spec.body.quadrature), comm
-        )
+        points = fenicsx.quadrature_points(self.space, spec.body.quadrature)
+        self._jacobians = fenicsx.PointValues(self.J, points, self.space, comm)
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding: float | None = None
@@ -544,8 +543,7 @@ class Discretisation:
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J over the quadrature points of all ranks."""
         self.set_state(u)
-        values = np.asarray(self._jacobians.eval(fenicsx.owned_cells(self.space)))
-        return fenicsx.smallest(self.comm, float(values.min(initial=np.inf)))
+        return fenicsx.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
 
     def negative_pivots(self) -> int:
         """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; −1 if unknown."""
