@@ -104,8 +104,8 @@ def cost(cells: int) -> Cost:
 def main(cells: tuple[int, ...] = CELLS) -> None:
     """Print counts, CPU times and the spectrum for each mesh."""
     print(
-        "| unknowns of the field | solves | products: mode | pairs | linear solves in each case "
-        "| CPU time (s): prior | mode | pairs | λ_1 | λ_20 | λ_50 | λ_100 | directions determined | truth within 2 std |"
+        "| unknowns of the field | solves | products: mode | pairs | linear solves in each case | CPU time (s): prior "
+        "| mode | pairs | λ_1 | λ_20 | λ_50 | λ_100 | directions determined | truth within 2 std |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
     rows = []
