@@ -39,7 +39,7 @@ def test_linear_models(prior):
         lambda x: -log_density(x), bracket=(start - 0.1, start, start + 0.1), options={"xtol": 1e-9}
     )
     assert found.factor == pytest.approx(prior.from_normal(np.array([best.x]))[0][0], rel=1e-5)
-    x = np.linspace(-4, 4, 1601)
+    x = np.linspace(-4, 4, 401)
     values = np.array([log_density(at) for at in x])
     w = np.exp(values - values.max())
     assert found.log_evidence == pytest.approx(values.max() + np.log(w.sum() * (x[1] - x[0])), abs=2e-6)
