@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import Hyperelastic, Mistake, Scalar
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
@@ -22,7 +22,7 @@ from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
@@ -112,20 +112,10 @@ class Study(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Study:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                "Study",
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given
-                    )
-                    for place, m, given in mistakes
-                ],
-            )
+        refused("Study", list(self._mistakes()))
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         try:
             _ = self.models
         except ValidationError as error:
@@ -150,7 +140,7 @@ class Study(Settings):
         if isinstance(self.method, Compare):
             yield from self._compare_mistakes(self.method)
 
-    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         scalars = self.model.scalars
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
@@ -161,21 +151,9 @@ class Study(Settings):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        for path, distribution in self.parameters.items():
-            if path not in scalars:
-                yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
-                continue
-            ends = distribution.support
-            if ends is None:
-                ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-            for end in ends:
-                objection = scalars[path].objection(end)
-                if objection is not None:
-                    message = f"reaches {end:.4g}, where the model is impossible ({objection})"
-                    yield ("parameters", path), message, distribution.model_dump()
-                    break
+        yield from mistakes_of_parameters(scalars, self.parameters)
 
-    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _compare_mistakes(self, method: Compare) -> Iterator[Mistake]:
         for i, entry in enumerate(method.methods):
             shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:
@@ -187,7 +165,36 @@ class Study(Settings):
                 yield ("method", "reference", "values"), message, list(given)
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Selection:
+def refused(title: str, mistakes: Sequence[Mistake]) -> None:
+    """Raise what pydantic raises, if there are mistakes."""
+    if mistakes:
+        raise ValidationError.from_exception_data(
+            title,
+            [
+                InitErrorDetails(type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given)
+                for place, m, given in mistakes
+            ],
+        )
+
+
+def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible."""
+    for path, distribution in parameters.items():
+        if path not in scalars:
+            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        ends = distribution.support
+        if ends is None:
+            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        for end in ends:
+            objection = scalars[path].objection(end)
+            if objection is not None:
+                message = f"reaches {end:.4g}, where the model is impossible ({objection})"
+                yield ("parameters", path), message, distribution.model_dump()
+                break
+
+
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Comparison:
     """Check a document and make a study of it.
 
     Parameters
@@ -209,15 +216,15 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         _override(blocks, assignment)
     try:
         if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
-            from workflows.selection import Selection, expanded
+            from workflows.selection import made
 
-            return Selection.model_validate(expanded(blocks, folder))
+            return made(blocks, folder)
         return Study.model_validate(blocks)
     except ValidationError as error:
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
+def load(path: Path, overrides: Sequence[str] = ()) -> Study | Comparison:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -233,12 +240,12 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
     return parse(document, overrides, path.parent)
 
 
-def document(study: Study | Selection) -> dict[str, Any]:
+def document(study: Study | Comparison) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study | Selection) -> str:
+def dump(study: Study | Comparison) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 

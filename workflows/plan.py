@@ -9,7 +9,7 @@ from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 
 def bytes_per_model(unknowns: int) -> float:
@@ -17,11 +17,10 @@ def bytes_per_model(unknowns: int) -> float:
     return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
 
 
-SECONDS_PER_STRESS = 4e-4  # a material point with its derivatives
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 
-def plan(study: Study | Selection, groups: int = 1) -> list[str]:
+def plan(study: Study | Comparison, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     if not isinstance(study, Study):
         return _comparison(study)
@@ -66,16 +65,22 @@ def plan(study: Study | Selection, groups: int = 1) -> list[str]:
     ]
 
 
-def _comparison(study: Selection) -> list[str]:
-    method, tests = study.method, study.data.tests
+def _comparison(study: Comparison) -> list[str]:
+    method = study.method
     evidences = study.evidences
-    seconds = SECONDS_PER_STRESS * study.planned + SECONDS_PER_SURROGATE * evidences
+    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
     check = " and nested sampling, which takes minutes" if method.check else ""
-    groups = f" in {len(study.data.groups)} groups" if len(study.data.groups) > 1 else ""
+    data = study.groups.values()
+    tests = sum(len(study.tests(group)) for group in study.group_names)
+    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    kind = "stresses" if study.quantity == "stress" else "displacements"
+    count = (
+        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
+    )
     return [
         f"method      {method.kind}",
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
-        f"data        {sum(len(test.at) for test in tests)} stresses of {len(tests)} tests{groups}",
+        f"data        {count}{groups}",
         f"evidences   {evidences}{check}",
         f"solves      about {study.planned:,}",
         f"time        about {_duration(seconds)} on 1 core (rough)",

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
@@ -81,7 +81,7 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     return out
 
 
-def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], Study | Selection]:
+def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], Study | Comparison]:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
@@ -144,7 +144,7 @@ def _context(results: Results) -> dict[str, Any]:
     }
 
 
-def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: Selection) -> dict[str, Any]:
+def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: Comparison) -> dict[str, Any]:
     """Everything that the template of a comparison of models shows."""
     from workflows import selection_report
 

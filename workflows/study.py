@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from uq.checkpoint import Checkpoint
     from uq.ensemble import Ensemble
     from uq.inputs import Inputs
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 REALISATIONS = 3  # of random fields, to look at
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
-def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = False) -> int:
+def run(study: Study | Comparison, name: str, directory: Path, *, quiet: bool = False) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
     Parameters
@@ -99,7 +99,7 @@ def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = F
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
-    job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study)
+    job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study, ensemble)
     kept = checkpoint if job.costly else None
     dataset = ensemble.run(job.model, job.task, others=job.others, checkpoint=kept, progress=progress)
     if dataset is None:
@@ -189,12 +189,12 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     return _Job(model, others, task, recorders, labelled)
 
 
-def _selection(study: Selection) -> _Job:
-    """The candidates, each for each group of data."""
+def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
+    """The candidates, each for each group of data; making them is collective over the group."""
     from uq.evaluate import SerialEvaluate
 
     pairs = study.pairs
-    makers = [partial(study.build, *pair) for pair in pairs]
+    makers = [partial(study.build, *pair, ensemble.group) for pair in pairs]
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -202,19 +202,23 @@ def _selection(study: Selection) -> _Job:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
             return recorders[f"{name}/{group}"]
 
-        # What nested sampling solves is too much, and too cheap, to keep.
-        return study.method.run(
-            study.models, study.groups, recorded, lambda name, group: SerialEvaluate(study.build(name, group))
-        )
+        def free(name: str, group: str) -> Evaluate:
+            # What nested sampling solves is too much, and too cheap, to keep.
+            return SerialEvaluate(study.build(name, group))
 
-    return _Job(makers[0](), list(makers[1:]), task, recorders, lambda found: found, costly=False)
+        return study.method.run(study.models, study.groups, recorded, free)
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        return found.assign_attrs(quantity=study.quantity)
+
+    return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, costly=study.costly)
 
 
-def _identity(study: Study | Selection) -> dict[str, Any]:
+def _identity(study: Study | Comparison) -> dict[str, Any]:
     return {key: value for key, value in document(study).items() if key != "parallel"}
 
 
-def _prepare(study: Study | Selection, directory: Path, ranks: int) -> int | None:
+def _prepare(study: Study | Comparison, directory: Path, ranks: int) -> int | None:
     """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
     share = study.parallel.ranks_per_model
     if ranks % share:
@@ -280,7 +284,7 @@ def _version() -> str:
 
 
 def _summary(
-    study: Study | Selection,
+    study: Study | Comparison,
     name: str,
     dataset: xr.Dataset,
     evaluations: dict[str, Evaluations],
@@ -341,7 +345,7 @@ def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
     return found
 
 
-def _parameters(study: Study | Selection, label: str) -> tuple[str, ...]:
+def _parameters(study: Study | Comparison, label: str) -> tuple[str, ...]:
     """Names of the parameters of a model by the name that its evaluations are kept under."""
     if isinstance(study, Study):
         return study.inputs.names
