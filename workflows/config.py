@@ -5,12 +5,12 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import Hyperelastic, Mistake, Scalar
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
@@ -22,7 +22,10 @@ from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 if TYPE_CHECKING:
+    from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Selection
+
+    AnyStudy: TypeAlias = "Study | Selection | Inversion | Synthesis"
 
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
@@ -112,20 +115,10 @@ class Study(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Study:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                "Study",
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given
-                    )
-                    for place, m, given in mistakes
-                ],
-            )
+        refused("Study", list(self._mistakes()))
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         try:
             _ = self.models
         except ValidationError as error:
@@ -150,7 +143,7 @@ class Study(Settings):
         if isinstance(self.method, Compare):
             yield from self._compare_mistakes(self.method)
 
-    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         scalars = self.model.scalars
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
@@ -161,21 +154,9 @@ class Study(Settings):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        for path, distribution in self.parameters.items():
-            if path not in scalars:
-                yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
-                continue
-            ends = distribution.support
-            if ends is None:
-                ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-            for end in ends:
-                objection = scalars[path].objection(end)
-                if objection is not None:
-                    message = f"reaches {end:.4g}, where the model is impossible ({objection})"
-                    yield ("parameters", path), message, distribution.model_dump()
-                    break
+        yield from mistakes_of_parameters(scalars, self.parameters)
 
-    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _compare_mistakes(self, method: Compare) -> Iterator[Mistake]:
         for i, entry in enumerate(method.methods):
             shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:
@@ -187,7 +168,36 @@ class Study(Settings):
                 yield ("method", "reference", "values"), message, list(given)
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Selection:
+def refused(title: str, mistakes: Sequence[Mistake]) -> None:
+    """Raise what pydantic raises, if there are mistakes."""
+    if mistakes:
+        raise ValidationError.from_exception_data(
+            title,
+            [
+                InitErrorDetails(type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given)
+                for place, m, given in mistakes
+            ],
+        )
+
+
+def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible."""
+    for path, distribution in parameters.items():
+        if path not in scalars:
+            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        ends = distribution.support
+        if ends is None:
+            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        for end in ends:
+            objection = scalars[path].objection(end)
+            if objection is not None:
+                message = f"reaches {end:.4g}, where the model is impossible ({objection})"
+                yield ("parameters", path), message, distribution.model_dump()
+                break
+
+
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> AnyStudy:
     """Check a document and make a study of it.
 
     Parameters
@@ -208,7 +218,12 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     try:
-        if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
+        kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
+        if kind in {"invert", "synthesize"}:
+            from workflows.inversion import made
+
+            return made(blocks, folder)
+        if kind == "select":
             from workflows.selection import Selection, expanded
 
             return Selection.model_validate(expanded(blocks, folder))
@@ -217,7 +232,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
+def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -233,12 +248,12 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
     return parse(document, overrides, path.parent)
 
 
-def document(study: Study | Selection) -> dict[str, Any]:
+def document(study: AnyStudy) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study | Selection) -> str:
+def dump(study: AnyStudy) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 
@@ -336,10 +351,10 @@ def _kinds() -> set[str]:
     """Return the kinds of blocks, which pydantic puts into the places of errors."""
     from typing import get_args
 
-    from forward import geometry, loads, outputs
+    from forward import geometry, inclusions, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
+    unions = (geometry.Body, inclusions.Inclusion, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 
