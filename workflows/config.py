@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -22,7 +22,10 @@ from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 if TYPE_CHECKING:
+    from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Comparison
+
+    AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
 
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
@@ -194,7 +197,7 @@ def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[st
                 break
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Comparison:
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> AnyStudy:
     """Check a document and make a study of it.
 
     Parameters
@@ -215,16 +218,21 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     try:
-        if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
-            from workflows.selection import made
+        kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
+        if kind in {"invert", "synthesize"}:
+            from workflows.inversion import made
 
             return made(blocks, folder)
+        if kind == "select":
+            from workflows import selection
+
+            return selection.made(blocks, folder)
         return Study.model_validate(blocks)
     except ValidationError as error:
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study | Comparison:
+def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -240,12 +248,12 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Comparison:
     return parse(document, overrides, path.parent)
 
 
-def document(study: Study | Comparison) -> dict[str, Any]:
+def document(study: AnyStudy) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study | Comparison) -> str:
+def dump(study: AnyStudy) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 
@@ -343,10 +351,10 @@ def _kinds() -> set[str]:
     """Return the kinds of blocks, which pydantic puts into the places of errors."""
     from typing import get_args
 
-    from forward import geometry, loads, outputs
+    from forward import geometry, inclusions, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
+    unions = (geometry.Body, inclusions.Inclusion, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 

@@ -9,6 +9,8 @@ from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
 
 if TYPE_CHECKING:
+    from workflows.config import AnyStudy
+    from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Comparison
 
 
@@ -20,10 +22,10 @@ def bytes_per_model(unknowns: int) -> float:
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 
-def plan(study: Study | Comparison, groups: int = 1) -> list[str]:
+def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     if not isinstance(study, Study):
-        return _comparison(study)
+        return _of_other_kinds(study)
     method, body = study.method, study.model.body
     textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
@@ -62,6 +64,55 @@ def plan(study: Study | Comparison, groups: int = 1) -> list[str]:
             " few quadrature points see the transition, and derivatives by place and size are rough"
             for inclusion in narrow
         ),
+    ]
+
+
+def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study)
+    return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
+
+
+SOLVES_OF_FIELD = 12  # for a mode
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+
+
+def _inversion(study: Inversion) -> list[str]:
+    spec, sets = study.model, study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    each = seconds_per_solve(spec.unknowns) * len(spec.cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + study.method.solves(field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {sum(moved)} points outside the body are moved to its surface"] if sum(moved) else []),
+        f"time        about {_duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _synthesis(study: Synthesis) -> list[str]:
+    spec, sets = study.model, len(study.method.fraction)
+    seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
+    return [
+        f"method      {study.method.kind}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {sets}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
     ]
 
 
