@@ -718,14 +718,15 @@ class HyperelasticModel:
         """Take this rank's part (k, U_local) of (k, U) in canonical order."""
         return self.layout.scatter(rows)
 
-    def factors(self, points: FloatArray) -> dict[str, FloatArray]:
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, nodes) of each random field at parameters (n, d), nodes in canonical order.
 
-        Collective; empty but on the first rank.
+        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
+        the vertices.
         """
         self._visited = None
         self.body.forget_parameters()
-        space = fenicsx.scalar_space(self.body.mesh, self.spec.body.degree)
+        space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in self.body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}
 

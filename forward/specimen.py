@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,7 +20,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector
 from forward.hyperelastic import Hyperelastic, Material, Scalar
-from forward.inclusions import Inclusion, stiffness_factor
+from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import SolverSettings
@@ -33,10 +32,6 @@ if TYPE_CHECKING:
 
     from forward.finite_element import FiniteElementSolution, HyperelasticModel
     from forward.layout import Layout
-
-
-# What indicators of inclusions are made of, of arrays.
-_NUMBERS = SimpleNamespace(exp=np.exp, ln=np.log, sqrt=np.sqrt, tanh=np.tanh, sin=np.sin, cos=np.cos)
 
 
 class LoadCase(Settings):
@@ -153,21 +148,6 @@ class Specimen(Settings):
     def unknowns(self) -> int:
         """Number of unknowns of each load case."""
         return self.loaded(self.cases[0]).unknowns
-
-    def factor(self, places: FloatArray, values: Mapping[str, float]) -> FloatArray:
-        """Return what the inclusions multiply the stiffness by (n,) at places (n, 3).
-
-        Parameters
-        ----------
-        values
-            Numbers of the specimen by their paths; the others are as specified.
-        """
-        found = np.ones(len(places))
-        for inclusion in self.inclusions:
-            block = inclusion.model_dump(exclude={"name"})
-            given = {name: values.get(f"inclusions.{inclusion.label}.{name}", block[name]) for name in block}
-            found = found * stiffness_factor(_NUMBERS, places.T, **given)
-        return found
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         """Mesh the body and compile the forms of every case on a communicator; collective.
@@ -309,6 +289,18 @@ class SpecimenModel:
 
         body = self.models[0].body
         return Layout(fenicsx.scalar_space(body.space.mesh, 1), body.comm)
+
+    def log_fields(self, points: FloatArray) -> FloatArray:
+        """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
+
+        That of all random fields on it together; on every rank.
+        """
+        model = self.models[0]
+        found = np.zeros((len(points), self.spec.body.vertex_count))
+        if self.spec.fields:
+            factors = model.body.comm.bcast(model.factors(points[:, self.positions[0]], 1))
+            found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
+        return found
 
     def solve(
         self,

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.evidence import Evidence, tail_shape
@@ -64,12 +65,15 @@ class Data:
         Name of the test of each output (M,).
     at
         Where in the test (M,).
+    neighbours
+        Numbers of data that stand beside each other, two (k,); by default those that follow each other in a test.
     """
 
     values: FloatArray
     sigma: FloatArray | None
     tests: tuple[str, ...]
     at: FloatArray
+    neighbours: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
     tails = np.array([tail_shape(np.exp(column)) for column in (log_ratio - top).T])
-    neighbours = _neighbours(data)
+    neighbours = data.neighbours or _neighbours(data)
     m = posterior.data.size
     misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))

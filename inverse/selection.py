@@ -24,6 +24,7 @@ from inverse.nested import nested
 from inverse.posterior import Posterior
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate
+from uq.linearisation import linearise
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -150,11 +151,12 @@ class Select(Settings):
             If a model has no answer at any start or any point.
         """
         pairs = [(name, group) for name in candidates for group in groups]
-        posteriors = {
-            (name, group): posterior(candidates[name], groups[group], self.noise, evaluate(name, group))
-            for name, group in pairs
-        }
-        stated = {pair: self._assess(posteriors[pair], pair) for pair in pairs}
+        posteriors, stated = {}, {}
+        for name, group in pairs:
+            one = started(posterior(candidates[name], groups[group], self.noise, evaluate(name, group)))
+            stated[name, group] = self._assess(one, (name, group))
+            mode = one.physical(stated[name, group].gaussian.mode[None, :])[0]
+            posteriors[name, group] = started(one, mode[: len(one.inputs.names)])
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
         }
@@ -165,10 +167,7 @@ class Select(Settings):
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
-                pair: self._value(
-                    posterior(candidates[pair[0]], groups[pair[1]], noise, posteriors[pair].evaluate), pair
-                )
-                for pair in pairs
+                pair: self._value(_with_noise(posteriors[pair], groups[pair[1]], noise), pair) for pair in pairs
             }
         for label, tests in self.subsets.items():
             variants[label] = {
@@ -200,7 +199,8 @@ class Select(Settings):
     def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> Assessment:
         try:
             gaussian = laplace(posterior, starts=self.starts, seed=self.seed)
-            return Assessment(gaussian, evidence(posterior, gaussian, self.samples, seed=self.seed))
+            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
+            return Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
         except SolveError as error:
             message = f"candidate '{pair[0]}': {error.reason}"
             raise SolveError(message, error.history) from None
@@ -214,6 +214,22 @@ def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate
     """Return the posterior of a candidate."""
     sigma = noise.sigma(data.values, data.sigma)
     return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
+
+
+def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
+    """Let solves of a model with states start from its tangent at a point (d,), by default the mean of the prior."""
+    if posterior.start is None and point is not None:
+        return posterior  # a model without states, or without an answer at the mean
+    try:
+        start = linearise(posterior.inputs, posterior.evaluate, point).prediction
+    except SolveError:
+        return posterior
+    return replace(posterior, start=start)
+
+
+def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
+    """The same with other errors."""
+    return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
 
 
 def _tests(data: Data) -> tuple[str, ...]:

@@ -319,7 +319,7 @@ def test_a_study_from_the_command_line(small):
     assert "nothing to do" in again.stdout
     both = run(None, TISSUQ, "report", small.parent / "one", small.parent / "two")
     assert both.returncode == 2
-    assert "compares models" in both.stderr
+    assert "no estimates of outputs" in both.stderr
     found = xr.load_dataset(small.parent / "one" / "results.nc")
     assert found["prior_probability"].to_numpy() == pytest.approx([1 / 3, 2 / 3])
 

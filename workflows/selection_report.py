@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 
-def context(dataset: xr.Dataset, study: Selection) -> dict[str, Any]:
+UNITS = {"stress": "Pa", "displacement": "m"}
+
+
+def context(dataset: xr.Dataset, study: Comparison) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     return {
         "findings": findings(dataset),
-        "source": study.data.source,
+        "source": study.source,
         "priors": priors(study),
         "evidences": evidences(dataset),
         "routes": routes(dataset),
@@ -46,13 +49,17 @@ def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]
     )
     tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
     several = dataset.sizes["group"] > 1
-    yield (
-        "Curves over the data",
-        [
+    if dataset.attrs["quantity"] == "displacement":
+        drawn = [
+            (residuals(dataset, str(test)), f"{test}: measured less predicted, over the errors.") for _, test in tests
+        ]
+        yield "What is left of the data", drawn
+    else:
+        drawn = [
             (curves(dataset, str(group), str(test)), f"{test}{f' of {group}' if several else ''}: mean and 90 % band.")
             for group, test in tests
-        ],
-    )
+        ]
+        yield "Curves over the data", drawn
     best = ranking(dataset["log_evidence"])[0]
     pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
     drawn = [
@@ -66,15 +73,15 @@ def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
-def priors(study: Selection) -> Table:
+def priors(study: Comparison) -> Table:
     """The candidates with the priors of their constants."""
     rows = []
     for name, candidate in study.candidates.items():
         for constant, distribution in candidate.parameters.items():
             block = distribution.model_dump()
-            unit = unit_of(f"material.{constant}")
-            rows.append((name, candidate.kind, constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
-    return Table(("candidate", "material", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
+            unit = _unit(constant)
+            rows.append((name, study.described(name), constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
+    return Table(("candidate", "model", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
 
 
 def evidences(dataset: xr.Dataset) -> Table:
@@ -203,7 +210,7 @@ def constants(dataset: xr.Dataset) -> Table:
                 of_name = one.sel(parameter=name)
                 if np.isnan(float(of_name["constant_mode"])):
                     continue
-                unit = "1" if name == "noise" else unit_of(f"material.{name}")
+                unit = _unit(str(name))
                 low, high = of_name["constant_quantiles"].values
                 values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
                 rows.append((str(model), str(group), str(name), *(with_unit(number(float(v)), unit) for v in values)))
@@ -214,6 +221,7 @@ def constants(dataset: xr.Dataset) -> Table:
 def averages(dataset: xr.Dataset) -> Table:
     """Predictions averaged over the models at the end of each test, with both parts of their variance."""
     rows = []
+    quantity = str(dataset.attrs["quantity"])
     tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
@@ -225,9 +233,9 @@ def averages(dataset: xr.Dataset) -> Table:
                 str(group),
                 str(test),
                 number(float(one["output_at"])),
-                with_unit(number(float(one["measured"])), "Pa"),
-                with_unit(number(float(one["average_mean"])), "Pa"),
-                *(with_unit(number(std, 3), "Pa") for std in stds),
+                with_unit(number(float(one["measured"])), UNITS[quantity]),
+                with_unit(number(float(one["average_mean"])), UNITS[quantity]),
+                *(with_unit(number(std, 3), UNITS[quantity]) for std in stds),
             )
         )
     head = ("group", "test", "at", "measured", "averaged prediction", "std within models", "std between models")
@@ -321,9 +329,31 @@ def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
     return corner_axes
 
 
+def _unit(constant: str) -> str:
+    """SI unit of a constant of a material, or of a number of a model by its path."""
+    return "1" if constant == "noise" else unit_of(constant if "." in constant else f"material.{constant}")
+
+
 def _with_unit(constant: str) -> str:
-    unit = "1" if constant == "noise" else unit_of(f"material.{constant}")
+    unit = _unit(constant)
     return constant if unit == "1" else f"{constant} ({unit})"
+
+
+def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
+    """Draw what each model leaves of the data of a test, over the stated errors, against what was measured."""
+    ax = ax or plots.axes(height=3.4)
+    one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
+    measured = one["measured"].values
+    for k, model in enumerate(dataset.model.values):
+        left = (measured - one["prediction_mean"].sel(model=model).values) / one["sigma"].values
+        P = float(dataset["probability"].sel(model=model))
+        colour = plots.COLOURS[k % len(plots.COLOURS)]
+        ax.plot(measured, left, ".", markersize=4, color=colour, label=f"{model} ({P:.2g})")
+    ax.axhspan(-2, 2, color=plots.DARK, alpha=0.08, linewidth=0)
+    ax.set_xlabel("measured displacement (m)")
+    ax.set_ylabel("residual / σ")
+    ax.legend(fontsize="small", frameon=False)
+    return ax
 
 
 def curves(dataset: xr.Dataset, group: str, test: str, ax: Axes | None = None) -> Axes:
