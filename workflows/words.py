@@ -65,6 +65,8 @@ def unit_of(path: str) -> str:
         return next((of[name] for of in map(units, (MATERIALS | OF_STRETCHES).values()) if name in of), "1")
     if path.endswith(".contrast"):
         return "1"
+    if block == "regions":
+        return unit_of(f"material.{path.rpartition('.')[2]}")
     if path.endswith(".density"):
         return "kg/m³"
     return {"inclusions": "m", "displacements": "m", "loads": "Pa"}.get(block, "1")
@@ -93,7 +95,7 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
         yield from _external_in_words(study)
         return
     model, body = study.body, study.body.body
-    cells = " × ".join(f"{n}" for n in body.cells)
+    cells = body.cells_in_words
     coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
@@ -102,6 +104,12 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    if model.regions:
+        named = {
+            region: ", ".join(f"{name} = {_scalar(study, f'regions.{region}.{name}')}" for name in numbers)
+            for region, numbers in model.regions.items()
+        }
+        yield "regions", [f"{region}: {numbers}" for region, numbers in named.items()]
     if model.inclusions:
         yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     if model.fields:
