@@ -3,7 +3,7 @@
 It writes organ.msh beside itself, in millimetres: region `tissue`, region `tumour`, boundary `vessel` (the wall of the
 vein), boundary `tool` (a round patch on top, where an instrument presses), boundary `surface` (the rest).
 
-    python configs/meshes/organ.py [LENGTH]     LENGTH of the cells in mm, by default 13; needs pip install gmsh meshio
+    python configs/meshes/organ.py [LENGTH]     LENGTH of the cells in mm, by default 15; needs pip install gmsh meshio
 """
 
 import sys
@@ -14,7 +14,7 @@ import meshio
 import numpy as np
 
 VEIN = {"x": 15.0, "z": -8.0, "radius": 12.0}  # a straight tube along y
-TUMOUR = {"centre": (60.0, 12.0, 5.0), "radius": 14.0}
+TUMOUR = {"centre": (48.0, -8.0, 16.0), "radius": 13.0}
 TOOL = {"x": 45.0, "y": -10.0, "radius": 16.0}
 NUMBERS = {"tissue": (1, 3), "tumour": (2, 3), "vessel": (3, 2), "tool": (4, 2), "surface": (5, 2)}
 
@@ -79,6 +79,6 @@ def generate(length: float) -> meshio.Mesh:
 if __name__ == "__main__":
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
-    mesh = generate(float(sys.argv[1]) if len(sys.argv) > 1 else 13.0)
+    mesh = generate(float(sys.argv[1]) if len(sys.argv) > 1 else 15.0)
     gmsh.finalize()
     meshio.write(Path(__file__).with_name("organ.msh"), mesh, file_format="gmsh22", binary=True)
