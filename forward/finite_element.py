@@ -22,7 +22,7 @@ from forward import fenicsx, kinematics
 from forward.acceleration import Inverse, block_galerkin
 from forward.functionals import functional
 from forward.geometry import AXES
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
@@ -131,15 +131,36 @@ class Discretisation:
 
     def energy_of(self, measures: dict[str, Any]) -> Any:
         """Energy density of its measures, as UFL; in the mixed form, without that of the change of volume."""
-        values = self._numbers("material")
+        values = self._material
         if self.p is not None:
             values["D1"] = 0
         return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *measures.values(), **values)
 
     @cached_property
+    def _regions(self) -> dict[str, Any]:
+        """Indicators of the regions that have numbers of their own."""
+        if not self.spec.regions:
+            return {}
+        found = fenicsx.region_indicators(self.comm, self.spec.body, self.mesh)
+        return {name: found[name] for name in self.spec.regions}
+
+    @property
+    def _material(self) -> dict[str, Any]:
+        """Constants of the material, by their names, each as an expression of the place."""
+        values = self._numbers("material")
+        for region, inside in self._regions.items():
+            for name, number in self._numbers(f"regions.{region}").items():
+                if name != CONTRAST:
+                    values[name] = (1 - inside) * values[name] + inside * number
+        return values
+
+    @cached_property
     def stiffness_factor(self) -> Any:
-        """What inclusions and fields multiply every modulus by, as a UFL expression of the place; 1 without any."""
+        """What regions, inclusions and fields multiply every modulus by, by the place, in UFL; 1 without any."""
         factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        for region, inside in self._regions.items():
+            if CONTRAST in self.spec.regions[region]:
+                factor *= 1 - inside + inside * self._variables[f"regions.{region}.{CONTRAST}"]
         X = ufl.SpatialCoordinate(self.mesh)
         for inclusion in self.spec.inclusions:
             numbers = self._numbers(f"inclusions.{inclusion.label}")
@@ -168,7 +189,7 @@ class Discretisation:
         energy, J, p = self.energy_of(self._measures), self._measures["J"], self._pressure
         if p is None:
             return energy, energy, self.J - 1
-        bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
+        bulk = 2 * self.stiffness_factor * self._material["D1"]
         of_pressure = p**2 / (2 * bulk)
         return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
 

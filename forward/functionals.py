@@ -14,7 +14,7 @@ import ufl
 
 from forward import fenicsx, kinematics
 from forward.geometry import AXES
-from forward.model import FloatArray
+from forward.model import FloatArray, ModelError
 from forward.outputs import (
     MaxDisplacement,
     MaxVonMises,
@@ -87,7 +87,7 @@ def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
     owners = body.comm.allgather(found is not None)
     if not any(owners):
         message = f"output '{output.name}': the point {list(output.at)} lies outside the body"
-        raise ValueError(message)
+        raise ModelError(message)
     probe = fenicsx.function(body.space)
     if found is not None and owners.index(True) == body.comm.rank:
         nodes, weights = found

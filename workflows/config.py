@@ -12,6 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
 from forward.hyperelastic import Hyperelastic, Mistake, Scalar
+from forward.model import ModelError
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
@@ -139,6 +140,8 @@ class Study(Settings):
         except ValidationError as error:
             message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
+        except ModelError as error:
+            yield ("method", "kind"), str(error), self.method.kind
         yield from self._mistakes_of_parameters()
         yield from self._mistakes_without_body()
         try:
@@ -240,7 +243,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     overrides
         Assignments such as ``method.samples=512`` that come on top; values are TOML, or else plain text.
     folder
-        Where tables of data are that it names.
+        Where tables of data and meshes are that it names.
 
     Raises
     ------
@@ -251,6 +254,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     try:
+        blocks = _located(blocks, folder)
         kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
         if kind in {"invert", "synthesize"}:
             from workflows.inversion import made
@@ -263,6 +267,16 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         return Study.model_validate(blocks)
     except ValidationError as error:
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
+
+
+def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Say in full where the file of a mesh is, which the study names from where it stands itself."""
+    model = blocks.get("model")
+    body = model.get("body") if isinstance(model, Mapping) else None
+    file = body.get("file") if isinstance(body, Mapping) else None
+    if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
+        return blocks
+    return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
@@ -311,14 +325,22 @@ def dump(study: AnyStudy) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """List what changed between two documents, one line for each place; how ranks are used does not count."""
+    """List what changed between two documents, one line for each place.
+
+    How ranks are used does not count, nor where a mesh is, as long as it is the same.
+    """
     before, after = (dict(_leaves({k: v for k, v in d.items() if k != "parallel"})) for d in (old, new))
+    if before.get(_MESH) == after.get(_MESH) is not None:
+        after |= {"model.body.file": before["model.body.file"]}
     places = [*before, *(place for place in after if place not in before)]
     return [
         f"{place}: {before.get(place, 'absent')} → {after.get(place, 'absent')}"
         for place in places
         if before.get(place) != after.get(place)
     ]
+
+
+_MESH = "model.body.contents.digest"
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:

@@ -34,7 +34,6 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     sizes = [model.unknowns for model in study.meshes]
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
     memory = sum(bytes_per_model(other.unknowns) for other in study.models if isinstance(other, Hyperelastic))
-    cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
     form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
     edge = body.longest_edge
     narrow = [inclusion for inclusion in model.inclusions if inclusion.width < edge]
@@ -50,7 +49,7 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
         names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {method.kind}",
-        f"unknowns    {sizes[0]:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
+        f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
         *(
             f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
             for k, (size, s) in enumerate(zip(sizes, each, strict=True))
@@ -67,6 +66,7 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
             " few quadrature points see the transition, and derivatives by place and size are rough"
             for inclusion in narrow
         ),
+        *(f"warning     {warning}" for warning in body.warnings),
     ]
 
 

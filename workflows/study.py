@@ -335,6 +335,8 @@ def _identity(study: AnyStudy) -> dict[str, Any]:
     blocks = {key: value for key, value in document(study).items() if key != "parallel"}
     if isinstance(study, Study) and isinstance(study.model, PythonModel):
         blocks["source"] = study.model.source
+    if isinstance(study, Study) and study.body is not None:
+        blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
     return blocks
 
 

@@ -67,6 +67,9 @@ def unit_of(path: str) -> str:
         return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
             path.rpartition(".")[2], "m"
         )
+    if block == "regions":
+        name = path.rpartition(".")[2]
+        return "1" if name == "contrast" else unit_of(f"material.{name}")
     if path.endswith(".density"):
         return "kg/m³"
     return {"displacements": "m", "loads": "Pa"}.get(block, "1")
@@ -95,7 +98,7 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
         yield from _external_in_words(study)
         return
     model, body = study.body, study.body.body
-    cells = " × ".join(f"{n}" for n in body.cells)
+    cells = body.cells_in_words
     coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
@@ -105,6 +108,12 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     fibres = [f"fibres along {' and '.join(map(_value, model.fibres))}"] if model.fibres else []
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(numbers), *fibres]
+    if model.regions:
+        named = {
+            region: ", ".join(f"{name} = {_scalar(study, f'regions.{region}.{name}')}" for name in numbers)
+            for region, numbers in model.regions.items()
+        }
+        yield "regions", [f"{region}: {numbers}" for region, numbers in named.items()]
     if model.inclusions:
         yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     if model.fields:
