@@ -36,6 +36,7 @@ from inverse.evidence import ALIKE, TRUSTED, Evidence, tail_shape
 from inverse.field_posterior import Point
 from inverse.laplace import Laplace
 from inverse.low_rank import LowRankPosterior
+from inverse.newton_cg import Mode
 from inverse.posterior import Posterior
 from inverse.predictive import ResidualTest
 
@@ -357,15 +358,12 @@ class FieldWeights:
 
     Attributes
     ----------
-    gaussian
-        The Gaussian that is checked.
     values
         m (n, N).
     log_weights
         ln w (n,), of which the mean of w is p(y); −∞ where the model has no answer.
     """
 
-    gaussian: LowRankPosterior
     values: FloatArray
     log_weights: FloatArray
 
@@ -433,7 +431,7 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
     log_weights = log_density + (z**2).sum(axis=1) / 2 + constant
     if not np.isfinite(log_weights.max()):
         raise SolveError("the model has no answer at any of the samples of the Gaussian")
-    return FieldWeights(found, mode.posterior.values(noise), log_weights)
+    return FieldWeights(mode.posterior.values(noise), log_weights)
 
 
 # --- what they say ---------------------------------------------------------------------------------------------------
@@ -491,10 +489,10 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
 
 
 def verdict_on_field(
-    converged: bool, found: FieldWeights | None, test: ResidualTest, chains: Chains | None = None
+    mode: Mode, gaussian: LowRankPosterior, found: FieldWeights | None, test: ResidualTest, chains: Chains | None = None
 ) -> Verdict:
     """Judge means and standard deviations of the values of a field by weighted samples, if any, and the residuals."""
-    objection = _objection(converged, test)
+    objection = _objection(mode.converged, test)
     if objection is not None:
         return objection
     if found is None:
@@ -503,7 +501,6 @@ def verdict_on_field(
     worth = f"weights worth {found.effective:.0f} of {len(found.log_weights)} samples, k̂ = {found.tail:.2f}"
     if not found.trusted or found.effective < FEWEST:
         return _by_chains(worth, chains)
-    gaussian = found.gaussian
     # Root mean squares over the vertices, less what as few samples would give by chance.
     chance = 1 / found.effective
     shift = np.sqrt(max(float((((found.mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))

@@ -238,15 +238,15 @@ def test_verdicts_on_fields():
     mode, found = solved(Linear())
     test = examine(mode.point.residual, found.spectrum, found.weights)
     weights = weigh_field(mode.point, found, 64)
-    assert verdict_on_field(True, weights, test).trust == "laplace"
-    assert "not checked" in verdict_on_field(True, None, test).why
-    assert verdict_on_field(False, weights, test).trust == "neither"
+    assert verdict_on_field(mode, found, weights, test).trust == "laplace"
+    assert "not checked" in verdict_on_field(mode, found, None, test).why
+    assert verdict_on_field(replace(mode, converged=False), found, weights, test).trust == "neither"
     moved = replace(weights, values=weights.values + 0.5 * found.std)
-    assert verdict_on_field(True, moved, test).trust == "corrected"
+    assert verdict_on_field(mode, found, moved, test).trust == "corrected"
     wider = replace(weights, values=found.mean + 1.6 * (weights.values - found.mean))
-    assert verdict_on_field(True, wider, test).trust == "corrected"
+    assert verdict_on_field(mode, found, wider, test).trust == "corrected"
     uneven = replace(weights, log_weights=5 * np.random.default_rng(0).standard_normal(64))
-    assert verdict_on_field(True, uneven, test).trust == "neither"
+    assert verdict_on_field(mode, found, uneven, test).trust == "neither"
 
 
 def test_a_posterior_of_one_parameter():
