@@ -214,15 +214,13 @@ class _MaxVonMises:
         self._body = body
         F = ufl.variable(body.F)
         # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
-        cauchy = ufl.diff(body.energy_of(kinematics.invariants(ufl, F)), F) * F.T / ufl.det(F)
+        cauchy = ufl.diff(body.energy_of(body.measures_of(F)), F) * F.T / ufl.det(F)
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature
-        self._expression = fenicsx.compile_expression(stress, fenicsx.quadrature_points(body.space, degree), body.comm)
+        points = fenicsx.quadrature_points(body.space, degree)
+        self._values = fenicsx.PointValues(stress, points, body.space, body.comm)
         self._selector = fenicsx.function(fenicsx.quadrature_space(body.mesh, degree))
         self._stress = stress
-
-    def _values(self) -> FloatArray:
-        return np.asarray(self._expression.eval(fenicsx.owned_cells(self._body.space)))
 
     def value(self) -> float:
         return -fenicsx.smallest(self._body.comm, -self._values().max(initial=0.0))

@@ -65,6 +65,10 @@ class _SixSided(Settings):
     def contains(self, point: Vector) -> bool:
         """Whether a point (m) lies in the undeformed body."""
 
+    @abstractmethod
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+
     @property
     def boundaries(self) -> tuple[str, ...]:
         """Names of the boundaries."""
@@ -192,6 +196,10 @@ class Box(_SixSided):
         """Whether a point (m) lies in the undeformed body."""
         return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
 
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        return np.asarray(np.clip(points, 0.0, self.size))
+
 
 class Block(_SixSided):
     """A block with eight given corners: the trilinear image of a cube.
@@ -243,6 +251,26 @@ class Block(_SixSided):
         gap = np.abs(np.asarray(point) - self.place(x)[0]).max()
         extent = max(high - low for low, high in self.bounds)
         return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        from scipy.optimize import lsq_linear
+
+        steps = np.linspace(0, 1, 5)
+        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        images = self.place(guesses)
+        found = np.empty_like(points)
+        for i, point in enumerate(points):
+            # Gauss and Newton's method in the cube, the steps of which end at its faces.
+            x = guesses[[np.linalg.norm(images - point, axis=1).argmin()]]
+            for _ in range(20):
+                gap = point - self.place(x)[0]
+                step = lsq_linear(self._slopes(x)[0], gap, (np.minimum(-x[0], -1e-300), np.maximum(1 - x[0], 1e-300))).x
+                x = np.clip(x + step, 0, 1)
+                if np.abs(step).max() < 1e-12:
+                    break
+            found[i] = self.place(x)[0]
+        return found
 
     def _trilinear(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
         """Sum the corners with weights (n, 2) of the two ends along each axis."""

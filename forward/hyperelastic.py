@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
@@ -13,13 +14,28 @@ from pydantic import Field, TypeAdapter, ValidationError, create_model, field_va
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.fields import RandomField
-from forward.geometry import AXES, Body
+from forward.geometry import AXES, Body, Vector
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
-from forward.materials import MATERIALS, constants, small_strain_moduli, splits
+from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
 from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
 from forward.settings import Settings, nearest
+
+
+class _Fibrous(Settings):
+    """A material with one or two families of fibres, along vectors in the undeformed body."""
+
+    fibres: tuple[Vector, ...] = Field(min_length=1, max_length=2)
+
+    @field_validator("fibres")
+    @classmethod
+    def _have_lengths(cls, fibres: tuple[Vector, ...]) -> tuple[Vector, ...]:
+        if not all(any(fibre) for fibre in fibres):
+            message = "a direction has length zero, expected vectors such as [1, 0, 0]"
+            raise ValueError(message)
+        return fibres
+
 
 if TYPE_CHECKING:
     from forward.finite_element import HyperelasticModel
@@ -32,7 +48,7 @@ else:
             tuple(
                 create_model(
                     energy.__name__.title().replace("_", ""),
-                    __base__=Settings,
+                    __base__=_Fibrous if "I4" in measures(energy) else Settings,
                     __doc__=energy.__doc__,
                     kind=(Literal[name], name),
                     **{
@@ -147,9 +163,8 @@ class Hyperelastic(Settings):
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
         found = {}
-        for name in type(self.material).model_fields:
-            if name != "kind":
-                found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for name in constants(MATERIALS[self.energy]):
+            found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
         for region, numbers in self.regions.items():
             for name, value in numbers.items():
                 block = RegionNumbers if name == CONTRAST else type(self.material)
@@ -189,19 +204,26 @@ class Hyperelastic(Settings):
             return self.formulation == "mixed"
         if self.body.degree < 2 or not self._splits:
             return False
-        values = {name: value for name, value in self.material.model_dump().items() if name != "kind"}
+        values = {name: getattr(self.material, name) for name in constants(MATERIALS[self.energy])}
         of_regions = [values | {k: v for k, v in own.items() if k != CONTRAST} for own in self.regions.values()]
-        moduli = [small_strain_moduli(self._energy, constants) for constants in (values, *of_regions)]
+        moduli = [small_strain_moduli(self.energy, numbers) for numbers in (values, *of_regions)]
         return any(kappa > NEARLY_INCOMPRESSIBLE * mu for mu, kappa in moduli)
 
     @property
     def _splits(self) -> bool:
         """Whether the energy is the sum of a part without J and of D1 (J−1)²."""
-        return splits(self._energy)
+        return splits(self.energy)
 
     @property
-    def _energy(self) -> str:
+    def energy(self) -> str:
+        """Kind of the material."""
         return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Unit vectors along the families of fibres in the undeformed body."""
+        given = getattr(self.material, "fibres", ())
+        return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
@@ -307,7 +329,7 @@ class Hyperelastic(Settings):
                 yield ("regions", region), f"unknown region; {hint}", numbers
             for name, value in numbers.items():
                 if name not in known:
-                    message = f"not a constant of '{self._energy}'; {nearest(name, known)}"
+                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
                     yield ("regions", region, name), message, value
                     continue
                 objection = self.scalars[f"regions.{region}.{name}"].objection(value)
@@ -325,7 +347,7 @@ class Hyperelastic(Settings):
     def _mistakes_of_formulation(self) -> Iterator[Mistake]:
         if self.formulation == "mixed" and not self._splits:
             split = ", ".join(name for name, energy in MATERIALS.items() if splits(energy))
-            message = f"the energy '{self._energy}' has no part of the volume alone; a mixed form has: {split}"
+            message = f"the energy '{self.energy}' has no part of the volume alone; a mixed form has: {split}"
             yield ("formulation",), message, self.formulation
         if self.formulation == "mixed" and self.body.degree < 2:
             message = "a mixed form on cells of degree 1 is not stable, expected body.degree = 2"

@@ -42,6 +42,10 @@ _EDGES = {
     "tetrahedron": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
     "hexahedron": [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]],
 }
+_TETRAHEDRA = {
+    "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
+}
 # Corners of hexahedra with their neighbours, in an order that makes all determinants positive.
 _CORNERS = [
     [0, 1, 3, 4],
@@ -261,6 +265,29 @@ class OwnMesh(Settings):
         """Whether a point (m) lies in a box around the body; where the mesh is made, it must lie in a cell."""
         return all(low <= x <= high for x, (low, high) in zip(point, self.bounds, strict=True))
 
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        mesh = self.load()
+        tetrahedra = mesh.points[mesh.cells[:, _TETRAHEDRA[mesh.cell]].reshape(-1, 4)]
+        faces = mesh.cells[:, _FACES[mesh.cell]].reshape(-1, len(_FACES[mesh.cell][0]))
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        outer = faces[first[count == 1]]
+        triangles = mesh.points[
+            np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
+        ]
+        lows, highs = tetrahedra.min(axis=1), tetrahedra.max(axis=1)
+        slack = CLOSE * max(high - low for low, high in self.bounds)
+        found = np.array(points, dtype=float)
+        for i, point in enumerate(found):
+            near = ((lows <= point + slack) & (point - slack <= highs)).all(axis=1)
+            a, b, c, d = np.moveaxis(tetrahedra[near], 1, 0)
+            shares = np.linalg.solve(np.stack([b - a, c - a, d - a], axis=2), (point - a)[..., None])[..., 0]
+            if ((shares >= -CLOSE).all(axis=1) & (shares.sum(axis=1) <= 1 + CLOSE)).any():
+                continue
+            places = _nearest_of(triangles, point)
+            found[i] = places[((places - point) ** 2).sum(axis=1).argmin()]
+        return found
+
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
         return list(self.found.boundaries[boundary])
@@ -424,6 +451,25 @@ def contents(mesh: Loaded, digest: str) -> Contents:
         boundaries={name: _spanning(points[np.unique(facets)]) for name, facets in mesh.boundaries.items()},
         regions={name: float(f"{volume:.6g}") for name, volume in zip(mesh.regions, sums, strict=True)},
     )
+
+
+def _nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
+    """Return the place (n, 3) of each triangle (n, 3, 3) that is nearest to a point (3,)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    square = (normal**2).sum(axis=1)
+    foot = point - (((point - a) * normal).sum(axis=1) / square)[:, None] * normal
+    inside = np.ones(len(triangles), dtype=bool)
+    best, least = foot, np.full(len(triangles), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along = end - start
+        inside &= (np.cross(along, foot - start) * normal).sum(axis=1) >= 0
+        share = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+        place = start + share[:, None] * along
+        distance = ((place - point) ** 2).sum(axis=1)
+        best = np.where((distance < least)[:, None], place, best)
+        least = np.minimum(least, distance)
+    return np.where(inside[:, None], foot, best)
 
 
 def _spanning(points: FloatArray) -> tuple[Point, ...]:

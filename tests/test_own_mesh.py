@@ -123,6 +123,14 @@ def test_what_is_found_is_that_of_the_box(file):
         }
 
 
+@pytest.mark.parametrize("kind", ["hexahedron", "tetra"])
+def test_nearest_places_are_those_of_the_box(tmp_path, kind):
+    meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
+    points = np.random.default_rng(0).uniform(-0.4, 1.4, (60, 3))
+    found = OwnMesh(file=str(tmp_path / "box.vtu")).nearest(points)
+    np.testing.assert_allclose(found, Box(size=SIZE, cells=CELLS).nearest(points), atol=1e-12)
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("kind", ["hexahedron", "tetra"])
 def test_nodes_are_those_of_the_space(tmp_path, kind, degree):

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from workflows.config import Study
-    from workflows.selection import Selection
+    from workflows.config import AnyStudy
 
 # One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -102,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _load(options: argparse.Namespace) -> Study | Selection:
+def _load(options: argparse.Namespace) -> AnyStudy:
     """Read the study; modules of its model are found beside it and in the working directory."""
     from workflows.config import load
 

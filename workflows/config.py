@@ -5,13 +5,13 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import Hyperelastic, Mistake, Scalar
 from forward.model import ModelError
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
@@ -24,7 +24,10 @@ from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import Comparison
+
+    AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
 
 Model = Annotated[
     Hyperelastic | PythonModel | UmBridgeModel,
@@ -128,20 +131,10 @@ class Study(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Study:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                "Study",
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given
-                    )
-                    for place, m, given in mistakes
-                ],
-            )
+        refused("Study", list(self._mistakes()))
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         try:
             _ = self.models
         except ValidationError as error:
@@ -169,7 +162,7 @@ class Study(Settings):
         if isinstance(self.method, Compare):
             yield from self._compare_mistakes(self.method)
 
-    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         scalars = self.model.scalars
         fields = self.body.fields if self.body is not None else ()
         if not self.parameters and not fields:
@@ -182,21 +175,9 @@ class Study(Settings):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        for path, distribution in self.parameters.items():
-            if path not in scalars:
-                yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
-                continue
-            ends = distribution.support
-            if ends is None:
-                ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-            for end in ends:
-                objection = scalars[path].objection(end)
-                if objection is not None:
-                    message = f"reaches {end:.4g}, where the model is impossible ({objection})"
-                    yield ("parameters", path), message, distribution.model_dump()
-                    break
+        yield from mistakes_of_parameters(scalars, self.parameters)
 
-    def _mistakes_without_body(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_without_body(self) -> Iterator[Mistake]:
         """What only a body has: meshes, a solver, ranks that share it."""
         if self.body is not None:
             return
@@ -211,7 +192,7 @@ class Study(Settings):
             message = f"a model of kind '{kind}' is not shared by ranks, expected 1"
             yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
 
-    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _compare_mistakes(self, method: Compare) -> Iterator[Mistake]:
         for i, entry in enumerate(method.methods):
             shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:
@@ -223,7 +204,36 @@ class Study(Settings):
                 yield ("method", "reference", "values"), message, list(given)
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Selection:
+def refused(title: str, mistakes: Sequence[Mistake]) -> None:
+    """Raise what pydantic raises, if there are mistakes."""
+    if mistakes:
+        raise ValidationError.from_exception_data(
+            title,
+            [
+                InitErrorDetails(type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given)
+                for place, m, given in mistakes
+            ],
+        )
+
+
+def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible."""
+    for path, distribution in parameters.items():
+        if path not in scalars:
+            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        ends = distribution.support
+        if ends is None:
+            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        for end in ends:
+            objection = scalars[path].objection(end)
+            if objection is not None:
+                message = f"reaches {end:.4g}, where the model is impossible ({objection})"
+                yield ("parameters", path), message, distribution.model_dump()
+                break
+
+
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> AnyStudy:
     """Check a document and make a study of it.
 
     Parameters
@@ -244,11 +254,17 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     try:
-        if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
-            from workflows.selection import Selection, expanded
+        blocks = _located(blocks, folder)
+        kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
+        if kind in {"invert", "synthesize"}:
+            from workflows.inversion import made
 
-            return Selection.model_validate(expanded(blocks, folder))
-        return Study.model_validate(_located(blocks, folder))
+            return made(blocks, folder)
+        if kind == "select":
+            from workflows import selection
+
+            return selection.made(blocks, folder)
+        return Study.model_validate(blocks)
     except ValidationError as error:
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
@@ -263,7 +279,7 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
     return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
+def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -281,24 +297,27 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, by which editors complete and check it."""
+    from workflows.inversion import Inversion, Synthesis
     from workflows.selection import DataFile, Selection
+    from workflows.specimen_selection import DisplacementFile, SpecimenSelection
 
-    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection)
+    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection | SpecimenSelection | Inversion | Synthesis)
     found = adapter.json_schema(ref_template="#/$defs/{model}")
     # A file may name a table in place of the data themselves.
-    table = TypeAdapter(DataFile).json_schema(ref_template="#/$defs/{model}")
-    found["$defs"] |= table.pop("$defs", {}) | {"DataFile": table}
-    data = found["$defs"]["Selection"]["properties"]
-    data["data"] = {"anyOf": [data["data"], {"$ref": "#/$defs/DataFile"}]}
+    for name, file in (("Selection", DataFile), ("SpecimenSelection", DisplacementFile)):
+        table = TypeAdapter(file).json_schema(ref_template="#/$defs/{model}")
+        found["$defs"] |= table.pop("$defs", {}) | {file.__name__: table}
+        data = found["$defs"][name]["properties"]
+        data["data"] = {"anyOf": [data["data"], {"$ref": f"#/$defs/{file.__name__}"}]}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A study of tissuq"} | found
 
 
-def document(study: Study | Selection) -> dict[str, Any]:
+def document(study: AnyStudy) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study | Selection) -> str:
+def dump(study: AnyStudy) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 
@@ -404,10 +423,10 @@ def _kinds() -> set[str]:
     """Return the kinds of blocks, which pydantic puts into the places of errors."""
     from typing import get_args
 
-    from forward import geometry, loads, outputs
+    from forward import geometry, inclusions, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (Model, geometry.Body, loads.Load, outputs.Output, Distribution, Method)
+    unions = (Model, geometry.Body, inclusions.Inclusion, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 

@@ -10,7 +10,9 @@ from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.config import AnyStudy
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import Comparison
 
 
 def bytes_per_model(unknowns: int) -> float:
@@ -18,14 +20,13 @@ def bytes_per_model(unknowns: int) -> float:
     return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
 
 
-SECONDS_PER_STRESS = 4e-4  # a material point with its derivatives
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 
-def plan(study: Study | Selection, groups: int = 1) -> list[str]:
+def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     if not isinstance(study, Study):
-        return _comparison(study)
+        return _of_other_kinds(study)
     if study.body is None:
         return _external(study)
     method, model, body = study.method, study.body, study.body.body
@@ -83,16 +84,71 @@ def _external(study: Study) -> list[str]:
     ]
 
 
-def _comparison(study: Selection) -> list[str]:
-    method, tests = study.method, study.data.tests
-    evidences = len(study.pairs) * method.variants
-    seconds = SECONDS_PER_STRESS * study.planned + SECONDS_PER_SURROGATE * evidences
+def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study)
+    return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
+
+
+SOLVES_OF_FIELD = 12  # for a mode
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+
+
+def _inversion(study: Inversion) -> list[str]:
+    spec, sets = study.model, study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    each = seconds_per_solve(spec.unknowns) * len(spec.cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + study.method.solves(field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {sum(moved)} points outside the body are moved to its surface"] if sum(moved) else []),
+        f"time        about {_duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _synthesis(study: Synthesis) -> list[str]:
+    spec, sets = study.model, len(study.method.fraction)
+    seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
+    return [
+        f"method      {study.method.kind}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {sets}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
+    ]
+
+
+def _comparison(study: Comparison) -> list[str]:
+    method = study.method
+    evidences = study.evidences
+    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
     check = " and nested sampling, which takes minutes" if method.check else ""
-    groups = f" in {len(study.data.groups)} groups" if len(study.data.groups) > 1 else ""
+    data = study.groups.values()
+    tests = sum(len(study.tests(group)) for group in study.group_names)
+    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    kind = "stresses" if study.quantity == "stress" else "displacements"
+    count = (
+        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
+    )
     return [
         f"method      {method.kind}",
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
-        f"data        {sum(len(test.at) for test in tests)} stresses of {len(tests)} tests{groups}",
+        f"data        {count}{groups}",
         f"evidences   {evidences}{check}",
         f"solves      about {study.planned:,}",
         f"time        about {_duration(seconds)} on 1 core (rough)",

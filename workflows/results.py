@@ -26,8 +26,8 @@ def write_text(path: Path, text: str) -> None:
     partial.replace(path)
 
 
-def write_dataset(path: Path, dataset: xr.Dataset) -> None:
-    """Write a netCDF-4 file and rename it into place; equal datasets give equal bytes."""
+def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
+    """Write a netCDF-4 file, with groups, and rename it into place; equal datasets give equal bytes."""
     import h5netcdf
     import h5py
     from xarray.backends import H5NetCDFStore
@@ -42,6 +42,8 @@ def write_dataset(path: Path, dataset: xr.Dataset) -> None:
     created = h5py.h5f.create(os.fsencode(partial), fcpl=creation)
     with h5py.File(created) as file, h5netcdf.File(file, "a") as netcdf:
         dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
+        for name, of_group in (groups or {}).items():
+            of_group.dump_to_store(H5NetCDFStore(netcdf.create_group(name)))  # type: ignore[no-untyped-call]
     partial.replace(path)
 
 
@@ -72,6 +74,12 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
+    if "alone_eigenvalue" in dataset:
+        from workflows.inversion import summary as of_inversion
+
+        return of_inversion(dataset)
+    if "clean" in dataset:
+        return {"data": int(np.isfinite(dataset["values"]).sum())}
     if "log_evidence" in dataset:
         shown = ("log_evidence", "log_evidence_error", "probability")
         return {
@@ -130,6 +138,20 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     if "row_method" in dataset:
         summary["methods"] = _methods(dataset)
     return summary
+
+
+def inverted(summary: Mapping[str, Any]) -> list[str]:
+    """Say in a line what was found for each data set, if data were inverted."""
+    lines = []
+    for name, found in summary.get("data_sets", {}).items():
+        if "failed" in found:
+            lines.append(f"{name}: failed: {found['failed']}")
+            continue
+        values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
+        lines += [f"{name}: {', '.join(values)}", f"{name}: {found['verdict']}"]
+    if "data" in summary:
+        lines.append(f"{summary['data']} data made")
+    return lines
 
 
 def _methods(dataset: xr.Dataset) -> dict[str, list[dict[str, Any]]]:
@@ -212,14 +234,21 @@ def body_grid(dataset: xr.Dataset) -> Any:
 
 
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
-    """Write the displacement fields of the results on the undeformed mesh, for ParaView; nothing if there are none."""
+    """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
+
+    Displacements are in one file, what data sets say of the interior in one for each.
+    """
     if "cell_nodes" not in dataset:
         return None
     directory.mkdir(exist_ok=True)
-    path = directory / "displacement.vtu"
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    body_grid(dataset).save(partial)
-    partial.replace(path)
+    parts = {"displacement": dataset}
+    if "data_set" in dataset.dims:
+        parts = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
+    for name, part in parts.items():
+        path = directory / f"{name}.vtu"
+        partial = path.with_name(f".{os.getpid()}.{path.name}")
+        body_grid(part).save(partial)
+        partial.replace(path)
     return path
 
 
@@ -239,6 +268,9 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
                     arrays[f"{name} {field} {i}"] = values
         elif variable.dims == ("node",):
             arrays[str(name)] = variable.to_numpy()
+        elif variable.dims[1:] == ("node",):
+            labels = variable[variable.dims[0]].values
+            arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
     return arrays
 
 

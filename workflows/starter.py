@@ -22,6 +22,7 @@ body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexa
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 # formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
+# (kind = "ellipsoid" has radii a, b, c and a rotation vector turn_x, turn_y, turn_z (rad) instead of a radius)
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]
 # A random factor on the stiffness (or the density), log-normal, that varies over the body; its modes are parameters:
 # fields = [{ of = "stiffness", length = 0.03, std = 0.3, modes = 10 }]
@@ -43,7 +44,8 @@ outputs = [
 
 [parameters]
 # Any number of the model by its path: material.*, loads.<name or kind>.density|size, displacements.<name or boundary>.x
-# inclusions.<name or kind>.contrast|radius|x|y|z|width, regions.<name>.contrast|<constant>
+# inclusions.<name or kind>.contrast|radius|x|y|z|width (or a|b|c|turn_x|turn_y|turn_z of an ellipsoid)
+# regions.<name>.contrast|<constant>, in a mesh from a file
 # uniform, log-uniform, triangular, beta, truncated-normal, normal, log-normal, gamma
 "material.C1" = { kind = "uniform", lower = 0.5e4, upper = 1.5e4 }
 "loads.gravity.density" = { kind = "truncated-normal", mean = 1000, std = 50, lower = 800, upper = 1200 }

@@ -10,7 +10,7 @@ from forward.fields import RandomField
 from forward.hyperelastic import Hyperelastic
 from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
-from forward.materials import MATERIALS, OF_STRETCHES, units
+from forward.materials import MATERIALS, constants, units
 from forward.outputs import Output
 from workflows.config import Study
 
@@ -62,14 +62,17 @@ def unit_of(path: str) -> str:
     block, _, name = path.partition(".")
     if block == "material":
         # A name has the same unit in every material.
-        return next((of[name] for of in map(units, (MATERIALS | OF_STRETCHES).values()) if name in of), "1")
-    if path.endswith(".contrast"):
-        return "1"
+        return next((of[name] for of in map(units, MATERIALS.values()) if name in of), "1")
+    if block == "inclusions":
+        return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
+            path.rpartition(".")[2], "m"
+        )
     if block == "regions":
-        return unit_of(f"material.{path.rpartition('.')[2]}")
+        name = path.rpartition(".")[2]
+        return "1" if name == "contrast" else unit_of(f"material.{name}")
     if path.endswith(".density"):
         return "kg/m³"
-    return {"inclusions": "m", "displacements": "m", "loads": "Pa"}.get(block, "1")
+    return {"displacements": "m", "loads": "Pa"}.get(block, "1")
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -100,10 +103,11 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
-    kind = str(model.material.model_dump()["kind"])
-    constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
+    kind = model.energy
+    numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(MATERIALS[kind])]
+    fibres = [f"fibres along {' and '.join(map(_value, model.fibres))}"] if model.fibres else []
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
-    yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    yield "material", [law, ", ".join(numbers), *fibres]
     if model.regions:
         named = {
             region: ", ".join(f"{name} = {_scalar(study, f'regions.{region}.{name}')}" for name in numbers)
