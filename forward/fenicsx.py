@@ -200,14 +200,17 @@ def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
     return found
 
 
-def region_indicators(comm: Any, body: Body, msh: Any) -> dict[str, Any]:
-    """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
-    if not isinstance(body, OwnMesh):
-        return {}
+def region_numbers(comm: Any, body: OwnMesh, msh: Any) -> NDArray[np.int32]:
+    """Return the number of the region of each of this rank's cells, ghosts included; collective."""
     loaded = _on_first(comm, body.load)
     region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))
+    return np.asarray(region[np.asarray(msh.topology.original_cell_index)])
+
+
+def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
+    """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
+    of_cells = region_numbers(comm, body, msh)
     space = fem.FunctionSpace(msh, ("DG", 0))
-    of_cells = region[np.asarray(msh.topology.original_cell_index)]
     dofs = np.array([space.dofmap.cell_dofs(cell)[0] for cell in range(len(of_cells))])
     found = {}
     for number, name in enumerate(body.regions):

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from forward import fenicsx, kinematics
 from forward.acceleration import Inverse, block_galerkin
@@ -29,6 +30,7 @@ from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS, measures
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Found, Residual, solve
+from forward.own_mesh import OwnMesh
 from forward.reference import ReferenceFactor, turn
 from forward.vertex_fields import VertexField
 
@@ -139,7 +141,7 @@ class Discretisation:
     @cached_property
     def _regions(self) -> dict[str, Any]:
         """Indicators of the regions that have numbers of their own."""
-        if not self.spec.regions:
+        if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
             return {}
         found = fenicsx.region_indicators(self.comm, self.spec.body, self.mesh)
         return {name: found[name] for name in self.spec.regions}
@@ -750,6 +752,15 @@ class HyperelasticModel:
         space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in self.body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}
+
+    def region_of_cells(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of the layout's cells; nothing without regions.
+
+        Collective.
+        """
+        if not isinstance(self.spec.body, OwnMesh):
+            return None
+        return self.layout.by_cell(fenicsx.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
 
     @property
     def variance_kept(self) -> dict[str, float]:

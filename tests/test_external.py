@@ -1,9 +1,9 @@
 """Models of other programs: Python functions in every method that needs no field."""
 
 import json
+import shutil
 import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from forward.conformance import check_derivatives
 from forward.external import PythonModel
 from forward.model import ModelError, SolveError
 from tests import functions
+from tests.launch import ROOT
 from uq.evaluate import SerialEvaluate
 from workflows.config import StudyError, parse
 from workflows.plan import plan
@@ -174,8 +175,18 @@ def test_modules_are_found_beside_the_study(tmp_path, monkeypatch, capsys):
     from workflows.__main__ import main
 
     monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "own_beam.py").write_text(Path(functions.__file__).read_text())
+    shutil.copy(ROOT / "configs" / "own_model.py", tmp_path / "own_beam.py")
     (tmp_path / "study.toml").write_text(STUDY.replace("tests.functions", "own_beam"))
     assert main(["check", str(tmp_path / "study.toml")]) == 0
     assert main(["check", str(tmp_path / "study.toml"), "--set", "model.function=own_beam.bem"]) == 2
     assert capsys.readouterr().err == "model.function: 'own_beam' has no 'bem'; did you mean 'beam'?\n"
+
+
+def test_the_shipped_example(tmp_path, monkeypatch):
+    from workflows.__main__ import main
+
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    study = ROOT / "configs" / "own-model.toml"
+    assert main(["run", str(study), "--quiet", "--out", str(tmp_path / "out")]) == 0
+    data = xr.load_dataset(tmp_path / "out" / "results.nc")
+    assert float(data["mean"].sel(output="tip")) == pytest.approx(MEAN, rel=1e-5)

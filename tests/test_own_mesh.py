@@ -8,6 +8,7 @@ from itertools import product
 import meshio
 import numpy as np
 import pytest
+import pyvista
 import xarray as xr
 from mpi4py import MPI
 
@@ -196,6 +197,25 @@ def test_ranks_that_share_the_mesh_agree(file):
     assert one.returncode == two.returncode == 0, two.stderr
     for a, b in zip(*(json.loads(done.stdout.splitlines()[-1]) for done in (one, two)), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
+
+
+@pytest.mark.fem
+def test_results_hold_the_regions(tmp_path, file):
+    from workflows.study import run
+
+    blocks = document(parse(tomllib.loads((ROOT / "configs" / "tiny.toml").read_text())))
+    blocks["model"] = spec(file, outputs=FEW, displacements=(), loads=loaded_body("mooney-rivlin").loads).model_dump(
+        mode="json", exclude_none=True
+    )
+    blocks["parameters"] = {"loads.gravity.density": {"kind": "uniform", "lower": 500, "upper": 700}}
+    study = parse(blocks, ["method={kind='monte-carlo', samples=2}"])
+    assert run(study, "own", tmp_path / "own", quiet=True) == 0
+    data = xr.load_dataset(tmp_path / "own" / "results.nc")
+    grid = pyvista.read(tmp_path / "own" / "fields" / "displacement.vtu")
+    middles = grid.cell_centers().points[:, 0]
+    assert list(data.region.values) == ["left", "right"]
+    np.testing.assert_array_equal(grid.cell_data["region"], middles > 0.5)
+    np.testing.assert_array_equal(data["cell_region"], middles > 0.5)
 
 
 @pytest.mark.fem

@@ -31,6 +31,7 @@ from workflows.results import (
     read_summary,
     summarise,
     with_random_fields,
+    with_regions,
     write_dataset,
     write_fields,
     write_text,
@@ -204,19 +205,22 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
         return study.method.run(inputs, recorders["/"])
 
     others: list[Callable[[], ForwardModel]] = [
-        partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]
+        partial(other.build, ensemble.group, inputs.names) for other in study.models[1:]
     ]
     if study.body is None:
         function = study.model.build(ensemble.group, inputs.names)
         return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
 
-    model = study.body.build(ensemble.group, inputs.names)
+    spec = study.body
+    model = spec.build(ensemble.group, inputs.names)
     # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
     cells, kind = model.layout.cells()
+    regions = model.region_of_cells()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = label(found, units, model.layout.coordinates, cells, kind)
+        found = with_regions(found, spec.body.regions, regions)
         return with_random_fields(found, factors, model.variance_kept)
 
     return _Job(model, others, task, recorders, labelled)
