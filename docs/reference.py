@@ -53,6 +53,7 @@ def pages() -> Iterator[tuple[str, str]]:
     """Return the generated pages: where each goes, and its text."""
     yield "overview.md", overview((ROOT / "README.md").read_text(encoding="utf-8"))
     yield "studies.md", shipped()
+    yield "decisions.md", decisions()
     yield "reference/settings.md", settings()
     yield "reference/commands.md", commands()
     lines = ["# Modules", "", "Every public name with its docstring, from the source.", ""]
@@ -79,6 +80,15 @@ def shipped() -> str:
     for path in sorted((ROOT / "configs").glob("*.toml")):
         lines += [f"## {path.stem}", "", fenced("toml", path.read_text(encoding="utf-8")), ""]
     return "\n".join(lines)
+
+
+def decisions() -> str:
+    """Return a page that lists the decisions."""
+    lines = ["# Decisions", "", "Why some things are as they are, each with what was measured.", ""]
+    for path in sorted((ROOT / "docs" / "decisions").glob("*.md")):
+        title = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        lines.append(f"- [{title}](decisions/{path.name})")
+    return "\n".join([*lines, ""])
 
 
 def commands() -> str:
