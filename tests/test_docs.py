@@ -43,7 +43,8 @@ def commands(text):
 
 def words(command):
     """The arguments, as a shell hands them over; variables become a number."""
-    command = re.sub(r"\$\w+", "0.1", re.sub(r"`.*|\)$|; done$", "", command)).strip(" .,;")
+    command = re.sub(r"`.*|\)$|; done$|&$|> \S+$", "", command.strip())
+    command = re.sub(r"\$\w+", "0.1", command).strip(" .,;")
     return shlex.split(command, comments=True)[1:]
 
 
@@ -127,7 +128,9 @@ def test_names_that_python_snippets_import_are_there():
 
 
 def test_pictures_that_the_docs_name_are_functions():
-    for page, (module, name) in each(lambda text: re.findall(r"`(plots|bodies|selection_report)\.(\w+)`", text)):
+    for page, (module, name) in each(
+        lambda text: re.findall(r"`(plots|bodies|selection_report|inversion_report)\.(\w+)`", text)
+    ):
         assert callable(getattr(importlib.import_module(f"workflows.{module}"), name, None)), (page, name)
 
 
