@@ -190,6 +190,73 @@ subsets = { "tension alone" = ["uniaxial"] }
 """
 
 
+_SPECIMEN = """\
+# What is inside a specimen, with tissuq. SI units throughout. Check it with `tissuq check FILE`, run it with
+# `tissuq run FILE`.
+
+[model]
+kind = "specimen"
+# As of other studies, but for loads and outputs: bodies, materials, inclusions, fields.
+body = { kind = "box", size = [0.05, 0.05, 0.05], cells = [4, 4, 4], cell = "hexahedron", degree = 2 }
+material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 4e3 }
+inclusions = [{ name = "lump", x = 0.025, y = 0.025, z = 0.025, radius = 0.012, contrast = 4, width = 8e-3 }]
+# Load cases, each with clamp, displacements and loads as of other studies.
+[[model.cases]]
+name = "pull"
+clamp = ["z-min"]
+loads = [{ kind = "traction", on = "z-max", direction = [0, 0, 1], size = 100 }]
+"""
+
+_INVERT = """
+[parameters]
+# Priors of the numbers that are unknown, by their paths. Or none, and a field whose values at the vertices are:
+# model.fields = [{ of = "stiffness", length = 0.02, std = 0.5, basis = "nodes" }]
+"inclusions.lump.x" = { kind = "uniform", lower = 0.01, upper = 0.04 }
+"inclusions.lump.contrast" = { kind = "log-uniform", lower = 1, upper = 16 }
+
+[data]
+# Tables with the columns x, y, z, any of ux, uy, uz, optionally sigma and case (empty cells: not measured), or meshes
+# that meshio reads; files, folders or patterns. Each is a data set by itself.
+files = ["measured.csv"]
+sigma = 2e-5          # standard deviation (m) of the errors, where a file does not say
+# unit = 1e-3         # m per unit of the files
+# tolerance = 1e-4    # how far (m) points may lie outside the body
+
+[method]
+"""
+
+_SYNTHESIZE = """
+
+# What is measured: all nodes of boundaries, or points (at = [[x, y, z], …]).
+[[model.observed]]
+on = "z-max"
+
+[parameters]
+# What is drawn for each data set.
+"inclusions.lump.x" = { kind = "uniform", lower = 0.015, upper = 0.035 }
+
+[method]
+"""
+
+_METHODS["invert"] = """\
+kind = "invert"
+samples = 64          # solves that correct Laplace's Gaussian; of a field, 0 is none
+starts = 2            # of the search for the mode
+# noise = { kind = "log-uniform", lower = 0.2, upper = 5 }   # of a factor on all sigma, if their size is unknown
+# chains = "pcn"      # Markov chains beside it; or "emcee"
+seed = 1
+"""
+
+_METHODS["synthesize"] = """\
+kind = "synthesize"
+noise = { relative = 0.01 }   # of the root mean square of the displacements of a load case; or absolute (m)
+fraction = [0.5, 0.1]         # of the points, for each data set
+missing = 0.0                 # share of components that are lost
+seed = 1
+"""
+_HEADS = {"select": _SELECTION, "invert": _SPECIMEN + _INVERT, "synthesize": _SPECIMEN + _SYNTHESIZE}
+
+
 def starter(kind: str) -> str:
     """Return a commented study that runs as it is.
 
@@ -201,4 +268,4 @@ def starter(kind: str) -> str:
     if kind not in _METHODS:
         message = f"init {kind}: unknown kind of study; {nearest(kind, tuple(_METHODS))}"
         raise StudyError(message)
-    return (_SELECTION if kind == "select" else _MODEL) + _METHODS[kind]
+    return _HEADS.get(kind, _MODEL) + _METHODS[kind]
