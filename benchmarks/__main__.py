@@ -6,6 +6,7 @@ import sys
 
 from benchmarks import (
     bookkeeping,
+    calibration,
     chaos,
     fields,
     inversion,
@@ -25,6 +26,7 @@ ALL = {
     "levels": levels.main,
     "fields": fields.main,
     "inversion": inversion.main,
+    "calibration": calibration.main,
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,

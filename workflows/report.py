@@ -133,6 +133,7 @@ def _context(results: Results) -> dict[str, Any]:
         **_sobol(results),
         "bounds": [_bounds(results, output) for output in results.outputs] if "total_bound" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
+        "has_body": results.study.body is not None,
         "field_lines": field_lines,
         "bodies": drawn,
         "sensitivities": [(o, tables.sensitivities(results, o)) for o in results.outputs] if differentiated else [],
@@ -159,9 +160,9 @@ def _inversion(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) ->
 def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> dict[str, Any]:
     """Everything that the template of a comparison of models shows."""
     from workflows import selection_report
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
-    assert isinstance(study, Selection)
+    assert isinstance(study, Comparison)
     return {
         **_of_all(dataset, summary, study),
         "charts": [
