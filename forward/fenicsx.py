@@ -342,9 +342,9 @@ class Unknowns:
         self.displacement, displacements = self.whole.sub(0).collapse()
         self.pressure, pressures = self.whole.sub(1).collapse()
         self.pressures = int(self.pressure.dofmap.index_map.size_global)
-        self._numbers = np.array(displacements, dtype=np.int32)
+        self._numbers = np.array(displacements, dtype=np.int32).ravel()
         owned = self._numbers[: 3 * owned_nodes(self.displacement)]
-        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32)[: owned_nodes(self.pressure)]])
+        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32).ravel()[: owned_nodes(self.pressure)]])
         self.size = len(self._order)
 
     def split(self, all_of_them: Any) -> tuple[Any, Any]:

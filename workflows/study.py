@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -477,13 +478,12 @@ def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
 
 
 def _versions() -> dict[str, str]:
-    names = ("tissuq", "fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
+    dolfinx = ("fenics-dolfinx", "dolfinx-solver-real")  # Debian's name and that of the wheel
+    names = ("tissuq", *dolfinx, "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
     found = {}
     for name in names:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
     return found
 
 
