@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
+from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
@@ -102,7 +102,9 @@ def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = F
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study)
     kept = checkpoint if job.costly else None
-    dataset = ensemble.run(job.model, job.task, others=job.others, checkpoint=kept, progress=progress)
+    dataset = ensemble.run(
+        job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
+    )
     if dataset is None:
         return DONE
     progress.close()
@@ -221,11 +223,11 @@ def _prepare(study: Study | Selection, directory: Path, ranks: int) -> int | Non
     if ranks % share:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
-    groups, blocks = ranks // share, min(max(study.planned - 1, 1), BLOCKS)
+    groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
     if groups > blocks:
         message = (
             f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
-            f"start mpirun -n {blocks * share}, or set parallel.ranks_per_model"
+            f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
         )
         raise StudyError(message)
     kept = directory / "study.toml"
