@@ -57,6 +57,7 @@ bench: $(READY) ## measure times
 
 docs: $(READY) ## build the documentation into site/, without network
 	@NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
+	@echo site/index.html
 
 clean: ## remove .venv and caches; results stay
 	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -49,8 +49,8 @@ print(*inversion_report.findings(data), sep="\n")
 # posterior, and its standard deviation beside that of the prior.
 
 # %%
-axis, level = inversion_report.plane(one)
-inversion_report.slices(one, axis, level).figure
+cut = inversion_report.Cut.of(one)
+inversion_report.slices(one, cut).figure
 
 # %% [markdown]
 # ## How much is from the data: the spectrum
@@ -74,13 +74,13 @@ print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all:
 # from the faces that were measured.
 
 # %%
-inversion_report.direction_slices(one, axis, level).figure
+inversion_report.direction_slices(one, cut).figure
 
 # %% [markdown]
 # Each load case alone would have said less:
 
 # %%
-inversion_report.alone_slices(one, axis, level).figure
+inversion_report.alone_slices(one, cut).figure
 
 # %% [markdown]
 # ## Draws, and what they predict
