@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import lru_cache
+from io import StringIO
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self
@@ -318,7 +320,8 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
         raise ModelError(message)
 
     try:
-        mesh = meshio.read(file)
+        with redirect_stdout(StringIO()):  # meshio prints empty lines
+            mesh = meshio.read(file)
     except (Exception, SystemExit) as error:  # readers fail in many ways, some of them by exiting
         said = (str(error).splitlines() or [""])[0]
         refuse(f"cannot be read as a mesh: {said or type(error).__name__}")

@@ -23,6 +23,7 @@ from forward.model import ModelError, SolveError
 from tests.launch import ROOT, environment
 from uq.evaluate import SerialEvaluate
 from workflows.config import load, parse
+from workflows.serve import RefusalError, Service
 
 TISSUQ = Path(sys.executable).parent / "tissuq"
 POINT = [750.0, 2e5]
@@ -157,6 +158,24 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
         return
     jsonschema.validate(answer, ERROR)
     assert (status, answer["error"]["type"]) == (400, kind)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes"])
+def test_models_that_are_not_there(beam, what):
+    status, answer = ask(beam, what, {"name": "wrong_model_name"})
+    jsonschema.validate(answer, ERROR)
+    assert (status, answer["error"]["type"]) == (400, "ModelNotFound")
+
+
+def test_derivatives_that_are_not_there():
+    service = Service(parse(tomllib.loads(FUNCTION.format("beam").replace("jacobian", "# jacobian"))))
+    support = service.answer("ModelInfo", {"name": "forward"})["support"]
+    assert support == {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False}
+    for what in ("Gradient", "ApplyJacobian", "ApplyHessian"):
+        with pytest.raises(RefusalError) as caught:
+            service.answer(what, {"name": "forward"})
+        assert (caught.value.kind, caught.value.status) == ("UnsupportedFeature", 400)
 
 
 @pytest.mark.fem

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
@@ -136,7 +137,7 @@ class Inversion(Settings):
     data: DataFiles
     method: Invert = Invert()
     parallel: Parallel = Parallel()
-    measurements: tuple[Any, ...] = Field(default=(), exclude=True, repr=False)
+    measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     def __eq__(self, other: object) -> bool:
         """Whether the same is asked of the same files."""

@@ -20,6 +20,8 @@ body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexa
 # "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda), "saint-venant-kirchhoff" (lmbda, mu),
 # "blatz-ko" (mu).
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
+# Others: neo-hookean, neo-hookean-coupled, yeoh, gent, demiray, ogden, saint-venant-kirchhoff, blatz-ko, and
+# holzapfel-gasser-ogden, c = 2e4, k1 = 1e4, k2 = 1, D1 = 2e5, fibres = [[1, 1, 0], [1, -1, 0]]
 # formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
 # (kind = "ellipsoid" has radii a, b, c and a rotation vector turn_x, turn_y, turn_z (rad) instead of a radius)
@@ -154,6 +156,7 @@ kind = "local-sensitivity"
 
 _SELECTION = """\
 # A comparison of material models with tissuq. Check it with `tissuq check FILE`, run it with `tissuq run FILE`.
+# For models of a specimen given its displacements see configs/inclusion-material.toml.
 
 [data]
 # Tests, here in full. Or a table beside this file, whose lines with # are kept as its source:
@@ -167,7 +170,7 @@ tests = [
 ]
 
 # A candidate: constants that do not vary stand in material, priors of the others in parameters. Without D1, an energy
-# that has it is that of an incompressible material. Energies as of other studies, and "ogden".
+# that has it is that of an incompressible material. Energies as of other studies.
 [candidates.neo-hookean]
 material = { kind = "neo-hookean" }
 parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
@@ -189,6 +192,7 @@ seed = 1
 noise = { relative = 0.05, absolute = 10 }  # factor = { kind = "log-uniform", lower = 0.2, upper = 20 }
 other_noises = { "twice the errors" = { relative = 0.1, absolute = 20 } }
 subsets = { "tension alone" = ["uniaxial"] }
+# held_out = true     # predict every test from the others, too
 # check = "dynesty"   # nested sampling beside it, for minutes
 """
 
