@@ -6,6 +6,13 @@ PACKAGES := python3-dolfinx python3-h5py-mpi libopenblas0-serial openmpi-bin \
     libegl1 libgl1-mesa-dri libxrender1
 PYTHON := .venv/bin/python
 READY := .venv/ready
+# The second lane: DOLFINx from a wheel, for another Python. The first of these that runs; pyenv hides its own.
+WHEEL_PYTHON = $(shell for python in python3.12 python3.13 python3.14 $$(ls -d $$HOME/.pyenv/versions/3.1[2-4].*/bin/python 2>/dev/null); \
+    do $$python -c 'import venv, ensurepip' 2>/dev/null && echo $$python && break; done)
+WHEEL_VENV := .venv-wheel
+WHEEL_READY := $(WHEEL_VENV)/ready
+WHEEL_TESTS := tests/test_references.py tests/test_chaos.py tests/test_config.py tests/test_derivative_based.py \
+    tests/test_inputs.py tests/test_low_rank.py tests/test_monte_carlo.py tests/test_posterior.py tests/test_sobol.py
 DEMO := beam
 ARGS :=
 
@@ -18,12 +25,14 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint bench clean system
+.PHONY: help setup setup-wheel demo test test-all test-wheel lint bench docs clean system
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
 
 setup: $(READY) ## install what is missing
+
+setup-wheel: $(WHEEL_READY) ## install DOLFINx 0.11 from PyPI into .venv-wheel (Python 3.12 or newer)
 
 demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the report is
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
@@ -34,6 +43,9 @@ test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
 test-all: $(READY) ## run the test suite with the slow tests
 	@$(PYTHON) -m pytest -m "not benchmark" $(ARGS)
 
+test-wheel: $(WHEEL_READY) ## run the tests that say that DOLFINx 0.11 gives the same results
+	@$(WHEEL_VENV)/bin/python -m pytest -m "not slow and not benchmark and (wheel or not fem and not mpi)" $(WHEEL_TESTS) $(ARGS)
+
 lint: $(READY) ## check style, types and layers
 	@$(PYTHON) -m ruff check
 	@$(PYTHON) -m ruff format --check
@@ -43,8 +55,11 @@ lint: $(READY) ## check style, types and layers
 bench: $(READY) ## measure times
 	@$(PYTHON) -m benchmarks $(ARGS)
 
+docs: $(READY) ## build the documentation into site/, without network
+	@NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
+
 clean: ## remove .venv and caches; results stay
-	@rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 system:
@@ -71,4 +86,14 @@ $(READY): pyproject.toml constraints.txt | system
 	    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: h5py\nVersion: {h5py.__version__}\n")'
 	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --editable '.[dev]'
 	@$(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
+	@touch $@
+
+# Files of packages are compiled when they are first used, which most never are.
+$(WHEEL_READY): pyproject.toml constraints.txt
+	@[ -n "$(WHEEL_PYTHON)" ] || { echo "no Python 3.12 or newer found" >&2; exit 1; }
+	@echo "installing Python packages into $(WHEEL_VENV)"
+	@$(WHEEL_PYTHON) -m venv $(WHEEL_VENV)
+	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(WHEEL_VENV)/bin/python -m pip install --quiet --no-compile \
+	    --editable '.[fenicsx]' dynesty hypothesis pytest SALib
+	@$(WHEEL_VENV)/bin/python -c 'import dolfinx_solver, dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
 	@touch $@

@@ -6,6 +6,7 @@ import sys
 
 from benchmarks import (
     bookkeeping,
+    calibration,
     chaos,
     fields,
     inversion,
@@ -27,6 +28,7 @@ ALL = {
     "fields": fields.main,
     "inversion": inversion.main,
     "selection": selection.main,
+    "calibration": calibration.main,
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,

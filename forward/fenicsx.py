@@ -1,6 +1,6 @@
 """The only file that knows a DOLFINx version: meshes, spaces, compiled forms, assembly, linear solvers.
 
-Written for DOLFINx 0.5.
+Written for DOLFINx 0.5 (Debian 12) and 0.11 (the wheel `dolfinx-solver-real`).
 """
 
 from __future__ import annotations
@@ -8,88 +8,135 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+import sysconfig
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import basix
-import basix.cell
 import numpy as np
-import petsc4py
-import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from forward.geometry import AXES, Body
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ModelError, SolveError
+from forward.own_mesh import OwnMesh
+
+with suppress(ModuleNotFoundError):
+    import dolfinx_solver as _  # the wheel wants to be first  # noqa: F401
+import petsc4py
 
 petsc4py.init(["tissuq", "-no_signal_handler"])  # PETSc would end the study where a child process dies (SIGPIPE)
 
-from dolfinx import fem, geometry, mesh, plot  # noqa: E402
+import basix  # noqa: E402
+import dolfinx  # noqa: E402
+import dolfinx.fem.petsc  # noqa: E402
+import ffcx.naming  # noqa: E402
+import ufl  # noqa: E402
+from dolfinx import cpp, fem, geometry, mesh, plot  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+T = TypeVar("T")
+
+_FIVE = dolfinx.__version__.startswith("0.5.")  # else 0.11
+if not _FIVE:
+    import basix.ufl
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
 
 
 # --- compilation -----------------------------------------------------------------------------------------------------
 
 
+# Sums over nodes are vectorised only where the compiler may reorder them; NaN and infinity keep their meaning, which
+# -ffast-math would take from them. Measured: residuals 2 to 4 times, stiffness 1.3 times faster.
+_REORDER = ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-freciprocal-math", "-fno-math-errno"]
+_FLAGS = ["-O3", "-march=native", *_REORDER]
+
+
 def _cache_directory() -> Path:
-    """Compiled forms use the instructions of this processor, so each kind of processor has a folder of its own."""
+    """Folder of what was compiled for this kind of processor, this Python and these flags."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next(line for line in lines if line.startswith("flags"))
     except (OSError, StopIteration):
         processor = ""
+    made_for = [processor, str(sysconfig.get_config_var("SOABI")), dolfinx.__version__, *_FLAGS]
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "tissuq" / f"forms-{hashlib.sha256(processor.encode()).hexdigest()[:12]}"
+    return root / "tissuq" / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
 
 
 _CACHE = _cache_directory()
-# Sums over nodes are vectorised only where the compiler may reorder them; NaN and infinity keep their meaning, which
-# -ffast-math would take from them. Measured: residuals 2 to 4 times, stiffness 1.3 times faster.
-_REORDER = ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-freciprocal-math", "-fno-math-errno"]
-_JIT = {
-    "cffi_extra_compile_args": ["-O3", "-march=native", *_REORDER],
-    "cffi_libraries": ["m"],
-    "cache_dir": str(_CACHE),
-    "timeout": 600,
-}
+
+
+def _options(folder: Path) -> dict[str, Any]:
+    options = {"cffi_extra_compile_args": _FLAGS, "cffi_libraries": ["m"], "cache_dir": str(folder), "timeout": 600}
+    return {"jit_params" if _FIVE else "jit_options": options}
 
 
 @contextmanager
-def _compiling(comm: Any) -> Iterator[None]:
-    """Let one process of the machine compile at a time.
-
-    A compilation that was killed leaves a source without its end mark, which later ones would wait for; under the
-    lock no one else is compiling, so such leftovers can be removed.
-    """
-    if comm.rank > 0:
-        yield
-        return
+def _lock(name: str) -> Iterator[None]:
+    """Let one process at a time in. The system opens the lock of a process that dies."""
     _CACHE.mkdir(parents=True, exist_ok=True)
-    with (_CACHE / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        for source in _CACHE.glob("*.c"):
-            if not source.with_suffix(".c.cached").exists():
-                source.unlink()
+    with (_CACHE / f"{name}.lock").open("w") as lock:
+        with suppress(OSError):  # some file systems of clusters have no locks: then more than one process compiles
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def _compiled(what: Any, make: Callable[[Path], T], comm: Any) -> T:
+    """Return what `make` compiles, or loads, in a folder; collective over `comm`.
+
+    Whatever the number of processes that ask for it together, one compiles: in a folder that is renamed when it is
+    complete, so that no one ever finds half of it, nor has to wait for a process that was killed. What is there is
+    loaded without any lock.
+    """
+    name = ffcx.naming.compute_signature([what], "")
+    folder = _CACHE / name
+    if comm.bcast(folder.is_dir() if comm.rank == 0 else None):
+        return make(folder)
+    with _lock(name) if comm.rank == 0 else nullcontext():
+        place = comm.bcast(_vacant(folder) if comm.rank == 0 else None)
+        try:
+            made = make(place)
+            comm.barrier()  # everyone has loaded it
+            if comm.rank == 0 and place != folder:
+                with suppress(OSError):  # without locks another process may have been faster
+                    place.rename(folder)
+        finally:
+            if comm.rank == 0 and place != folder:
+                shutil.rmtree(place, ignore_errors=True)
+    return made
+
+
+def _vacant(folder: Path) -> Path:
+    """Where to compile: in a new folder, unless the folder itself has appeared."""
+    return folder if folder.is_dir() else Path(tempfile.mkdtemp(dir=_CACHE))
 
 
 def compile_form(form: Any, comm: Any) -> Any:
     """Compile a UFL form, once per machine; collective over `comm`."""
-    with _compiling(comm):
-        return fem.form(form, jit_params=_JIT)
+    return _compiled(form, lambda folder: fem.form(form, **_options(folder)), comm)
 
 
-def compile_expression(expression: Any, points: FloatArray, comm: Any) -> Any:
-    """Compile a UFL expression for evaluation at reference `points`; collective over `comm`."""
-    with _compiling(comm):
-        return fem.Expression(expression, points, jit_params=_JIT)
+class PointValues:
+    """A compiled UFL expression with its values at reference `points` (q, 3) of this rank's cells."""
+
+    def __init__(self, expression: Any, points: FloatArray, space: Any, comm: Any) -> None:
+        self._expression = _compiled(
+            (expression, points), lambda folder: fem.Expression(expression, points, **_options(folder)), comm
+        )
+        self._mesh = space.mesh
+        self._cells = np.arange(_cell_map(space.mesh).size_local, dtype=np.int32)
+
+    def __call__(self) -> FloatArray:
+        """Return the values (n_cells, q · size of the expression) at the state that is set."""
+        cells = (self._cells,) if _FIVE else (self._mesh, self._cells)
+        return np.asarray(self._expression.eval(*cells)).reshape(len(self._cells), -1)
 
 
 # --- meshes and spaces -----------------------------------------------------------------------------------------------
@@ -97,17 +144,79 @@ def compile_expression(expression: Any, points: FloatArray, comm: Any) -> Any:
 
 def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
+    if isinstance(body, OwnMesh):
+        return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
-    # FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name
-    # from the start, a form that was compiled in one run is found by the next.
-    domain = msh.ufl_domain()
-    plain = domain.ufl_coordinate_element()
-    named = ufl.FiniteElement(plain.family(), plain.cell(), plain.degree(), variant="equispaced")
-    domain._ufl_coordinate_element = ufl.VectorElement(named)
+    if _FIVE:
+        # FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name
+        # from the start, a form that was compiled in one run is found by the next.
+        domain = msh.ufl_domain()
+        plain = domain.ufl_coordinate_element()
+        named = ufl.FiniteElement(plain.family(), plain.cell(), plain.degree(), variant="equispaced")
+        domain._ufl_coordinate_element = ufl.VectorElement(named)
     # Facets are found while boundaries are planes across an axis.
     facets = _box_facets(msh, body.meshed)
     msh.geometry.x[:] = body.place(msh.geometry.x)
     return msh, facets
+
+
+def _own_mesh(comm: Any, body: OwnMesh) -> tuple[Any, dict[str, NDArray[np.int32]]]:
+    """Distribute a mesh that the first rank reads."""
+    loaded = _on_first(comm, body.load)
+    corners = 4 if body.cell == "tetrahedron" else 8
+    points, cells, boundaries = np.zeros((0, 3)), np.zeros((0, corners), dtype=np.int64), None
+    if loaded is not None:
+        points, boundaries = loaded.points, loaded.boundaries
+        # From VTK's order of the corners.
+        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, [0, 1, 3, 2, 4, 5, 7, 6]])
+    element = ufl.FiniteElement("Lagrange", body.cell, 1, variant="equispaced")
+    msh = mesh.create_mesh(comm, cells, points, ufl.Mesh(ufl.VectorElement(element)))
+    boundaries = comm.bcast(boundaries)
+    msh.topology.create_entities(2)
+    msh.topology.create_connectivity(2, 3)
+    facet_map = msh.topology.index_map(2)
+    every = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)
+    nodes = np.asarray(cpp.mesh.entities_to_geometry(msh._mesh, 2, every, False))
+    originals = np.sort(np.asarray(msh.geometry.input_global_indices)[nodes.reshape(len(every), -1)], axis=1)
+    numbers = {tuple(row): k for k, row in enumerate(originals.tolist())}
+    facets = {}
+    for name, wanted in boundaries.items():
+        here = [numbers[row] for row in map(tuple, np.sort(wanted, axis=1).tolist()) if row in numbers]
+        facets[name] = np.array(sorted(here), dtype=np.int32)
+    return msh, facets
+
+
+def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
+    """Call on the first rank; what is raised there is raised on all."""
+    found, problem = None, None
+    if comm.rank == 0:
+        try:
+            found = load()
+        except ModelError as error:
+            problem = str(error)
+    problem = comm.bcast(problem)
+    if problem is not None:
+        raise ModelError(problem)
+    return found
+
+
+def region_numbers(comm: Any, body: OwnMesh, msh: Any) -> NDArray[np.int32]:
+    """Return the number of the region of each of this rank's cells, ghosts included; collective."""
+    loaded = _on_first(comm, body.load)
+    region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))
+    return np.asarray(region[np.asarray(msh.topology.original_cell_index)])
+
+
+def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
+    """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
+    of_cells = region_numbers(comm, body, msh)
+    space = fem.FunctionSpace(msh, ("DG", 0))
+    dofs = np.array([space.dofmap.cell_dofs(cell)[0] for cell in range(len(of_cells))])
+    found = {}
+    for number, name in enumerate(body.regions):
+        found[name] = fem.Function(space)
+        found[name].x.array[dofs] = of_cells == number
+    return found
 
 
 def _box_facets(msh: Any, size: tuple[float, float, float]) -> dict[str, NDArray[np.int32]]:
@@ -132,14 +241,33 @@ def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]], degree: int) -
     return ufl.Measure("ds", domain=msh, subdomain_data=marked, metadata={"quadrature_degree": degree}), tags
 
 
+def _cell_map(msh: Any) -> Any:
+    return msh.topology.index_map(3)
+
+
+def _lagrange(msh: Any, degree: int, *, vector: bool) -> Any:
+    """Lagrange elements, as UFL knows them."""
+    cell = msh.ufl_cell()
+    if _FIVE:
+        return (ufl.VectorElement if vector else ufl.FiniteElement)("Lagrange", cell, degree)
+    return basix.ufl.element("Lagrange", cell.cellname, degree, shape=(3,) if vector else ())
+
+
+def _space(msh: Any, element: Any) -> Any:
+    """Return the space of an element; DOLFINx 0.5 compiles the element."""
+    if not _FIVE:
+        return fem.functionspace(msh, element)
+    return _compiled(element, lambda folder: fem.FunctionSpace(msh, element, **_options(folder)), msh.comm)
+
+
 def vector_space(msh: Any, degree: int) -> Any:
     """Continuous vector-valued Lagrange elements."""
-    return fem.VectorFunctionSpace(msh, ("Lagrange", degree))
+    return _space(msh, _lagrange(msh, degree, vector=True))
 
 
 def scalar_space(msh: Any, degree: int) -> Any:
     """Continuous scalar Lagrange elements."""
-    return fem.FunctionSpace(msh, ("Lagrange", degree))
+    return _space(msh, _lagrange(msh, degree, vector=False))
 
 
 def interpolate(values: Any, space: Any) -> FloatArray:
@@ -150,10 +278,14 @@ def interpolate(values: Any, space: Any) -> FloatArray:
 
 
 def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
-    """Mesh a body by hexahedra in this process; return trilinear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them."""
+    """Mesh a body in this process; return linear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them.
+
+    They are on hexahedra, but for bodies that come with a mesh of tetrahedra.
+    """
     from scipy.sparse import csr_matrix
 
-    msh, _ = mesh_body(MPI.COMM_SELF, body.model_copy(update={"cell": "hexahedron"}))
+    boxed = body if isinstance(body, OwnMesh) else body.model_copy(update={"cell": "hexahedron"})
+    msh, _ = mesh_body(MPI.COMM_SELF, boxed)
     space = scalar_space(msh, 1)
     v, w = ufl.TestFunction(space), ufl.TrialFunction(space)
     parts = [constant(msh, 0.0) for _ in range(3)]
@@ -205,15 +337,14 @@ class Unknowns:
             self.whole = self.displacement = vector_space(msh, degree)
             self.size = 3 * owned_nodes(self.displacement)
             return
-        cell = msh.ufl_cell()
-        elements = ufl.VectorElement("Lagrange", cell, degree), ufl.FiniteElement("Lagrange", cell, degree - 1)
-        self.whole = fem.FunctionSpace(msh, ufl.MixedElement(*elements))
+        elements = [_lagrange(msh, degree, vector=True), _lagrange(msh, degree - 1, vector=False)]
+        self.whole = _space(msh, ufl.MixedElement(*elements) if _FIVE else basix.ufl.mixed_element(elements))
         self.displacement, displacements = self.whole.sub(0).collapse()
         self.pressure, pressures = self.whole.sub(1).collapse()
         self.pressures = int(self.pressure.dofmap.index_map.size_global)
-        self._numbers = np.array(displacements, dtype=np.int32)
+        self._numbers = np.array(displacements, dtype=np.int32).ravel()
         owned = self._numbers[: 3 * owned_nodes(self.displacement)]
-        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32)[: owned_nodes(self.pressure)]])
+        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32).ravel()[: owned_nodes(self.pressure)]])
         self.size = len(self._order)
 
     def split(self, all_of_them: Any) -> tuple[Any, Any]:
@@ -250,7 +381,10 @@ class Unknowns:
 
 def quadrature_space(msh: Any, degree: int) -> Any:
     """Scalars at the quadrature points."""
-    return fem.FunctionSpace(msh, ufl.FiniteElement("Quadrature", msh.ufl_cell(), degree, quad_scheme="default"))
+    cell = msh.ufl_cell()
+    if _FIVE:
+        return _space(msh, ufl.FiniteElement("Quadrature", cell, degree, quad_scheme="default"))
+    return _space(msh, basix.ufl.quadrature_element(cell.cellname, scheme="default", degree=degree))
 
 
 def owned_nodes(space: Any) -> int:
@@ -277,8 +411,8 @@ def boundary_nodes(space: Any, facets: NDArray[np.int32]) -> NDArray[np.int32]:
 
 def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
     """Return the nodes (n_cells, k) of this rank's cells in VTK's order, and VTK's number of the cell type."""
-    topology, kinds, _ = plot.create_vtk_mesh(space)
-    owned = space.mesh.topology.index_map(3).size_local
+    topology, kinds, _ = (plot.create_vtk_mesh if _FIVE else plot.vtk_mesh)(space)
+    owned = _cell_map(space.mesh).size_local
     return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
 
 
@@ -286,12 +420,15 @@ def point_weights(space: Any, points: FloatArray) -> list[tuple[NDArray[np.int32
     """Return nodes and weights that interpolate at each point (n, 3) that this rank owns a cell around; collective."""
     msh = space.mesh
     probe = fem.Function(space)  # on every rank: making one is collective
-    tree = geometry.BoundingBoxTree(msh, 3, padding=1e-10)
-    colliding = geometry.compute_colliding_cells(msh, geometry.compute_collisions(tree, points), points)
+    if _FIVE:
+        near = geometry.compute_collisions(geometry.BoundingBoxTree(msh, 3, padding=1e-10), points)
+    else:
+        near = geometry.compute_collisions_points(geometry.bb_tree(msh, 3, padding=1e-10), points)
+    colliding = geometry.compute_colliding_cells(msh, near, points)
     found: list[tuple[NDArray[np.int32], FloatArray] | None] = []
     for i, position in enumerate(points):
         cells = colliding.links(i)
-        cells = cells[cells < msh.topology.index_map(3).size_local]
+        cells = cells[cells < _cell_map(msh).size_local]
         if len(cells) == 0:
             found.append(None)
             continue
@@ -307,14 +444,13 @@ def point_weights(space: Any, points: FloatArray) -> list[tuple[NDArray[np.int32
 
 def quadrature_points(space: Any, degree: int) -> FloatArray:
     """Reference points (q, 3) of the quadrature that the integrals use."""
-    cell = basix.cell.string_to_type(space.mesh.ufl_cell().cellname())
-    points, _ = basix.make_quadrature(cell, degree)  # type: ignore[attr-defined]
+    points, _ = basix.make_quadrature(_basix_cell(space), degree)
     return np.asarray(points)
 
 
-def owned_cells(space: Any) -> NDArray[np.int32]:
-    """Return the cells that this rank owns."""
-    return np.arange(space.mesh.topology.index_map(3).size_local, dtype=np.int32)
+def _basix_cell(space: Any) -> Any:
+    name = space.mesh.ufl_cell().cellname
+    return basix.cell.string_to_type(name()) if _FIVE else basix.CellType[name]
 
 
 def constant(msh: Any, value: Any) -> Any:
@@ -331,16 +467,16 @@ class NodalGradients:
     """Deformation gradients at the nodes: averages over the cells that meet there."""
 
     def __init__(self, F: Any, space: Any, comm: Any) -> None:
-        kind = basix.cell.string_to_type(space.mesh.ufl_cell().cellname())
-        degree = space.ufl_element().degree()
+        element = space.ufl_element()
         # The nodes in the order of the cells' lists, as `vector_space` places them.
-        family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped  # type: ignore[attr-defined]
-        nodes = basix.create_element(family, kind, degree, variant).points  # type: ignore[attr-defined]
+        family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
+        degree = element.degree() if _FIVE else element.degree
+        nodes = basix.create_element(family, _basix_cell(space), degree, variant).points
         self._comm = comm
-        self._expression = compile_expression(F, nodes, comm)
-        self._cells = owned_cells(space)
+        self._values = PointValues(F, nodes, space, comm)
         self._count = space.dofmap.index_map.size_local + space.dofmap.index_map.num_ghosts
-        self._nodes = space.dofmap.list.array.reshape(-1, len(nodes))[: len(self._cells)].ravel()
+        lists = space.dofmap.list.array.reshape(-1, len(nodes)) if _FIVE else space.dofmap.list
+        self._nodes = lists[: _cell_map(space.mesh).size_local].ravel()
         self._carrier = fem.Function(space)
         meeting = np.bincount(self._nodes, minlength=self._count).astype(float)
         self._meeting = self._owned(np.broadcast_to(meeting, (3, self._count)))[0]
@@ -354,7 +490,7 @@ class NodalGradients:
 
     def __call__(self) -> FloatArray:
         """Return F (3, 3, n_owned) at this rank's nodes, for the state that is set."""
-        values = np.asarray(self._expression.eval(self._cells)).reshape(-1, 9).T
+        values = self._values().reshape(-1, 9).T
         sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
         F = np.array([self._owned(rows) for rows in sums.reshape(3, 3, -1)])
         return np.asarray(F / self._meeting)
@@ -372,7 +508,7 @@ class VectorAssembler:
     def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any) -> None:
         self._form = compile_form(form, comm)
         self._unknowns = unknowns
-        self._vector = fem.petsc.create_vector(self._form)
+        self._vector = fem.petsc.create_vector(self._form if _FIVE else self._form.function_spaces[0])
 
     def __call__(self) -> FloatArray:
         """Assemble; return a copy of this rank's part (U_local,)."""
@@ -444,7 +580,7 @@ class DirectSolver:
             If the matrix is singular or has entries that are not finite.
         """
         self._matrix.zeroEntries()
-        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)  # type: ignore[misc]
+        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
         self._matrix.assemble()
         self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
         status = self._ksp.pc.getFactorMatrix().getMumpsInfog(1)
@@ -499,6 +635,6 @@ def total(comm: Any, values: FloatArray) -> FloatArray:
 
 def sum_ghosts(values: Any) -> FloatArray:
     """Send what a function holds at ghost nodes to their owners, add it there, and return the owned part."""
-    vector = values.vector
+    vector = values.vector if _FIVE else values.x.petsc_vec
     vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
     return np.array(vector.array_r)

@@ -17,18 +17,20 @@ from typing import Any
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from forward import fenicsx, kinematics
-from forward.acceleration import block_galerkin
+from forward.acceleration import Inverse, block_galerkin
 from forward.functionals import functional
 from forward.geometry import AXES
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS, measures
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Found, Residual, solve
+from forward.own_mesh import OwnMesh
 from forward.reference import ReferenceFactor, turn
 from forward.vertex_fields import VertexField
 
@@ -110,9 +112,8 @@ class Discretisation:
         self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
         self._solver = self.new_solver()
         self._factorised_at = np.zeros(self.size)
-        self._jacobians = fenicsx.compile_expression(
-            self.J, fenicsx.quadrature_points(self.space, spec.body.quadrature), comm
-        )
+        points = fenicsx.quadrature_points(self.space, spec.body.quadrature)
+        self._jacobians = fenicsx.PointValues(self.J, points, self.space, comm)
         self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding: float | None = None
@@ -132,15 +133,36 @@ class Discretisation:
 
     def energy_of(self, measures: dict[str, Any]) -> Any:
         """Energy density of its measures, as UFL; in the mixed form, without that of the change of volume."""
-        values = self._numbers("material")
+        values = self._material
         if self.p is not None:
             values["D1"] = 0
         return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *measures.values(), **values)
 
     @cached_property
+    def _regions(self) -> dict[str, Any]:
+        """Indicators of the regions that have numbers of their own."""
+        if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
+            return {}
+        found = fenicsx.region_indicators(self.comm, self.spec.body, self.mesh)
+        return {name: found[name] for name in self.spec.regions}
+
+    @property
+    def _material(self) -> dict[str, Any]:
+        """Constants of the material, by their names, each as an expression of the place."""
+        values = self._numbers("material")
+        for region, inside in self._regions.items():
+            for name, number in self._numbers(f"regions.{region}").items():
+                if name != CONTRAST:
+                    values[name] = (1 - inside) * values[name] + inside * number
+        return values
+
+    @cached_property
     def stiffness_factor(self) -> Any:
-        """What inclusions and fields multiply every modulus by, as a UFL expression of the place; 1 without any."""
+        """What regions, inclusions and fields multiply every modulus by, by the place, in UFL; 1 without any."""
         factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        for region, inside in self._regions.items():
+            if CONTRAST in self.spec.regions[region]:
+                factor *= 1 - inside + inside * self._variables[f"regions.{region}.{CONTRAST}"]
         X = ufl.SpatialCoordinate(self.mesh)
         for inclusion in self.spec.inclusions:
             numbers = self._numbers(f"inclusions.{inclusion.label}")
@@ -169,7 +191,7 @@ class Discretisation:
         energy, J, p = self.energy_of(self._measures), self._measures["J"], self._pressure
         if p is None:
             return energy, energy, self.J - 1
-        bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
+        bulk = 2 * self.stiffness_factor * self._material["D1"]
         of_pressure = p**2 / (2 * bulk)
         return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
 
@@ -544,8 +566,7 @@ class Discretisation:
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J over the quadrature points of all ranks."""
         self.set_state(u)
-        values = np.asarray(self._jacobians.eval(fenicsx.owned_cells(self.space)))
-        return fenicsx.smallest(self.comm, float(values.min(initial=np.inf)))
+        return fenicsx.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
 
     def negative_pivots(self) -> int:
         """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; −1 if unknown."""
@@ -709,8 +730,8 @@ class HyperelasticModel:
         way = None if reference is None else _Way(self, reference, parameters)
         found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
-        corrected = body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
+        corrected = way is not None and way.rotation is not None and body.work.factorisations == 0
+        return FiniteElementSolution(self, parameters, found, body.work, way if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -731,6 +752,15 @@ class HyperelasticModel:
         space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in self.body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}
+
+    def region_of_cells(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of the layout's cells; nothing without regions.
+
+        Collective.
+        """
+        if not isinstance(self.spec.body, OwnMesh):
+            return None
+        return self.layout.by_cell(fenicsx.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
 
     @property
     def variance_kept(self) -> dict[str, float]:
@@ -764,13 +794,28 @@ class HyperelasticModel:
 
 
 class _Way:
-    """The straight line in parameters from a reference."""
+    """The straight line in parameters from a reference.
+
+    Attributes
+    ----------
+    reference
+        Where it begins.
+    state
+        Of the reference.
+    rotation
+        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    """
 
     def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray) -> None:
-        self._body = model.body
+        self._body, self._factor = model.body, model.reference
         self._from, self._to = reference.parameters, parameters
+        self.reference = reference
         self.state = reference.state
-        self.inverse = model.reference.near
+        self.rotation: FloatArray | None = None
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        self.rotation = self._factor.rotation(u)
+        return self._factor.inverse(self.rotation)
 
     def at(self, fraction: float) -> None:
         self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
@@ -790,7 +835,7 @@ class FiniteElementSolution:
         parameters: FloatArray,
         found: Found,
         work: Work,
-        reference: Reference | None,
+        way: _Way | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
@@ -799,7 +844,8 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self._reference = reference
+        self._reference = None if way is None else way.reference
+        self._rotation = None if way is None else way.rotation
         model.visit(self)
         self.outputs = np.array([f.value() for f in model._functionals])
         self.outputs.flags.writeable = False
@@ -820,29 +866,20 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
-    @cached_property
-    def _rotation(self) -> FloatArray:
-        """Rotations of the nodes from the reference to this solution."""
-        model = self._model
-        assert self._reference is not None
-        factor = model.take_reference(self._reference)
-        model.visit(self)
-        return factor.rotation(self.state)
-
     def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
         """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
         model = self._model
-        if self._reference is not None and len(right) <= FEW:
-            found = self._solve_near(right, self._reference, transpose=transpose, directions=directions)
+        if self._reference is not None and self._rotation is not None and len(right) <= FEW:
+            found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
             if found is not None:
                 return found
         return model.linearise(self).back_substitute(right, transpose=transpose)
 
     def _solve_near(
-        self, right: FloatArray, reference: Reference, *, transpose: bool, directions: FloatArray | None
+        self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
     ) -> FloatArray | None:
-        """Solve with the factor of the reference; nothing if that is too far away."""
-        model, R = self._model, self._rotation
+        """Solve with the factor of the reference, turned as for its prediction; nothing if that is too far away."""
+        model = self._model
         factor = model.take_reference(reference)
         fixed = model.body.fixed
         first = None

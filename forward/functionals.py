@@ -14,7 +14,7 @@ import ufl
 
 from forward import fenicsx, kinematics
 from forward.geometry import AXES
-from forward.model import FloatArray
+from forward.model import FloatArray, ModelError
 from forward.outputs import (
     MaxDisplacement,
     MaxVonMises,
@@ -87,7 +87,7 @@ def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
     owners = body.comm.allgather(found is not None)
     if not any(owners):
         message = f"output '{output.name}': the point {list(output.at)} lies outside the body"
-        raise ValueError(message)
+        raise ModelError(message)
     probe = fenicsx.function(body.space)
     if found is not None and owners.index(True) == body.comm.rank:
         nodes, weights = found
@@ -217,12 +217,10 @@ class _MaxVonMises:
         cauchy = ufl.diff(body.energy_of(body.measures_of(F)), F) * F.T / ufl.det(F)
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature
-        self._expression = fenicsx.compile_expression(stress, fenicsx.quadrature_points(body.space, degree), body.comm)
+        points = fenicsx.quadrature_points(body.space, degree)
+        self._values = fenicsx.PointValues(stress, points, body.space, body.comm)
         self._selector = fenicsx.function(fenicsx.quadrature_space(body.mesh, degree))
         self._stress = stress
-
-    def _values(self) -> FloatArray:
-        return np.asarray(self._expression.eval(fenicsx.owned_cells(self._body.space)))
 
     def value(self) -> float:
         return -fenicsx.smallest(self._body.comm, -self._values().max(initial=0.0))

@@ -10,6 +10,7 @@ from annotated_types import Gt
 from pydantic import BeforeValidator, Field, model_validator
 
 from forward.model import FloatArray
+from forward.own_mesh import OwnMesh
 from forward.settings import Settings
 
 Axis = Literal["x", "y", "z"]
@@ -72,6 +73,27 @@ class _SixSided(Settings):
     def boundaries(self) -> tuple[str, ...]:
         """Names of the boundaries."""
         return tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """No region has a name."""
+        return ()
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells."""
+        a, b, c = self.cells
+        return a * b * c * (6 if self.cell == "tetrahedron" else 1)
+
+    @property
+    def cells_in_words(self) -> str:
+        """How many cells there are along each edge."""
+        return " × ".join(f"{n}" for n in self.cells)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Nothing is odd about it."""
+        return ()
 
     @property
     def nodes(self) -> int:
@@ -281,4 +303,4 @@ def _box_by_default(value: Any) -> Any:
     return {"kind": "box"} | value if isinstance(value, dict) else value
 
 
-Body = Annotated[Box | Block, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+Body = Annotated[Box | Block | OwnMesh, Field(discriminator="kind"), BeforeValidator(_box_by_default)]

@@ -9,7 +9,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
 import numpy as np
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
@@ -93,6 +93,21 @@ def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> T
     return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
 
 
+CONTRAST = "contrast"
+
+
+class RegionNumbers(Settings):
+    """What a region may have besides constants of the material.
+
+    Parameters
+    ----------
+    contrast
+        Stiffness there divided by that of its constants (1).
+    """
+
+    contrast: Annotated[float, Gt(0)]
+
+
 class Hyperelastic(Settings):
     """A hyperelastic body under loads, solved by finite elements.
 
@@ -102,8 +117,11 @@ class Hyperelastic(Settings):
         Geometry and mesh.
     material
         Strain energy and its constants.
+    regions
+        Numbers of named regions of the mesh: constants of the material, which take the place of those of `material`,
+        and `contrast`, by which the energy density is multiplied: ``{ tumour = { contrast = 9 } }``.
     inclusions
-        Regions that are stiffer or softer: their factors multiply the energy density.
+        Balls that are stiffer or softer: their factors multiply the energy density.
     fields
         Random fields that multiply the stiffness or the density.
     clamp
@@ -127,6 +145,7 @@ class Hyperelastic(Settings):
     formulation: Literal["displacement", "mixed", "auto"] = "auto"
     body: Body
     material: Material
+    regions: dict[str, dict[str, float]] = Field(default={})
     inclusions: tuple[Inclusion, ...] = ()
     fields: tuple[RandomField, ...] = ()
     clamp: tuple[str, ...] = ()
@@ -135,7 +154,7 @@ class Hyperelastic(Settings):
     outputs: tuple[Output, ...] = Field(min_length=1)
     solver: SolverSettings = SolverSettings()
 
-    @field_validator("solver", mode="before")
+    @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
     @classmethod
     def _kind_alone(cls, given: Any) -> Any:
         return {"kind": given} if isinstance(given, str) else given
@@ -146,6 +165,11 @@ class Hyperelastic(Settings):
         found = {}
         for name in constants(MATERIALS[self.energy]):
             found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for region, numbers in self.regions.items():
+            for name, value in numbers.items():
+                block = RegionNumbers if name == CONTRAST else type(self.material)
+                if name in block.model_fields:
+                    found[f"regions.{region}.{name}"] = Scalar(value, block, name)
         for inclusion in self.inclusions:
             for name in type(inclusion).model_fields:
                 if name not in {"kind", "name"}:
@@ -181,8 +205,9 @@ class Hyperelastic(Settings):
         if self.body.degree < 2 or not self._splits:
             return False
         values = {name: getattr(self.material, name) for name in constants(MATERIALS[self.energy])}
-        mu, kappa = small_strain_moduli(self.energy, values)
-        return kappa > NEARLY_INCOMPRESSIBLE * mu
+        of_regions = [values | {k: v for k, v in own.items() if k != CONTRAST} for own in self.regions.values()]
+        moduli = [small_strain_moduli(self.energy, numbers) for numbers in (values, *of_regions)]
+        return any(kappa > NEARLY_INCOMPRESSIBLE * mu for mu, kappa in moduli)
 
     @property
     def _splits(self) -> bool:
@@ -263,6 +288,7 @@ class Hyperelastic(Settings):
             if not self.body.contains(centre):
                 message = f"its centre lies outside the body, which lies in {self._bounds}"
                 yield ("inclusions", i), message, list(centre)
+        yield from self._mistakes_of_regions()
         yield from self._mistakes_of_fields()
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
@@ -294,6 +320,21 @@ class Hyperelastic(Settings):
                 )
             if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
                 yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
+
+    def _mistakes_of_regions(self) -> Iterator[Mistake]:
+        known = (*(name for name in type(self.material).model_fields if name != "kind"), CONTRAST)
+        for region, numbers in self.regions.items():
+            if region not in self.body.regions:
+                hint = nearest(region, self.body.regions) if self.body.regions else "this body has none"
+                yield ("regions", region), f"unknown region; {hint}", numbers
+            for name, value in numbers.items():
+                if name not in known:
+                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
+                    yield ("regions", region, name), message, value
+                    continue
+                objection = self.scalars[f"regions.{region}.{name}"].objection(value)
+                if objection is not None:
+                    yield ("regions", region, name), objection, value
 
     def _mistakes_of_fields(self) -> Iterator[Mistake]:
         for i, field in enumerate(self.fields):

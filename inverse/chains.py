@@ -11,8 +11,15 @@ the noise of the prior. For few parameters there is also the ensemble whose walk
 Appl. Math. Comp. Sci. 5 (2010) 65–80; emcee: D. Foreman-Mackey et al., Publ. Astron. Soc. Pac. 125 (2013) 306–312),
 which knows no Gaussian. R̂ and effective sizes are ArviZ's (A. Vehtari et al., Bayesian Anal. 16 (2021) 667–718).
 
-The same Gaussian as a proposal of independent samples has the weights w ∝ exp(ℓ(x) + ½|z|²): in the directions beyond
-the pairs the posterior is the prior to λ/(1+λ) of the first one left out, so that only the pairs make weights uneven.
+For fields the Gaussian alone misses what is of second order in the many directions that the data hardly see: together
+they change what the data see well by more than the noise (a field that varies is softer in the mean than a constant
+one). So the L above is bent: with the part w of Lz in the directions U of λ ≤ 30, and the residual r of a solve at ξ̂+w,
+
+    x = ξ̂ + w + U_s (a(w) + (I+Λ_s)^{−1/2} z_s),   a(w) = −(I+Λ_s)⁻¹ (A_sᵀ r + ξ̂_s),
+
+the strong directions s follow by a step of Gauss–Newton. As a depends on w alone, the determinant of this map is that
+of L, and all formulas stay as they are; for linear models a = 0. Samples x of independent z have the weights w ∝
+exp(ℓ(x) + ½|z|²), and the mean of these is the evidence.
 """
 
 from __future__ import annotations
@@ -29,6 +36,7 @@ from inverse.evidence import ALIKE, TRUSTED, Evidence, tail_shape
 from inverse.field_posterior import Point
 from inverse.laplace import Laplace
 from inverse.low_rank import LowRankPosterior
+from inverse.newton_cg import Mode
 from inverse.posterior import Posterior
 from inverse.predictive import ResidualTest
 
@@ -37,12 +45,13 @@ if TYPE_CHECKING:
 
 ACCEPTED = 0.3  # share of proposals that β aims at during the burn-in
 FIRST_STEP = 0.5  # β at its start
+STRONG = 30.0  # λ of the directions of a field that follow the others
 SPREAD = 1.3  # of the starts of chains, in standard deviations of the Gaussian
 WIDER = 1.2  # standard deviations of the Gaussian of weighted points, over those of the points
 MIXED = 1.01  # R̂ up to which chains say the same
 INDEPENDENT = 400.0  # effective draws from which on R̂ and quantiles mean something
 
-Density = Callable[[FloatArray], FloatArray]
+Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Map = Callable[[FloatArray], FloatArray]
 
 
@@ -127,9 +136,8 @@ def _arviz() -> Any:
 
 
 def crank_nicolson(
-    log_density: Density,
-    centre: FloatArray,
-    root: Map,
+    place: Place,
+    size: int,
     *,
     keep: Map = lambda x: x,
     names: tuple[str, ...] | None = None,
@@ -143,12 +151,10 @@ def crank_nicolson(
 
     Parameters
     ----------
-    log_density
-        ℓ (n,) at x (n, c), up to a constant; −∞ where there is no answer.
-    centre
-        x̂ (c,).
-    root
-        Products of L with rows (n, c).
+    place
+        Points x (n, c) of z (n, c), and ℓ (n,) there, up to a constant: −∞ where there is no answer.
+    size
+        c.
     keep
         Quantities (n, k) at x (n, c) that are kept.
     names
@@ -164,21 +170,18 @@ def crank_nicolson(
         If there is no answer at the start of a chain.
     """
     rngs = [np.random.default_rng([seed, chain]) for chain in range(chains)]
-    c = len(centre)
 
     def normals() -> FloatArray:
-        return np.array([rng.standard_normal(c) for rng in rngs])
+        return np.array([rng.standard_normal(size) for rng in rngs])
 
     z = SPREAD * normals()
-    x = centre + root(z)
-    here = log_density(x)
+    x, here = place(z)
     for _ in range(burn):  # starts beyond what can be solved come nearer
         lost = ~np.isfinite(here)
         if not lost.any():
             break
         z = np.where(lost[:, None], z / 2, z)
-        x = centre + root(z)
-        here = np.where(lost, log_density(x), here)
+        x, here = place(z)
     if not np.isfinite(here).all():
         raise SolveError("the model has no answer where a chain starts")
     odds = np.log(FIRST_STEP / (1 - FIRST_STEP))
@@ -187,8 +190,7 @@ def crank_nicolson(
     for step in range(-burn, draws * thin):
         beta = float(1 / (1 + np.exp(-odds)))
         moved = np.sqrt(1 - beta**2) * z + beta * normals()
-        x_moved = centre + root(moved)
-        there = log_density(x_moved)
+        x_moved, there = place(moved)
         chance = np.exp(np.minimum(0.0, there - here + ((moved**2).sum(axis=1) - (z**2).sum(axis=1)) / 2))
         taken = np.array([rng.random() for rng in rngs]) < chance
         z, x = np.where(taken[:, None], moved, z), np.where(taken[:, None], x_moved, x)
@@ -235,10 +237,14 @@ def chains_of_few(
         w, x = around.weights, around.density.x
         centre = w @ x
         root = WIDER * np.linalg.cholesky((x - centre).T @ ((x - centre) * w[:, None]))
+
+    def place(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x = centre + z @ root.T
+        return x, posterior.at(x).log_posterior
+
     return crank_nicolson(
-        lambda x: posterior.at(x).log_posterior,
-        centre,
-        lambda z: z @ root.T,
+        place,
+        len(centre),
         keep=posterior.physical,
         names=posterior.names,
         chains=chains,
@@ -264,9 +270,8 @@ def chains_of_field(
     """Run chains for a field; kept are its values (N,), or quantities (n, k) of values (n, N)."""
     values = mode.posterior.values
     return crank_nicolson(
-        near(mode, found),
-        mode.noise,
-        found.spectrum.root,
+        bent(mode, found),
+        len(mode.noise),
         keep=values if keep is None else lambda x: keep(values(x)),
         names=names,
         chains=chains,
@@ -314,23 +319,34 @@ def ensemble(
     )
 
 
-def near(mode: Point, found: LowRankPosterior) -> Density:
-    """Return −cost (n,) of a field at ξ (n, N), solved from states that the pairs predict by the factor of the mode."""
+def bent(mode: Point, found: LowRankPosterior) -> Place:
+    """Return the map of z (n, N) to ξ (n, N) and −cost (n,) there: two solves for each, by the factor of the mode."""
+    pairs = found.spectrum
     slopes = mode.solution.state_tangent(found.directions)
     state = np.array(mode.solution.state)
     reference = Reference(mode.values, state)
+    strong = pairs.values > STRONG
+    vectors, images, stiffness = pairs.vectors[strong], pairs.images[strong], 1 + pairs.values[strong]
+    centre = vectors @ mode.noise
 
-    def log_density(noise: FloatArray) -> FloatArray:
-        values = np.full(len(noise), -np.inf)
-        for i, row in enumerate(noise):
-            start = state + ((row - mode.noise) @ found.spectrum.vectors.T) @ slopes
+    def solved(noise: FloatArray) -> Point:
+        start = state + ((noise - mode.noise) @ pairs.vectors.T) @ slopes
+        return mode.posterior.at(noise, start, reference)
+
+    def place(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        along = z @ vectors.T
+        noise = mode.noise + pairs.root(z - along @ vectors)
+        values = np.full(len(z), -np.inf)
+        for i in range(len(z)):
             try:
-                values[i] = -mode.posterior.at(row, start, reference).cost
+                follows = -(images @ solved(noise[i]).residual + centre) / stiffness if strong.any() else 0.0
+                noise[i] += (follows + along[i] / np.sqrt(stiffness)) @ vectors
+                values[i] = -solved(noise[i]).cost
             except SolveError:
                 continue
-        return values
+        return noise, values
 
-    return log_density
+    return place
 
 
 # --- weighted samples of a field -------------------------------------------------------------------------------------
@@ -338,7 +354,7 @@ def near(mode: Point, found: LowRankPosterior) -> Density:
 
 @dataclass(frozen=True, eq=False)
 class FieldWeights:
-    """Samples of the low-rank Gaussian with their weights in the posterior.
+    """Samples of the low-rank Gaussian, bent, with their weights in the posterior.
 
     Attributes
     ----------
@@ -356,6 +372,16 @@ class FieldWeights:
         """Weights (n,) of sum 1."""
         w = np.exp(self.log_weights - self.log_weights.max())
         return np.asarray(w / w.sum())
+
+    @property
+    def mean(self) -> FloatArray:
+        """Means (N,) of the values."""
+        return np.asarray(self.weights @ self.values)
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations (N,)."""
+        return np.asarray(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
 
     @property
     def effective(self) -> float:
@@ -391,7 +417,7 @@ class FieldWeights:
 
 
 def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed: int = 0) -> FieldWeights:
-    """Draw samples of the low-rank Gaussian and weigh them by the posterior: a solve for each.
+    """Draw samples of the low-rank Gaussian, bent, and weigh them by the posterior: two solves for each.
 
     Raises
     ------
@@ -399,10 +425,10 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
         If the model has no answer at any of them.
     """
     z = np.random.default_rng(seed).standard_normal((samples, len(mode.noise)))
-    noise = mode.noise + found.spectrum.root(z)
+    noise, log_density = bent(mode, found)(z)
     weights = mode.posterior.weights[mode.posterior.weights > 0]
     constant = float(np.log(weights).sum()) - len(weights) / 2 * float(np.log(2 * np.pi)) + found.log_determinant / 2
-    log_weights = near(mode, found)(noise) + (z**2).sum(axis=1) / 2 + constant
+    log_weights = log_density + (z**2).sum(axis=1) / 2 + constant
     if not np.isfinite(log_weights.max()):
         raise SolveError("the model has no answer at any of the samples of the Gaussian")
     return FieldWeights(mode.posterior.values(noise), log_weights)
@@ -412,7 +438,6 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
 
 SHIFT = 0.25  # of the mean from the mode, in standard deviations, that is tolerated of Laplace's Gaussian
 WIDTH = 0.2  # relative difference of standard deviations that is
-EVEN = 0.3  # effective share of a field's samples from which on the Gaussian is good enough
 FEWEST = 20.0  # effective samples below which weights say nothing
 
 
@@ -464,21 +489,25 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
 
 
 def verdict_on_field(
-    converged: bool, found: FieldWeights | None, test: ResidualTest, chains: Chains | None = None
+    mode: Mode, gaussian: LowRankPosterior, found: FieldWeights | None, test: ResidualTest, chains: Chains | None = None
 ) -> Verdict:
-    """Judge the low-rank Gaussian of a field by weighted samples, if there are any, and the residuals."""
-    objection = _objection(converged, test)
+    """Judge means and standard deviations of the values of a field by weighted samples, if any, and the residuals."""
+    objection = _objection(mode.converged, test)
     if objection is not None:
         return objection
     if found is None:
         why = f"the residuals agree with it (probability {test.probability:.2g}); it was not checked by other solves"
         return Verdict("laplace", why)
     worth = f"weights worth {found.effective:.0f} of {len(found.log_weights)} samples, k̂ = {found.tail:.2f}"
-    if found.share >= EVEN and found.effective >= FEWEST / 2:
-        return Verdict("laplace", worth)
-    if found.trusted and found.effective >= FEWEST:
-        return Verdict("corrected", worth)
-    return _by_chains(worth, chains)
+    if not found.trusted or found.effective < FEWEST:
+        return _by_chains(worth, chains)
+    # Root mean squares over the vertices, less what as few samples would give by chance.
+    chance = 1 / found.effective
+    shift = np.sqrt(max(float((((found.mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
+    width = float(np.sqrt((found.std**2).mean() / (gaussian.std**2).mean()))
+    far = f"means are {shift:.2f} standard deviations from the mode, widths {width:.2f} of the Gaussian's; {worth}"
+    agrees = shift <= SHIFT and abs(np.log(width)) <= WIDTH + np.sqrt(chance)
+    return Verdict("laplace" if agrees else "corrected", far)
 
 
 def _objection(converged: bool, test: ResidualTest) -> Verdict | None:

@@ -608,7 +608,7 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
     if method.chains is not None:
         g = vertices.volumes / vertices.volumes.sum()
         chains = chains_of_field(mode.point, found, keep=lambda m: m @ g[:, None], seed=method.seed)
-    verdict = verdict_on_field(converged, weighed, test, chains)
+    verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains)
     noise = np.random.default_rng(method.seed).standard_normal((-(-method.draws // 10), len(found.mean)))
     cases = int(data.cases.max()) + 1
     return {

@@ -11,12 +11,15 @@ ROOT = Path(__file__).parent.parent
 def environment():
     """The environment of a fresh shell: a process that has initialised MPI cannot start mpirun with its own."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PMI_"))}
-    return clean | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1"}
+    root = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    return clean | root | {"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMP_NUM_THREADS": "1"}
 
 
 def on_ranks(ranks, *command):
     """The command, under mpirun where a number of ranks is given."""
-    return list(map(str, command if ranks is None else ("mpirun", "--oversubscribe", "-n", ranks, *command)))
+    beside = Path(sys.executable).parent / "mpirun"  # the wheel of DOLFINx brings an MPI of its own
+    mpirun = beside if beside.exists() else "mpirun"
+    return list(map(str, command if ranks is None else (mpirun, "-n", ranks, *command)))
 
 
 def run(ranks, *command):

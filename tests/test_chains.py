@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel, SolveError
-from inverse.chains import chains_of_few, chains_of_field, ensemble, near, verdict_on_few, verdict_on_field, weigh_field
+from inverse.chains import bent, chains_of_few, chains_of_field, ensemble, verdict_on_few, verdict_on_field, weigh_field
 from inverse.evidence import evidence
+from inverse.field_posterior import FieldPosterior
 from inverse.laplace import laplace
 from inverse.low_rank import LowRankPosterior
 from inverse.newton_cg import find_mode
@@ -15,7 +16,7 @@ from inverse.posterior import Posterior
 from inverse.predictive import examine, examine_few, summary
 from inverse.surrogate import fit
 from tests.test_evidence import ridge
-from tests.test_low_rank import Linear, N, curved, solved
+from tests.test_low_rank import DensePrior, Linear, N, curved, solved
 from tests.test_predictive import few
 from uq.evaluate import SerialEvaluate
 
@@ -41,7 +42,7 @@ def quick(posterior):
 # --- few parameters --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("run", [chains_of_few, ensemble])
+@pytest.mark.parametrize("run", [chains_of_few, pytest.param(ensemble, marks=pytest.mark.slow)])
 def test_linear_models(run):
     posterior = quick(few())
     gaussian = laplace(posterior)
@@ -126,9 +127,9 @@ def test_chains_of_linear_models_of_fields():
     problem = Linear()
     mode, found = solved(problem, cutoff=0.1)
     g = np.random.default_rng(1).standard_normal((N, 3)) / N
-    chains = chains_of_field(mode.point, found, keep=lambda m: m @ g, chains=4, draws=1000)
+    chains = chains_of_field(mode.point, found, keep=lambda m: m @ g, chains=4, draws=400, burn=100)
     assert (chains.accepted > 0.6).all()  # the pairs that are left out
-    assert (chains.rhat < 1.02).all()
+    assert (chains.rhat < 1.03).all()
     agrees(chains, problem.mean @ g, np.sqrt(np.diag(g.T @ problem.covariance @ g)))
     everything = chains_of_field(mode.point, found, draws=5, burn=2)
     assert everything.draws.shape == (2, 5, N)
@@ -142,7 +143,7 @@ def test_weights_of_linear_models_are_equal_and_their_mean_is_the_evidence():
     assert found.effective == pytest.approx(16)
     assert found.trusted
     _, truncated = solved(problem, rank=25)
-    found = weigh_field(mode.point, truncated, 4000)
+    found = weigh_field(mode.point, truncated, 1500)
     assert abs(found.log_evidence - exact.log_evidence) < 4 * found.error
     assert 0.01 < found.error < 0.3
     got = summary(found.values, found.weights)
@@ -154,26 +155,51 @@ def test_curved_fields_by_weights_and_by_chains():
     posterior = curved()
     mode = find_mode(posterior, tolerance=1e-8).point
     gaussian = LowRankPosterior.at(mode)
-    weighted = weigh_field(mode, gaussian, 4000)
+    weighted = weigh_field(mode, gaussian, 1500)
     expected = summary(weighted.values, weighted.weights)
-    chains = chains_of_field(mode, gaussian, chains=4, draws=1500)
-    assert chains.rhat.max() < 1.02
+    chains = chains_of_field(mode, gaussian, chains=4, draws=600)
+    assert chains.rhat.max() < 1.03
     got = summary(chains.flat)
     error = expected.std * np.sqrt(1 / chains.effective + 1 / weighted.effective)
     assert (np.abs(got.mean - expected.mean) < 4.5 * error).all()
-    np.testing.assert_allclose(got.std, expected.std, rtol=0.1)
+    np.testing.assert_allclose(got.std, expected.std, rtol=0.15)
 
 
 def test_samples_without_an_answer_have_no_weight():
     mode = find_mode(curved(), tolerance=1e-8).point
-    limit = np.abs(mode.values).max() + 0.02
-    posterior = curved(limit)
+    posterior = curved(np.abs(mode.values).max() + 0.02)
     mode = find_mode(posterior, tolerance=1e-8).point
     found = weigh_field(mode, LowRankPosterior.at(mode), 200)
     lost = ~np.isfinite(found.log_weights)
-    np.testing.assert_array_equal(lost, np.abs(found.values).max(axis=1) > limit)
     assert 0 < lost.sum() < 200
-    assert near(mode, LowRankPosterior.at(mode))(np.full((1, 12), 50.0))[0] == -np.inf
+    assert found.effective > 1
+    assert bent(mode, LowRankPosterior.at(mode))(np.full((1, 12), 1e3))[1][0] == -np.inf
+
+
+def test_the_strong_directions_follow_the_weak_ones():
+    """What the data see well is the mean of eᵐ: a field that varies must be lower in the mean than a constant one."""
+    size = 40
+    names = tuple(map(str, range(size)))
+    model = FunctionModel(lambda m: [np.exp(m).mean()], names, ("y",), lambda m: [np.exp(m) / size])
+    posterior = FieldPosterior(model, np.ones(1), np.array([3e-3]), DensePrior(0.25 * np.eye(size)))
+    mode = find_mode(posterior, tolerance=1e-8).point
+    gaussian = LowRankPosterior.at(mode)
+    found = weigh_field(mode, gaussian, 400)
+    assert found.effective > 300
+    straight = gaussian.samples(np.random.default_rng(0).standard_normal((400, size)))
+    misfits = [(np.exp(m).mean(axis=1) - 1) / 3e-3 for m in (found.values, straight)]
+    assert np.abs(misfits[0]).mean() < 3
+    assert np.abs(misfits[1]).mean() > 8
+    # ln p(y) by brute force over the prior, of which the mean of eᵐ is nearly normal.
+    drawn = np.exp(0.25 * np.random.default_rng(1).standard_normal((200_000, size))).mean(axis=1)
+    likelihood = np.exp(-(((drawn - 1) / 3e-3) ** 2) / 2) / (3e-3 * np.sqrt(2 * np.pi))
+    error = np.hypot(found.error, likelihood.std() / likelihood.mean() / np.sqrt(len(drawn)))
+    assert abs(found.log_evidence - np.log(likelihood.mean())) < 4 * error
+    assert abs(gaussian.log_evidence - found.log_evidence) > 0.2
+    assert found.values.mean() == pytest.approx(-(0.25**2) / 2, abs=0.003)  # of m, where the mean of eᵐ is 1
+    chains = chains_of_field(mode, gaussian, keep=lambda m: m.mean(axis=1)[:, None], draws=600)
+    assert chains.accepted.min() > 0.25
+    assert chains.flat.mean() == pytest.approx(found.weights @ found.values.mean(axis=1), abs=0.002)
 
 
 # --- what they say ---------------------------------------------------------------------------------------------------
@@ -212,14 +238,15 @@ def test_verdicts_on_fields():
     mode, found = solved(Linear())
     test = examine(mode.point.residual, found.spectrum, found.weights)
     weights = weigh_field(mode.point, found, 64)
-    assert verdict_on_field(True, weights, test).trust == "laplace"
-    assert "not checked" in verdict_on_field(True, None, test).why
-    assert verdict_on_field(False, weights, test).trust == "neither"
-    rng = np.random.default_rng(0)
-    some = replace(weights, log_weights=1.5 * rng.standard_normal(400))
-    assert verdict_on_field(True, some, test).trust == "corrected"
-    few_ = replace(weights, log_weights=5 * rng.standard_normal(64))
-    assert verdict_on_field(True, few_, test).trust == "neither"
+    assert verdict_on_field(mode, found, weights, test).trust == "laplace"
+    assert "not checked" in verdict_on_field(mode, found, None, test).why
+    assert verdict_on_field(replace(mode, converged=False), found, weights, test).trust == "neither"
+    moved = replace(weights, values=weights.values + 0.5 * found.std)
+    assert verdict_on_field(mode, found, moved, test).trust == "corrected"
+    wider = replace(weights, values=found.mean + 1.6 * (weights.values - found.mean))
+    assert verdict_on_field(mode, found, wider, test).trust == "corrected"
+    uneven = replace(weights, log_weights=5 * np.random.default_rng(0).standard_normal(64))
+    assert verdict_on_field(mode, found, uneven, test).trust == "neither"
 
 
 def test_a_posterior_of_one_parameter():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from forward.settings import Settings
 from uq.evaluate import Evaluate, Prediction, Request
 from uq.inputs import Inputs
@@ -109,7 +109,7 @@ class LocalSensitivity(Settings):
         """
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
-            raise ValueError(message)
+            raise ModelError(message)
         return local_dataset(inputs, evaluate, linearise(inputs, evaluate), fields=True)
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
+
+BITS = 52  # of each coordinate of a Sobol' point
 
 
 def random_points(seed: int | tuple[int, ...], start: int, stop: int, dimension: int) -> FloatArray:
@@ -23,15 +26,38 @@ def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int
     """Return the Sobol' points number `start` to `stop` (stop − start, dimension) of one of the scrambles of `seed`.
 
     A point is the same whichever range it is drawn in and however many scrambles there are. Each is uniform in the
-    cube by itself (a random linear scramble and a digital shift of 52 bits); different scrambles are independent.
+    cube by itself (a random linear scramble and a digital shift); different scrambles are independent.
     """
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimension, scramble=True, bits=52, seed=np.random.default_rng([seed, scramble]))
-    # Balance, which scipy warns of, is a matter of whole powers of two.
-    points = engine.random(1 << (stop - 1).bit_length())[start:stop]
+    count = 1 << (stop - 1).bit_length()
+    # Balance, which scipy warns of, is a matter of whole powers of two. Newer versions of scipy scramble in other ways.
+    plain = qmc.Sobol(dimension, scramble=False, bits=BITS).random(count)
+    numbers = (plain * 2.0**BITS).astype(np.uint64)
+    powers = 1 << np.arange(count.bit_length() - 1)
+    directions = numbers[powers] ^ numbers[powers - 1]  # points follow each other in Gray code
+    shift, directions = _scramble(directions, np.random.default_rng([seed, scramble]))
+    points = shift[None]
+    for direction in directions:
+        points = np.concatenate([points, points[::-1] ^ direction])
     # The points are lower corners of cells of this size: the centres lie strictly inside the cube.
-    return np.asarray(points + 2.0**-53, dtype=float)
+    return points[start:stop] * 2.0**-BITS + 2.0 ** -(BITS + 1)
+
+
+def _scramble(directions: NDArray[np.uint64], random: np.random.Generator) -> tuple[NDArray[np.uint64], ...]:
+    """Return a random shift (d,), and direction numbers (k, d) times random lower triangular matrices over GF(2).
+
+    J. Matoušek, On the L2-discrepancy for anchored boxes, J. Complexity 14 (1998).
+    """
+    dimension = directions.shape[1]
+    places = np.arange(BITS, dtype=np.uint64)
+    weights = np.uint64(1) << places
+    shift = random.integers(2, size=(dimension, BITS), dtype=np.uint64) @ weights
+    matrices = np.tril(random.integers(2, size=(dimension, BITS, BITS), dtype=np.uint64))
+    matrices[:, places, places] = 1
+    digits = directions[..., None] >> places[::-1] & np.uint64(1)  # the first after the point first
+    scrambled = np.einsum("dpq,kdq->kdp", matrices, digits) % 2
+    return shift, scrambled @ weights[::-1]
 
 
 def power_of_two(limit: int) -> int:

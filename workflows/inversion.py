@@ -554,7 +554,7 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
         noise = study.method.noise.model_dump(exclude_none=True)
         body = study.model.body
         file.write(
-            f"# Synthetic: {' × '.join(map(str, body.cells))} cells ({body.cell}, degree {body.degree}), errors "
+            f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), errors "
             f"{', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}.\n"
         )
         file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from forward.hyperelastic import Hyperelastic
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
@@ -26,15 +27,16 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     if not isinstance(study, Study):
         return _of_other_kinds(study)
-    method, body = study.method, study.model.body
-    textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
+    if study.body is None:
+        return _external(study)
+    method, model, body = study.method, study.body, study.body.body
+    textbook = TEXTBOOK if model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
-    memory = sum(bytes_per_model(model.unknowns) for model in study.models)
-    cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
-    form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
+    memory = sum(bytes_per_model(other.unknowns) for other in study.models if isinstance(other, Hyperelastic))
+    form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
     edge = body.longest_edge
-    narrow = [inclusion for inclusion in study.model.inclusions if inclusion.width < edge]
+    narrow = [inclusion for inclusion in model.inclusions if inclusion.width < edge]
     up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
     seconds = study.planned * each[0]
     if isinstance(method, MultilevelMonteCarlo):
@@ -42,19 +44,19 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
         seconds = method.seconds_to_begin(sizes, textbook)
     seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
     names = [*study.parameters]
-    for field in study.model.fields:
+    for field in model.fields:
         paths = field.paths(body)
         names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {method.kind}",
-        f"unknowns    {sizes[0]:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
+        f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
         *(
             f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
             for k, (size, s) in enumerate(zip(sizes, each, strict=True))
             if k
         ),
         f"parameters  {', '.join(names)}",
-        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"outputs     {', '.join(output.name for output in model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
         f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
@@ -64,6 +66,21 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
             " few quadrature points see the transition, and derivatives by place and size are rough"
             for inclusion in narrow
         ),
+        *(f"warning     {warning}" for warning in body.warnings),
+    ]
+
+
+def _external(study: Study) -> list[str]:
+    """Find the model, and describe a study of it: no one knows how long a solve takes."""
+    assert not isinstance(study.model, Hyperelastic)
+    model = study.model.build(None, study.inputs.names)
+    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
+    return [
+        f"method      {study.method.kind}",
+        f"model       {study.model.description}; {'with' if model.differentiable else 'without'} derivatives",
+        f"parameters  {', '.join(study.parameters)}",
+        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"solves      {up_to}{study.planned:,}",
     ]
 
 

@@ -133,6 +133,7 @@ def _context(results: Results) -> dict[str, Any]:
         **_sobol(results),
         "bounds": [_bounds(results, output) for output in results.outputs] if "total_bound" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
+        "has_body": results.study.body is not None,
         "field_lines": field_lines,
         "bodies": drawn,
         "sensitivities": [(o, tables.sensitivities(results, o)) for o in results.outputs] if differentiated else [],

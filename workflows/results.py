@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -211,6 +211,13 @@ def with_random_fields(
     return dataset
 
 
+def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.int64] | None) -> xr.Dataset:
+    """Add the regions of the cells, where there are some and the mesh is kept."""
+    if numbers is None or "cell" not in dataset.dims:
+        return dataset
+    return dataset.assign_coords(region=list(names)).assign(cell_region=(("cell",), numbers))
+
+
 def body_grid(dataset: xr.Dataset) -> Any:
     """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
     import pyvista
@@ -221,6 +228,8 @@ def body_grid(dataset: xr.Dataset) -> Any:
     grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
     for name, values in node_fields(dataset).items():
         grid.point_data[name] = values
+    if "cell_region" in dataset:
+        grid.cell_data["region"] = dataset["cell_region"].to_numpy()
     return grid
 
 

@@ -219,10 +219,8 @@ class SpecimenSelection(Comparison):
         specimen = self.specimens[name]
         body = specimen.body
         mixed = ", mixed" if specimen.loaded(specimen.cases[0]).mixed else ""
-        cells = " × ".join(map(str, body.cells))
-        return (
-            f"{specimen.loaded(specimen.cases[0]).energy} on {cells} cells ({body.cell}, degree {body.degree}{mixed})"
-        )
+        energy = specimen.loaded(specimen.cases[0]).energy
+        return f"{energy} on {body.cells_in_words} cells ({body.cell}, degree {body.degree}{mixed})"
 
     def build(self, name: str, group: str, comm: Any = None) -> SpecimenModel:
         """Make the model of a candidate; collective."""

@@ -12,6 +12,8 @@ _MODEL = """\
 kind = "hyperelastic"
 # A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
 # kind = "block" has corners = [...] instead: the images of the corners of a cube, x goes first, then y, then z.
+# kind = "mesh" has file = "liver.msh" (or .xdmf, .vtk, .vtu) and unit = 1e-3: its groups are boundaries and regions.
+# A model of another program in place of a body: kind = "python" or "um-bridge", see README.
 # cell = "hexahedron" | "tetrahedron", degree = 1 | 2
 body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
 # In Pa, but for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1), "yeoh" (C10, C20, C30, D1),
@@ -45,6 +47,7 @@ outputs = [
 [parameters]
 # Any number of the model by its path: material.*, loads.<name or kind>.density|size, displacements.<name or boundary>.x
 # inclusions.<name or kind>.contrast|radius|x|y|z|width (or a|b|c|turn_x|turn_y|turn_z of an ellipsoid)
+# regions.<name>.contrast|<constant>, in a mesh from a file
 # uniform, log-uniform, triangular, beta, truncated-normal, normal, log-normal, gamma
 "material.C1" = { kind = "uniform", lower = 0.5e4, upper = 1.5e4 }
 "loads.gravity.density" = { kind = "truncated-normal", mean = 1000, std = 50, lower = 800, upper = 1200 }

@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.external import PythonModel
 from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
@@ -29,6 +31,7 @@ from workflows.results import (
     read_summary,
     summarise,
     with_random_fields,
+    with_regions,
     write_dataset,
     write_fields,
     write_text,
@@ -194,24 +197,32 @@ def _job(study: AnyStudy, ensemble: Ensemble, name: str) -> _Job:
 
 def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
-    inputs = study.inputs
-    model = study.model.build(ensemble.group, inputs.names)
-    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
-    cells, kind = model.layout.cells()
-    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         return study.method.run(inputs, recorders["/"])
 
+    others: list[Callable[[], ForwardModel]] = [
+        partial(other.build, ensemble.group, inputs.names) for other in study.models[1:]
+    ]
+    if study.body is None:
+        function = study.model.build(ensemble.group, inputs.names)
+        return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+
+    spec = study.body
+    model = spec.build(ensemble.group, inputs.names)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
+    regions = model.region_of_cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = label(found, _units(study), model.layout.coordinates, cells, kind)
+        found = label(found, units, model.layout.coordinates, cells, kind)
+        found = with_regions(found, spec.body.regions, regions)
         return with_random_fields(found, factors, model.variance_kept)
 
-    others: list[Callable[[], ForwardModel]] = [
-        partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]
-    ]
     return _Job(model, others, task, recorders, labelled)
 
 
@@ -325,7 +336,13 @@ def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
 
 
 def _identity(study: AnyStudy) -> dict[str, Any]:
-    return {key: value for key, value in document(study).items() if key != "parallel"}
+    """Return what decides on evaluations."""
+    blocks = {key: value for key, value in document(study).items() if key != "parallel"}
+    if isinstance(study, Study) and isinstance(study.model, PythonModel):
+        blocks["source"] = study.model.source
+    if isinstance(study, Study) and study.body is not None:
+        blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
+    return blocks
 
 
 def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
@@ -376,14 +393,10 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
 
     They are the first samples of Monte Carlo with the seed of the study.
     """
-    if not study.model.fields:
+    if not study.model.coefficients:
         return {}
     seed = getattr(study.method, "seed", 0)
     return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
-
-
-def _units(study: Study) -> dict[str, str]:
-    return {output.name: output.unit for output in study.model.outputs}
 
 
 def _version() -> str:
@@ -465,13 +478,12 @@ def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
 
 
 def _versions() -> dict[str, str]:
-    names = ("tissuq", "fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
+    dolfinx = ("fenics-dolfinx", "dolfinx-solver-real")  # Debian's name and that of the wheel
+    names = ("tissuq", *dolfinx, "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
     found = {}
     for name in names:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
     return found
 
 
