@@ -154,9 +154,7 @@ class Select(Settings):
         posteriors, stated = {}, {}
         for name, group in pairs:
             one = started(posterior(candidates[name], groups[group], self.noise, evaluate(name, group)))
-            stated[name, group] = self._assess(one, (name, group))
-            mode = one.physical(stated[name, group].gaussian.mode[None, :])[0]
-            posteriors[name, group] = started(one, mode[: len(one.inputs.names)])
+            posteriors[name, group], stated[name, group] = self._assess(one, (name, group))
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
         }
@@ -196,17 +194,18 @@ class Select(Settings):
                 found[pair] = self._value(_only(posterior, groups[pair[1]], others), pair)
         return found
 
-    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> Assessment:
+    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[Posterior, Assessment]:
+        """Find mode and evidence; the posterior too, with solves that start from the mode."""
         try:
             gaussian = laplace(posterior, starts=self.starts, seed=self.seed)
             near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
-            return Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
+            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
         except SolveError as error:
             message = f"candidate '{pair[0]}': {error.reason}"
             raise SolveError(message, error.history) from None
 
     def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
-        found = self._assess(posterior, pair).evidence
+        found = self._assess(posterior, pair)[1].evidence
         return found.log_evidence, found.error
 
 

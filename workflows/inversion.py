@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from forward.hyperelastic import Mistake
-from forward.inclusions import derived
+from forward.inclusions import Inclusion, derived
 from forward.settings import Settings
 from forward.specimen import Specimen
 from inverse.inversion import Invert, Synthesize, names_of, sentence, variables
@@ -96,13 +97,16 @@ class Measurement:
         How far (n,) its points were moved (m).
     truth
         Numbers that it was made of, by path.
+    inclusions
+        Those that were really there.
     places, stiffness
-        Where (k, 3) ln of the true stiffness factor (k,) is known.
+        Where (k, 3) ln of the true stiffness factor (k,) is known beside that.
     """
 
     observations: Observations
     moved: FloatArray
     truth: dict[str, float]
+    inclusions: tuple[Any, ...]
     places: FloatArray
     stiffness: FloatArray
 
@@ -133,6 +137,12 @@ class Inversion(Settings):
     method: Invert = Invert()
     parallel: Parallel = Parallel()
     measurements: tuple[Any, ...] = Field(default=(), exclude=True, repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the same is asked of the same files."""
+        return isinstance(other, Inversion) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]
 
     @property
     def field(self) -> bool:
@@ -174,7 +184,7 @@ class Inversion(Settings):
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
-        return _stiffness(self.model, self.inputs.names, places, points)
+        return _stiffness(self.model.inclusions, self.inputs.names, places, points)
 
     def with_data(self, folder: Path) -> Inversion:
         """Return the same with its files read.
@@ -215,11 +225,12 @@ class Inversion(Settings):
         found, moved = found.on(body.nearest, extent, self.data.tolerance)
         truth, places, stiffness = dict(self.data.truth), np.zeros((0, 3)), np.zeros(0)
         for name, text in found.truth.items():
-            if name != "stiffness":
+            if name not in {"stiffness", "inclusions"}:
                 truth.setdefault(name, _known(name, text, path))
+        inclusions = _true_inclusions(found.truth["inclusions"], path) if "inclusions" in found.truth else ()
         if "stiffness" in found.truth:
             places, stiffness = _true_stiffness(path.parent / found.truth["stiffness"])
-        return Measurement(found, moved, truth, places, stiffness)
+        return Measurement(found, moved, truth, inclusions, places, stiffness)
 
     @model_validator(mode="after")
     def _check(self) -> Inversion:
@@ -280,7 +291,7 @@ class Synthesis(Settings):
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
-        return _stiffness(self.model, self.inputs.names, places, points)
+        return _stiffness(self.model.inclusions, self.inputs.names, places, points)
 
     @model_validator(mode="after")
     def _check(self) -> Synthesis:
@@ -316,10 +327,12 @@ def made(blocks: Mapping[str, Any], folder: Path) -> Inversion | Synthesis:
     return Inversion.model_validate(blocks).with_data(folder)
 
 
-def _stiffness(spec: Specimen, names: tuple[str, ...], places: FloatArray, points: FloatArray) -> FloatArray:
-    found = derived(spec.inclusions, names, points, places)
+def _stiffness(
+    inclusions: tuple[Any, ...], names: tuple[str, ...], places: FloatArray, points: FloatArray
+) -> FloatArray:
+    found = derived(inclusions, names, points, places)
     columns = [values for path, values in found.items() if path.startswith("stiffness.")]
-    return np.log(np.column_stack(columns)) if spec.inclusions else np.zeros((len(points), len(places)))
+    return np.log(np.column_stack(columns)) if inclusions else np.zeros((len(points), len(places)))
 
 
 def _known(name: str, text: str, path: Path) -> float:
@@ -327,6 +340,14 @@ def _known(name: str, text: str, path: Path) -> float:
         return float(text)
     except ValueError:
         message = f"{path.name}: truth.{name} is '{text}', expected a number"
+        raise DataError(message) from None
+
+
+def _true_inclusions(text: str, path: Path) -> tuple[Any, ...]:
+    try:
+        return TypeAdapter(tuple[Inclusion, ...]).validate_python(tuple(json.loads(text)))
+    except (ValueError, TypeError):
+        message = f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON"
         raise DataError(message) from None
 
 
@@ -423,9 +444,8 @@ def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArr
     """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is not known."""
     if measurement is None:
         return np.full(len(places), np.nan)
-    truth = measurement.truth
-    if not study.model.fields and study.model.inclusions and all(name in truth for name in study.inputs.names):
-        return np.asarray(study.stiffness(places, np.array([[truth[name] for name in study.inputs.names]]))[0])
+    if measurement.inclusions:
+        return np.asarray(_stiffness(measurement.inclusions, (), places, np.zeros((1, 0)))[0])
     if len(measurement.places):
         from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
@@ -520,6 +540,12 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
 # --- synthetic data --------------------------------------------------------------------------------------------------
 
 
+def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
+    """An inclusion with other numbers, by their paths."""
+    block: dict[str, Any] = inclusion.model_dump()
+    return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
+
+
 def points_of(model: SpecimenModel) -> NDArray[np.int64]:
     """Number (m,) of the point that each output of a specimen is observed at, the same in all load cases."""
     return np.asarray(np.unique(np.round(model.places, 12), axis=0, return_inverse=True)[1].ravel())
@@ -558,7 +584,10 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
             f"{', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}.\n"
         )
         file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
-        if study.model.inclusions or study.model.fields:
+        if study.model.inclusions and not study.model.fields:
+            inclusions = [_with_values(inclusion, truth) for inclusion in study.model.inclusions]
+            file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
+        if study.model.fields:
             file.write(f"# truth.stiffness = truth/{label}.csv\n")
             lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
             texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from workflows import plots
@@ -242,9 +244,9 @@ def _unit(path: str) -> str:
 
 def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
     """Draw what was found for one data set, each with what it shows."""
-    axis, level = plane(one)
-    where = f"the plane {'xyz'[axis]} = {level:.4g} m"
-    yield slices(one, axis, level), f"ln of the stiffness factor on {where}: {', '.join(_panels(one))}."
+    cut = Cut.of(one)
+    where = f"the plane {'xyz'[cut.axis]} = {cut.level:.4g} m"
+    yield slices(one, cut), f"ln of the stiffness factor on {where}: {', '.join(_panels(one))}."
     yield spectrum(one), "λ of all load cases together and of each alone; above 1 the data say more than the prior."
     if "draw" in one:
         yield (
@@ -253,8 +255,8 @@ def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
         )
     else:
         words = "The directions that the data constrain most, and the last that were found"
-        yield direction_slices(one, axis, level), f"{words}, on {where}."
-        yield alone_slices(one, axis, level), f"Standard deviation of ln stiffness by each load case alone, on {where}."
+        yield direction_slices(one, cut), f"{words}, on {where}."
+        yield alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {where}."
     yield misfits(one), "|r|² of each load case, and what is expected: mean and two standard deviations."
     if np.isfinite(one["stiffness_true"]).all():
         yield (
@@ -263,13 +265,53 @@ def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
         )
 
 
-def plane(one: xr.Dataset) -> tuple[int, float]:
-    """Return axis and level (m) of the plane that is drawn: across y, where truth or recovered field stand out."""
-    places = one["node_position"].to_numpy()
-    shown = one["stiffness_true"] if np.isfinite(one["stiffness_true"]).all() else one["stiffness_mean"]
-    far = np.abs(shown.to_numpy() - np.median(shown))
-    weights = np.where(far >= 0.7 * far.max(), far, 0.0) + 1e-300
-    return 1, float(weights @ places[:, 1] / weights.sum())
+@dataclass(frozen=True)
+class Cut:
+    """A plane across the body, with what it takes to draw fields on it.
+
+    Attributes
+    ----------
+    axis, level
+        The plane: a coordinate, and its value (m).
+    along
+        The other two axes.
+    lines
+        Coordinates (m) of the points along each of these.
+    vertices, weights
+        Numbers (n, 4) of the nodes around each point, and weights; NaN outside the body.
+    """
+
+    axis: int
+    level: float
+    along: tuple[int, int]
+    lines: tuple[FloatArray, FloatArray]
+    vertices: NDArray[np.int64]
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, one: xr.Dataset) -> Cut:
+        """Cut across y where truth or recovered field stand out."""
+        from scipy.spatial import Delaunay
+
+        places = one["node_position"].to_numpy()
+        shown = one["stiffness_true"] if np.isfinite(one["stiffness_true"]).all() else one["stiffness_mean"]
+        far = np.abs(shown.to_numpy() - np.median(shown))
+        weights = np.where(far >= 0.7 * far.max(), far, 0.0) + 1e-300
+        level = float(weights @ places[:, 1] / weights.sum())
+        first, second = (np.linspace(places[:, a].min(), places[:, a].max(), RESOLUTION) for a in (0, 2))
+        x, z = np.meshgrid(first, second, indexing="xy")
+        points = np.column_stack([x.ravel(), np.full(x.size, level), z.ravel()])
+        mesh = Delaunay(places)
+        found = mesh.find_simplex(points, tol=1e-9)
+        map_ = mesh.transform[found]
+        inner = np.einsum("nij,nj->ni", map_[:, :3], points - map_[:, 3])
+        shares = np.column_stack([inner, 1 - inner.sum(axis=1)])
+        shares[found < 0] = np.nan
+        return cls(1, level, (0, 2), (first, second), mesh.simplices[found], shares)
+
+    def values(self, field: FloatArray) -> FloatArray:
+        """Return a field (N,) at the points of the plane."""
+        return np.asarray((field[self.vertices] * self.weights).sum(axis=1).reshape(RESOLUTION, RESOLUTION))
 
 
 def _panels(one: xr.Dataset) -> dict[str, FloatArray]:
@@ -282,7 +324,7 @@ def _panels(one: xr.Dataset) -> dict[str, FloatArray]:
     return panels
 
 
-def slices(one: xr.Dataset, axis: int, level: float) -> Axes:
+def slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw truth, mean and standard deviations of ln stiffness on a plane."""
     panels = _panels(one)
     shown = [values for name, values in panels.items() if "deviation" not in name]
@@ -292,11 +334,11 @@ def slices(one: xr.Dataset, axis: int, level: float) -> Axes:
     for ax, (name, values) in zip(found, panels.items(), strict=True):
         spread = "deviation" in name
         limits = (0.0, widest) if spread else ends
-        _draw(ax, one, values, axis, level, name, "plasma" if spread else "viridis", limits)
+        _draw(ax, cut, values, name, "plasma" if spread else "viridis", limits)
     return found[0]
 
 
-def direction_slices(one: xr.Dataset, axis: int, level: float) -> Axes:
+def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw directions of a field on a plane."""
     shown = [i for i, n in enumerate(one["shown_number"].to_numpy()) if n >= 0]
     found = plots.grid(len(shown), columns=4)
@@ -305,46 +347,28 @@ def direction_slices(one: xr.Dataset, axis: int, level: float) -> Axes:
         n = int(one["shown_number"][i])
         largest = float(np.abs(values).max())
         label = f"{n + 1}: λ = {float(one['eigenvalue'][n]):.3g}"
-        _draw(ax, one, values, axis, level, label, "RdBu_r", (-largest, largest))
+        _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
     return found[0]
 
 
-def alone_slices(one: xr.Dataset, axis: int, level: float) -> Axes:
+def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw the standard deviation by each load case alone, and by all, on a plane."""
     panels = {str(case): one["alone_stiffness_std"].sel(case=case).to_numpy() for case in one.case.values}
     panels["all together"] = one["stiffness_std"].to_numpy()
     widest = float(one["stiffness_prior_std"].max())
     found = plots.grid(len(panels), columns=4)
     for ax, (name, values) in zip(found, panels.items(), strict=True):
-        _draw(ax, one, values, axis, level, name, "plasma", (0.0, widest))
+        _draw(ax, cut, values, name, "plasma", (0.0, widest))
     return found[0]
 
 
-def _draw(
-    ax: Axes,
-    one: xr.Dataset,
-    values: FloatArray,
-    axis: int,
-    level: float,
-    title: str,
-    colours: str,
-    ends: tuple[float, float],
-) -> None:
-    from scipy.interpolate import LinearNDInterpolator
-
-    places = one["node_position"].to_numpy()
-    along = [a for a in range(3) if a != axis]
-    lines = [np.linspace(places[:, a].min(), places[:, a].max(), RESOLUTION) for a in along]
-    first, second = np.meshgrid(*lines, indexing="xy")
-    points = np.empty((first.size, 3))
-    points[:, along[0]], points[:, along[1]], points[:, axis] = first.ravel(), second.ravel(), level
-    shown = LinearNDInterpolator(places, values)(points).reshape(first.shape)
+def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends: tuple[float, float]) -> None:
     low, high = ends if ends[1] > ends[0] else (ends[0] - 1e-3, ends[1] + 1e-3)
-    drawn = ax.pcolormesh(*lines, shown, cmap=colours, vmin=low, vmax=high, shading="gouraud")
+    drawn = ax.pcolormesh(*cut.lines, cut.values(values), cmap=colours, vmin=low, vmax=high, shading="gouraud")
     ax.set_aspect("equal")
     ax.set_title(title, fontsize="medium")
-    ax.set_xlabel(f"{'xyz'[along[0]]} (m)")
-    ax.set_ylabel(f"{'xyz'[along[1]]} (m)")
+    ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
+    ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
     ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9)
 
 

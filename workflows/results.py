@@ -33,17 +33,20 @@ def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Datas
     from xarray.backends import H5NetCDFStore
 
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    # HDF5 stamps its root group with the time unless it is told not to; netCDF-4 needs the order of creation.
-    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
-    creation.set_obj_track_times(False)
+    # HDF5 stamps groups with the time unless it is told not to; netCDF-4 needs the order of creation.
+    of_file, of_group = (h5py.h5p.create(kind) for kind in (h5py.h5p.FILE_CREATE, h5py.h5p.GROUP_CREATE))
     order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
-    creation.set_link_creation_order(order)
-    creation.set_attr_creation_order(order)
-    created = h5py.h5f.create(os.fsencode(partial), fcpl=creation)
+    for creation in (of_file, of_group):
+        creation.set_obj_track_times(False)
+        creation.set_link_creation_order(order)
+        creation.set_attr_creation_order(order)
+    created = h5py.h5f.create(os.fsencode(partial), fcpl=of_file)
+    for name in groups or {}:
+        h5py.h5g.create(created, name.encode(), gcpl=of_group)
     with h5py.File(created) as file, h5netcdf.File(file, "a") as netcdf:
         dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
-        for name, of_group in (groups or {}).items():
-            of_group.dump_to_store(H5NetCDFStore(netcdf.create_group(name)))  # type: ignore[no-untyped-call]
+        for name, part in (groups or {}).items():
+            part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
     partial.replace(path)
 
 
