@@ -11,7 +11,9 @@ from benchmarks import (
     inversion,
     levels,
     realisation,
+    scaling,
     stability,
+    startup,
     streaming,
     throughput,
     variance,
@@ -28,6 +30,8 @@ ALL = {
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,
+    "scaling": scaling.main,
+    "startup": startup.main,
 }
 
 
