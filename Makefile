@@ -25,7 +25,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-all test-wheel lint bench clean system
+.PHONY: help setup setup-wheel demo test test-all test-wheel lint bench docs clean system
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -55,8 +55,11 @@ lint: $(READY) ## check style, types and layers
 bench: $(READY) ## measure times
 	@$(PYTHON) -m benchmarks $(ARGS)
 
+docs: $(READY) ## build the documentation into site/, without network
+	@NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
+
 clean: ## remove .venv and caches; results stay
-	@rm -rf .venv $(WHEEL_VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 system:

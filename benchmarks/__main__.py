@@ -6,12 +6,14 @@ import sys
 
 from benchmarks import (
     bookkeeping,
+    calibration,
     chaos,
     fields,
     inversion,
     levels,
     realisation,
     scaling,
+    selection,
     stability,
     startup,
     streaming,
@@ -27,6 +29,8 @@ ALL = {
     "levels": levels.main,
     "fields": fields.main,
     "inversion": inversion.main,
+    "calibration": calibration.main,
+    "selection": selection.main,
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,

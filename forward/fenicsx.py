@@ -21,7 +21,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from forward.geometry import AXES, Body
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ModelError, SolveError
+from forward.own_mesh import OwnMesh
 
 with suppress(ModuleNotFoundError):
     import dolfinx_solver as _  # the wheel wants to be first  # noqa: F401
@@ -34,7 +35,7 @@ import dolfinx  # noqa: E402
 import dolfinx.fem.petsc  # noqa: E402
 import ffcx.naming  # noqa: E402
 import ufl  # noqa: E402
-from dolfinx import fem, geometry, mesh, plot  # noqa: E402
+from dolfinx import cpp, fem, geometry, mesh, plot  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
 
 if TYPE_CHECKING:
@@ -143,6 +144,8 @@ class PointValues:
 
 def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
+    if isinstance(body, OwnMesh):
+        return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     if _FIVE:
         # FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name
@@ -155,6 +158,73 @@ def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]
     facets = _box_facets(msh, body.meshed)
     msh.geometry.x[:] = body.place(msh.geometry.x)
     return msh, facets
+
+
+def _own_mesh(comm: Any, body: OwnMesh) -> tuple[Any, dict[str, NDArray[np.int32]]]:
+    """Distribute a mesh that the first rank reads."""
+    loaded = _on_first(comm, body.load)
+    corners = 4 if body.cell == "tetrahedron" else 8
+    points, cells, boundaries = np.zeros((0, 3)), np.zeros((0, corners), dtype=np.int64), None
+    if loaded is not None:
+        points, boundaries = loaded.points, loaded.boundaries
+        # From VTK's order of the corners.
+        cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, [0, 1, 3, 2, 4, 5, 7, 6]])
+    if _FIVE:
+        element = ufl.FiniteElement("Lagrange", body.cell, 1, variant="equispaced")
+        msh = mesh.create_mesh(comm, cells, points, ufl.Mesh(ufl.VectorElement(element)))
+    else:
+        msh = mesh.create_mesh(comm, cells, basix.ufl.element("Lagrange", body.cell, 1, shape=(3,)), points)
+    boundaries = comm.bcast(boundaries)
+    msh.topology.create_entities(2)
+    msh.topology.create_connectivity(2, 3)
+    facet_map = msh.topology.index_map(2)
+    every = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)
+    if _FIVE:
+        nodes = np.asarray(cpp.mesh.entities_to_geometry(msh._mesh, 2, every, False))
+    else:
+        nodes = np.asarray(mesh.entities_to_geometry(msh, 2, every))
+    originals = np.sort(np.asarray(msh.geometry.input_global_indices)[nodes.reshape(len(every), -1)], axis=1)
+    numbers = {tuple(row): k for k, row in enumerate(originals.tolist())}
+    facets = {}
+    for name, wanted in boundaries.items():
+        here = [numbers[row] for row in map(tuple, np.sort(wanted, axis=1).tolist()) if row in numbers]
+        facets[name] = np.array(sorted(here), dtype=np.int32)
+    return msh, facets
+
+
+def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
+    """Call on the first rank; what is raised there is raised on all."""
+    found, problem = None, None
+    if comm.rank == 0:
+        try:
+            found = load()
+        except ModelError as error:
+            problem = str(error)
+    problem = comm.bcast(problem)
+    if problem is not None:
+        raise ModelError(problem)
+    return found
+
+
+def region_numbers(comm: Any, body: OwnMesh, msh: Any) -> NDArray[np.int32]:
+    """Return the number of the region of each of this rank's cells, ghosts included; collective."""
+    loaded = _on_first(comm, body.load)
+    region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))
+    return np.asarray(region[np.asarray(msh.topology.original_cell_index)])
+
+
+def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
+    """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
+    of_cells = region_numbers(comm, body, msh)
+    cell = msh.ufl_cell()
+    constants = ufl.FiniteElement("DG", cell, 0) if _FIVE else basix.ufl.element("DG", cell.cellname, 0)
+    space = _space(msh, constants)
+    dofs = np.array([space.dofmap.cell_dofs(cell)[0] for cell in range(len(of_cells))])
+    found = {}
+    for number, name in enumerate(body.regions):
+        found[name] = fem.Function(space)
+        found[name].x.array[dofs] = of_cells == number
+    return found
 
 
 def _box_facets(msh: Any, size: tuple[float, float, float]) -> dict[str, NDArray[np.int32]]:
@@ -216,10 +286,14 @@ def interpolate(values: Any, space: Any) -> FloatArray:
 
 
 def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
-    """Mesh a body by hexahedra in this process; return trilinear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them."""
+    """Mesh a body in this process; return linear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them.
+
+    They are on hexahedra, but for bodies that come with a mesh of tetrahedra.
+    """
     from scipy.sparse import csr_matrix
 
-    msh, _ = mesh_body(MPI.COMM_SELF, body.model_copy(update={"cell": "hexahedron"}))
+    boxed = body if isinstance(body, OwnMesh) else body.model_copy(update={"cell": "hexahedron"})
+    msh, _ = mesh_body(MPI.COMM_SELF, boxed)
     space = scalar_space(msh, 1)
     v, w = ufl.TestFunction(space), ufl.TrialFunction(space)
     parts = [constant(msh, 0.0) for _ in range(3)]

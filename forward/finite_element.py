@@ -17,18 +17,20 @@ from typing import Any
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from forward import fenicsx, kinematics
-from forward.acceleration import block_galerkin
+from forward.acceleration import Inverse, block_galerkin
 from forward.functionals import functional
 from forward.geometry import AXES
-from forward.hyperelastic import Hyperelastic
+from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
-from forward.materials import MATERIALS
+from forward.materials import MATERIALS, measures
 from forward.model import FloatArray, Reference, SolveError, Work
 from forward.newton import Found, Residual, solve
+from forward.own_mesh import OwnMesh
 from forward.reference import ReferenceFactor, turn
 from forward.vertex_fields import VertexField
 
@@ -36,7 +38,18 @@ STRETCH = 1e-6  # of the body, to see how stiff it is
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of these derivatives, before a factor is made after all
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
-_OPS = SimpleNamespace(ln=ufl.ln, exp=ufl.exp, sqrt=ufl.sqrt, tanh=ufl.tanh)
+_OPS = SimpleNamespace(
+    ln=ufl.ln,
+    exp=ufl.exp,
+    sqrt=ufl.sqrt,
+    tanh=ufl.tanh,
+    sin=ufl.sin,
+    cos=ufl.cos,
+    atan2=ufl.atan_2,
+    tr=ufl.tr,
+    det=ufl.det,
+    positive=lambda x: ufl.max_value(x, 0.0),
+)
 
 
 class Discretisation:
@@ -79,7 +92,15 @@ class Discretisation:
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
-        self._invariants = tuple(ufl.variable(invariant) for invariant in kinematics.invariants(ufl, self.F))
+        self._fibres = [fenicsx.constant(self.mesh, unit) for unit in spec.fibres]
+        self._of_stretches = "l1" in measures(spec.energy)
+        self._gradient = ufl.variable(self.F) if self._of_stretches else self.F
+        self._measures = self.measures_of(self._gradient)
+        if not self._of_stretches:
+            self._measures = {
+                name: tuple(map(ufl.variable, measure)) if name == "I4" else ufl.variable(measure)
+                for name, measure in self._measures.items()
+            }
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._loads = self._virtual_works()
@@ -101,18 +122,47 @@ class Discretisation:
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
-    def energy_of(self, invariants: tuple[Any, Any, Any]) -> Any:
-        """Energy density of I1, I2 and J, as UFL; in the mixed form, without that of the change of volume."""
-        energy = MATERIALS[getattr(self.spec.material, "kind")]  # noqa: B009 - every material has a kind
-        values = self._numbers("material")
+    def measures_of(self, F: Any) -> dict[str, Any]:
+        """Return what the energy is a function of, by name, from a deformation gradient as UFL."""
+        if self._of_stretches:
+            stretches = kinematics.principal_stretches(_OPS, F, ufl.Identity(3))
+            return {**dict(zip(("l1", "l2", "l3"), stretches, strict=True)), "J": ufl.det(F)}
+        found = dict(zip(("I1", "I2", "J"), kinematics.invariants(ufl, F), strict=True))
+        fibres = {"I4": tuple(kinematics.fibre_stretch(ufl, F, fibre) for fibre in self._fibres)}
+        return found | fibres if self._fibres else found
+
+    def energy_of(self, measures: dict[str, Any]) -> Any:
+        """Energy density of its measures, as UFL; in the mixed form, without that of the change of volume."""
+        values = self._material
         if self.p is not None:
             values["D1"] = 0
-        return self.stiffness_factor * energy(_OPS, *invariants, **values)
+        return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *measures.values(), **values)
+
+    @cached_property
+    def _regions(self) -> dict[str, Any]:
+        """Indicators of the regions that have numbers of their own."""
+        if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
+            return {}
+        found = fenicsx.region_indicators(self.comm, self.spec.body, self.mesh)
+        return {name: found[name] for name in self.spec.regions}
+
+    @property
+    def _material(self) -> dict[str, Any]:
+        """Constants of the material, by their names, each as an expression of the place."""
+        values = self._numbers("material")
+        for region, inside in self._regions.items():
+            for name, number in self._numbers(f"regions.{region}").items():
+                if name != CONTRAST:
+                    values[name] = (1 - inside) * values[name] + inside * number
+        return values
 
     @cached_property
     def stiffness_factor(self) -> Any:
-        """What inclusions and fields multiply every modulus by, as a UFL expression of the place; 1 without any."""
+        """What regions, inclusions and fields multiply every modulus by, by the place, in UFL; 1 without any."""
         factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        for region, inside in self._regions.items():
+            if CONTRAST in self.spec.regions[region]:
+                factor *= 1 - inside + inside * self._variables[f"regions.{region}.{CONTRAST}"]
         X = ufl.SpatialCoordinate(self.mesh)
         for inclusion in self.spec.inclusions:
             numbers = self._numbers(f"inclusions.{inclusion.label}")
@@ -138,17 +188,24 @@ class Discretisation:
         In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
         keeps its digits however small it is.
         """
-        energy, J, p = self.energy_of(self._invariants), self._invariants[2], self._pressure
+        energy, J, p = self.energy_of(self._measures), self._measures["J"], self._pressure
         if p is None:
             return energy, energy, self.J - 1
-        bulk = 2 * self.stiffness_factor * self._variables["material.D1"]
+        bulk = 2 * self.stiffness_factor * self._material["D1"]
         of_pressure = p**2 / (2 * bulk)
         return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
 
     def _variation_of(self, density: Any) -> Any:
-        """First variation of a density of the invariants and the pressure: P : ∇v, and that of the pressure."""
-        slopes = tuple(ufl.diff(density, invariant) for invariant in self._invariants)
-        work = ufl.inner(kinematics.nominal_stress(ufl, self.F, slopes), ufl.grad(self.test))
+        """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
+        if self._of_stretches:
+            P = ufl.diff(density, self._gradient)
+        else:
+            found = self._measures
+            of_I1, of_I2, of_J = (ufl.diff(density, found[name]) for name in ("I1", "I2", "J"))
+            of_I4 = [ufl.diff(density, squared) for squared in found.get("I4", ())]
+            fibres = list(zip(self._fibres, of_I4, strict=True))
+            P = kinematics.nominal_stress(ufl, self.F, (of_I1, of_I2, of_J), fibres)
+        work = ufl.inner(P, ufl.grad(self.test))
         return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
 
     def derivative(self, form: Any) -> Any:
@@ -673,8 +730,8 @@ class HyperelasticModel:
         way = None if reference is None else _Way(self, reference, parameters)
         found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
-        corrected = body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, found, body.work, reference if corrected else None)
+        corrected = way is not None and way.rotation is not None and body.work.factorisations == 0
+        return FiniteElementSolution(self, parameters, found, body.work, way if corrected else None)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -684,16 +741,26 @@ class HyperelasticModel:
         """Take this rank's part (k, U_local) of (k, U) in canonical order."""
         return self.layout.scatter(rows)
 
-    def factors(self, points: FloatArray) -> dict[str, FloatArray]:
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, nodes) of each random field at parameters (n, d), nodes in canonical order.
 
-        Collective; empty but on the first rank.
+        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
+        the vertices.
         """
         self._visited = None
         self.body.forget_parameters()
-        space = fenicsx.scalar_space(self.body.mesh, self.spec.body.degree)
+        space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in self.body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}
+
+    def region_of_cells(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of the layout's cells; nothing without regions.
+
+        Collective.
+        """
+        if not isinstance(self.spec.body, OwnMesh):
+            return None
+        return self.layout.by_cell(fenicsx.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
 
     @property
     def variance_kept(self) -> dict[str, float]:
@@ -727,13 +794,28 @@ class HyperelasticModel:
 
 
 class _Way:
-    """The straight line in parameters from a reference."""
+    """The straight line in parameters from a reference.
+
+    Attributes
+    ----------
+    reference
+        Where it begins.
+    state
+        Of the reference.
+    rotation
+        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    """
 
     def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray) -> None:
-        self._body = model.body
+        self._body, self._factor = model.body, model.reference
         self._from, self._to = reference.parameters, parameters
+        self.reference = reference
         self.state = reference.state
-        self.inverse = model.reference.near
+        self.rotation: FloatArray | None = None
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        self.rotation = self._factor.rotation(u)
+        return self._factor.inverse(self.rotation)
 
     def at(self, fraction: float) -> None:
         self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
@@ -753,7 +835,7 @@ class FiniteElementSolution:
         parameters: FloatArray,
         found: Found,
         work: Work,
-        reference: Reference | None,
+        way: _Way | None,
     ) -> None:
         self._model = model
         self.parameters = np.array(parameters, dtype=float)
@@ -762,7 +844,8 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self._reference = reference
+        self._reference = None if way is None else way.reference
+        self._rotation = None if way is None else way.rotation
         model.visit(self)
         self.outputs = np.array([f.value() for f in model._functionals])
         self.outputs.flags.writeable = False
@@ -783,29 +866,20 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
-    @cached_property
-    def _rotation(self) -> FloatArray:
-        """Rotations of the nodes from the reference to this solution."""
-        model = self._model
-        assert self._reference is not None
-        factor = model.take_reference(self._reference)
-        model.visit(self)
-        return factor.rotation(self.state)
-
     def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
         """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
         model = self._model
-        if self._reference is not None and len(right) <= FEW:
-            found = self._solve_near(right, self._reference, transpose=transpose, directions=directions)
+        if self._reference is not None and self._rotation is not None and len(right) <= FEW:
+            found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
             if found is not None:
                 return found
         return model.linearise(self).back_substitute(right, transpose=transpose)
 
     def _solve_near(
-        self, right: FloatArray, reference: Reference, *, transpose: bool, directions: FloatArray | None
+        self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
     ) -> FloatArray | None:
-        """Solve with the factor of the reference; nothing if that is too far away."""
-        model, R = self._model, self._rotation
+        """Solve with the factor of the reference, turned as for its prediction; nothing if that is too far away."""
+        model = self._model
         factor = model.take_reference(reference)
         fixed = model.body.fixed
         first = None

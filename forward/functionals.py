@@ -14,7 +14,7 @@ import ufl
 
 from forward import fenicsx, kinematics
 from forward.geometry import AXES
-from forward.model import FloatArray
+from forward.model import FloatArray, ModelError
 from forward.outputs import (
     MaxDisplacement,
     MaxVonMises,
@@ -87,7 +87,7 @@ def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
     owners = body.comm.allgather(found is not None)
     if not any(owners):
         message = f"output '{output.name}': the point {list(output.at)} lies outside the body"
-        raise ValueError(message)
+        raise ModelError(message)
     probe = fenicsx.function(body.space)
     if found is not None and owners.index(True) == body.comm.rank:
         nodes, weights = found
@@ -214,7 +214,7 @@ class _MaxVonMises:
         self._body = body
         F = ufl.variable(body.F)
         # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
-        cauchy = ufl.diff(body.energy_of(kinematics.invariants(ufl, F)), F) * F.T / ufl.det(F)
+        cauchy = ufl.diff(body.energy_of(body.measures_of(F)), F) * F.T / ufl.det(F)
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature
         points = fenicsx.quadrature_points(body.space, degree)

@@ -10,6 +10,7 @@ from annotated_types import Gt
 from pydantic import BeforeValidator, Field, model_validator
 
 from forward.model import FloatArray
+from forward.own_mesh import OwnMesh
 from forward.settings import Settings
 
 Axis = Literal["x", "y", "z"]
@@ -64,10 +65,35 @@ class _SixSided(Settings):
     def contains(self, point: Vector) -> bool:
         """Whether a point (m) lies in the undeformed body."""
 
+    @abstractmethod
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+
     @property
     def boundaries(self) -> tuple[str, ...]:
         """Names of the boundaries."""
         return tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """No region has a name."""
+        return ()
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells."""
+        a, b, c = self.cells
+        return a * b * c * (6 if self.cell == "tetrahedron" else 1)
+
+    @property
+    def cells_in_words(self) -> str:
+        """How many cells there are along each edge."""
+        return " × ".join(f"{n}" for n in self.cells)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Nothing is odd about it."""
+        return ()
 
     @property
     def nodes(self) -> int:
@@ -170,6 +196,10 @@ class Box(_SixSided):
         """Whether a point (m) lies in the undeformed body."""
         return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
 
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        return np.asarray(np.clip(points, 0.0, self.size))
+
 
 class Block(_SixSided):
     """A block with eight given corners: the trilinear image of a cube.
@@ -222,6 +252,26 @@ class Block(_SixSided):
         extent = max(high - low for low, high in self.bounds)
         return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
 
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        from scipy.optimize import lsq_linear
+
+        steps = np.linspace(0, 1, 5)
+        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        images = self.place(guesses)
+        found = np.empty_like(points)
+        for i, point in enumerate(points):
+            # Gauss and Newton's method in the cube, the steps of which end at its faces.
+            x = guesses[[np.linalg.norm(images - point, axis=1).argmin()]]
+            for _ in range(20):
+                gap = point - self.place(x)[0]
+                step = lsq_linear(self._slopes(x)[0], gap, (np.minimum(-x[0], -1e-300), np.maximum(1 - x[0], 1e-300))).x
+                x = np.clip(x + step, 0, 1)
+                if np.abs(step).max() < 1e-12:
+                    break
+            found[i] = self.place(x)[0]
+        return found
+
     def _trilinear(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
         """Sum the corners with weights (n, 2) of the two ends along each axis."""
         corners = np.reshape(self.corners, (2, 2, 2, 3))
@@ -253,4 +303,4 @@ def _box_by_default(value: Any) -> Any:
     return {"kind": "box"} | value if isinstance(value, dict) else value
 
 
-Body = Annotated[Box | Block, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+Body = Annotated[Box | Block | OwnMesh, Field(discriminator="kind"), BeforeValidator(_box_by_default)]

@@ -6,9 +6,10 @@ specimen per volume, the nominal stress that does work on x is
     P = (1/k) dW(x, y(x))/dx,
 
 with k = 2 where two equal stretches are prescribed. An incompressible specimen has y(x) from J = 1; a compressible one
-has ∂W/∂y = 0, and then dW/dx = ∂W/∂x. SymPy reads the energy and differentiates it, so that stresses and their
-derivatives with respect to the constants are closed forms (of y, which Newton's method finds where it is not known):
-G. A. Holzapfel, Nonlinear Solid Mechanics (2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
+has ∂W/∂y = 0, and then dW/dx = ∂W/∂x. Fibres lie such that no shear is needed for that. SymPy reads the energy and
+differentiates it, so that stresses and their derivatives with respect to the constants are closed forms (of y, which
+Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics (2000), chapter 6; R. W. Ogden,
+Non-Linear Elastic Deformations (1984).
 """
 
 from __future__ import annotations
@@ -22,13 +23,12 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
-from forward.materials import MATERIALS, OF_STRETCHES, constants
+from forward.materials import MATERIALS, constants, measured, measures
 from forward.model import FloatArray, FunctionModel, FunctionSolution, Reference, SolveError
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
 Positive = Annotated[float, Gt(0)]
-ENERGIES = MATERIALS | OF_STRETCHES
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
 
@@ -89,20 +89,32 @@ class HomogeneousModel:
         What is measured.
     parameters
         Names of the constants that vary; the others keep their values.
+    fibres
+        Directions of one or two families of fibres, where the material has them: components along the stretch x, along
+        what is prescribed across (in simple shear, x moves along the first, more so along the second), and along y.
 
     Raises
     ------
     ValueError
-        If constants are missing or unknown.
+        If constants are missing or unknown, or a test would shear the specimen.
     """
 
     differentiable = True
     displacements = 0
 
     def __init__(
-        self, energy: str, values: dict[str, float], tests: Sequence[MaterialTest], parameters: Sequence[str]
+        self,
+        energy: str,
+        values: dict[str, float],
+        tests: Sequence[MaterialTest],
+        parameters: Sequence[str],
+        fibres: Sequence[tuple[float, float, float]] = (),
     ) -> None:
-        known = constants(ENERGIES[energy])
+        units = tuple(tuple((np.array(fibre) / np.linalg.norm(fibre)).tolist()) for fibre in fibres)
+        objection = next(filter(None, (unfit(energy, test.mode, fibres) for test in tests)), None)
+        if objection is not None:
+            raise ValueError(objection)
+        known = constants(MATERIALS[energy])
         given = dict.fromkeys([*values, *parameters])
         unknown, missing = set(given) - set(known), set(known) - set(given) - {"D1"}
         if unknown or missing:
@@ -113,7 +125,7 @@ class HomogeneousModel:
         self._values = np.array([values.get(name, np.nan) for name in self._names])
         self._varied = [self._names.index(name) for name in parameters]
         self._tests = tuple(tests)
-        self._readings = [reading(energy, test.mode, self._names) for test in tests]
+        self._readings = [reading(energy, test.mode, self._names, units) for test in tests]
         many = {test.label for test in tests if len(test.at) > 1}
         self.outputs = tuple(
             f"{test.label}[{i}]" if test.label in many else test.label for test in tests for i in range(len(test.at))
@@ -184,11 +196,12 @@ class _Kinematics(NamedTuple):
     stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of sympy, x, z, y
     incompressible: Callable[[Any, Any], Any] | None  # of x, z; nothing is free where there is none
     share: int = 1  # prescribed stretches that are x
+    alike: tuple[tuple[int, int], ...] = ()  # directions in which the specimen is stretched alike, and so must be made
 
 
 _MODES: dict[str, _Kinematics] = {
-    "uniaxial": _Kinematics(lambda ops, x, z, y: (x, y, y), lambda x, z: x ** (-0.5)),
-    "equibiaxial": _Kinematics(lambda ops, x, z, y: (x, x, y), lambda x, z: x ** (-2.0), share=2),
+    "uniaxial": _Kinematics(lambda ops, x, z, y: (x, y, y), lambda x, z: x ** (-0.5), alike=((1, 2),)),
+    "equibiaxial": _Kinematics(lambda ops, x, z, y: (x, x, y), lambda x, z: x ** (-2.0), share=2, alike=((0, 1),)),
     "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),
     "pure-shear": _Kinematics(lambda ops, x, z, y: (x, 1, y), lambda x, z: 1 / x),
     # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
@@ -200,8 +213,32 @@ _MODES: dict[str, _Kinematics] = {
 Reading = Callable[[FloatArray, FloatArray, FloatArray, bool, bool], tuple[FloatArray, FloatArray]]
 
 
+def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
+    """Say why fibres do not fit a material and a mode, or nothing if they do.
+
+    Where a face is free, the material must be alike on both sides of each plane of the mode (reflections leave the
+    families of fibres as they are, up to their sign), and in the directions that are stretched alike.
+    """
+    if ("I4" in measures(energy)) != bool(fibres):
+        return f"material '{energy}': {'expected fibres' if not fibres else 'has no fibres'}"
+    if mode == "simple-shear" or not fibres:
+        return None
+    families = np.array(fibres)
+    families = families / np.linalg.norm(families, axis=1)[:, None]
+    changes = [np.eye(3) - 2 * np.diag(axis) for axis in np.eye(3)]
+    for i, j in _MODES[mode].alike:
+        swap = np.eye(3)
+        swap[[i, j]] = swap[[j, i]]
+        changes.append(swap)
+    if all(np.isclose(np.abs(families @ change @ families.T).max(axis=0), 1).all() for change in changes):
+        return None
+    return f"fibres that a test '{mode}' would shear, or stretch unlike: expected them along axes, or a mirrored pair"
+
+
 @cache
-def reading(energy: str, mode: Mode, names: tuple[str, ...]) -> Reading:
+def reading(
+    energy: str, mode: Mode, names: tuple[str, ...], fibres: tuple[tuple[float, float, float], ...] = ()
+) -> Reading:
     """Return (x (k,), z (k,), θ (c, n, 1), cauchy, derivatives) → stresses (n, k) and dσ/dθ (c, n, k) of a mode.
 
     Parameters
@@ -210,32 +247,36 @@ def reading(energy: str, mode: Mode, names: tuple[str, ...]) -> Reading:
         Kind of the material.
     names
         The c constants θ; without D1 an energy that has it is read at J = 1.
+    fibres
+        Unit vectors along the families of fibres.
     """
     import sympy
 
-    ops = SimpleNamespace(ln=sympy.log, exp=sympy.exp, sqrt=sympy.sqrt)
     kinematics = _MODES[mode]
-    x = sympy.Symbol("x", real=True) if mode == "simple-shear" else sympy.Symbol("x", positive=True)
+    x = sympy.Symbol("x", real=True, positive=None if mode == "simple-shear" else True)
     z, y = sympy.symbols("z y", positive=True)
-    theta = {name: sympy.Symbol(name, real=True) for name in names}
+    theta = dict(zip(names, sympy.symbols(names, real=True), strict=True))
     confined = kinematics.incompressible is None
-    incompressible = "D1" in constants(ENERGIES[energy]) and "D1" not in names
+    incompressible = "D1" in constants(MATERIALS[energy]) and "D1" not in names
     values = theta if not incompressible else theta | {"D1": sympy.Integer(0)}
-    stretches = kinematics.stretches(sympy, x, z, y)
-    W = _energy(ops, energy, stretches, sympy.Integer(1) if incompressible or confined else None, values)
+    a, b, c = stretches = kinematics.stretches(sympy, x, z, y)
+    J = sympy.Integer(1) if incompressible or confined else a * b * c
+    squared = tuple(
+        (f + x * g) ** 2 + g**2 + h**2 if confined else (a * f) ** 2 + (b * g) ** 2 + (c * h) ** 2 for f, g, h in fibres
+    )
+    W = MATERIALS[energy](_operators(), *measured(energy, stretches, J, squared).values(), **values)
     if incompressible and kinematics.incompressible is not None:
         W = W.subs(y, _exact(kinematics.incompressible(x, z)))
     P = W.diff(x) / kinematics.share
-    arguments = [x, z, y, *theta.values()]
 
     def compiled(expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
-        function: Callable[..., Sequence[Any]] = sympy.lambdify(arguments, list(expressions), modules="numpy", cse=True)
+        symbols = [x, z, y, *theta.values()]
+        function: Callable[..., Sequence[Any]] = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
         return function
 
     free = not incompressible and not confined
-    slopes = [P.diff(symbol) for symbol in theta.values()]
     # Beyond where an energy ends, its derivatives may be numbers.
-    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *slopes])
+    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *(P.diff(s) for s in theta.values())])
     if free:
         g = W.diff(y)
         balance = compiled([g, g.diff(y)])
@@ -274,14 +315,13 @@ def reading(energy: str, mode: Mode, names: tuple[str, ...]) -> Reading:
     return read
 
 
-def _energy(ops: Any, kind: str, stretches: tuple[Any, Any, Any], J: Any | None, values: dict[str, Any]) -> Any:
-    """W of principal stretches; J is given where it is known."""
-    a, b, c = stretches
-    volume = a * b * c if J is None else J
-    if kind in OF_STRETCHES:
-        return OF_STRETCHES[kind](ops, a, b, c, volume, **values)
-    A, B, C = a**2, b**2, c**2
-    return MATERIALS[kind](ops, A + B + C, A * B + B * C + C * A, volume, **values)
+def _operators() -> SimpleNamespace:
+    import sympy
+
+    def positive(x: Any) -> Any:
+        return sympy.Piecewise((x, x > 0), (0, True))
+
+    return SimpleNamespace(ln=sympy.log, exp=sympy.exp, sqrt=sympy.sqrt, positive=positive)
 
 
 def _exact(expression: Any) -> Any:

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
 import numpy as np
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.fields import RandomField
-from forward.geometry import AXES, Body
+from forward.geometry import AXES, Body, Vector
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
-from forward.materials import MATERIALS, constants, small_strain_moduli, splits
+from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
 from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
 from forward.settings import Settings, nearest
+
+
+class _Fibrous(Settings):
+    """A material with one or two families of fibres, along vectors in the undeformed body."""
+
+    fibres: tuple[Vector, ...] = Field(min_length=1, max_length=2)
+
+    @field_validator("fibres")
+    @classmethod
+    def _have_lengths(cls, fibres: tuple[Vector, ...]) -> tuple[Vector, ...]:
+        if not all(any(fibre) for fibre in fibres):
+            message = "a direction has length zero, expected vectors such as [1, 0, 0]"
+            raise ValueError(message)
+        return fibres
+
 
 if TYPE_CHECKING:
     from forward.finite_element import HyperelasticModel
@@ -32,7 +48,7 @@ else:
             tuple(
                 create_model(
                     energy.__name__.title().replace("_", ""),
-                    __base__=Settings,
+                    __base__=_Fibrous if "I4" in measures(energy) else Settings,
                     __doc__=energy.__doc__,
                     kind=(Literal[name], name),
                     **{
@@ -77,6 +93,21 @@ def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> T
     return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
 
 
+CONTRAST = "contrast"
+
+
+class RegionNumbers(Settings):
+    """What a region may have besides constants of the material.
+
+    Parameters
+    ----------
+    contrast
+        Stiffness there divided by that of its constants (1).
+    """
+
+    contrast: Annotated[float, Gt(0)]
+
+
 class Hyperelastic(Settings):
     """A hyperelastic body under loads, solved by finite elements.
 
@@ -86,8 +117,11 @@ class Hyperelastic(Settings):
         Geometry and mesh.
     material
         Strain energy and its constants.
+    regions
+        Numbers of named regions of the mesh: constants of the material, which take the place of those of `material`,
+        and `contrast`, by which the energy density is multiplied: ``{ tumour = { contrast = 9 } }``.
     inclusions
-        Regions that are stiffer or softer: their factors multiply the energy density.
+        Balls that are stiffer or softer: their factors multiply the energy density.
     fields
         Random fields that multiply the stiffness or the density.
     clamp
@@ -111,6 +145,7 @@ class Hyperelastic(Settings):
     formulation: Literal["displacement", "mixed", "auto"] = "auto"
     body: Body
     material: Material
+    regions: dict[str, dict[str, float]] = Field(default={})
     inclusions: tuple[Inclusion, ...] = ()
     fields: tuple[RandomField, ...] = ()
     clamp: tuple[str, ...] = ()
@@ -119,7 +154,7 @@ class Hyperelastic(Settings):
     outputs: tuple[Output, ...] = Field(min_length=1)
     solver: SolverSettings = SolverSettings()
 
-    @field_validator("solver", mode="before")
+    @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
     @classmethod
     def _kind_alone(cls, given: Any) -> Any:
         return {"kind": given} if isinstance(given, str) else given
@@ -128,9 +163,13 @@ class Hyperelastic(Settings):
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
         found = {}
-        for name in type(self.material).model_fields:
-            if name != "kind":
-                found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for name in constants(MATERIALS[self.energy]):
+            found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
+        for region, numbers in self.regions.items():
+            for name, value in numbers.items():
+                block = RegionNumbers if name == CONTRAST else type(self.material)
+                if name in block.model_fields:
+                    found[f"regions.{region}.{name}"] = Scalar(value, block, name)
         for inclusion in self.inclusions:
             for name in type(inclusion).model_fields:
                 if name not in {"kind", "name"}:
@@ -165,18 +204,26 @@ class Hyperelastic(Settings):
             return self.formulation == "mixed"
         if self.body.degree < 2 or not self._splits:
             return False
-        values = {name: value for name, value in self.material.model_dump().items() if name != "kind"}
-        mu, kappa = small_strain_moduli(self._energy, values)
-        return kappa > NEARLY_INCOMPRESSIBLE * mu
+        values = {name: getattr(self.material, name) for name in constants(MATERIALS[self.energy])}
+        of_regions = [values | {k: v for k, v in own.items() if k != CONTRAST} for own in self.regions.values()]
+        moduli = [small_strain_moduli(self.energy, numbers) for numbers in (values, *of_regions)]
+        return any(kappa > NEARLY_INCOMPRESSIBLE * mu for mu, kappa in moduli)
 
     @property
     def _splits(self) -> bool:
         """Whether the energy is the sum of a part without J and of D1 (J−1)²."""
-        return splits(self._energy)
+        return splits(self.energy)
 
     @property
-    def _energy(self) -> str:
+    def energy(self) -> str:
+        """Kind of the material."""
         return str(getattr(self.material, "kind"))  # noqa: B009 - every material has a kind
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Unit vectors along the families of fibres in the undeformed body."""
+        given = getattr(self.material, "fibres", ())
+        return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
@@ -241,6 +288,7 @@ class Hyperelastic(Settings):
             if not self.body.contains(centre):
                 message = f"its centre lies outside the body, which lies in {self._bounds}"
                 yield ("inclusions", i), message, list(centre)
+        yield from self._mistakes_of_regions()
         yield from self._mistakes_of_fields()
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
@@ -273,6 +321,21 @@ class Hyperelastic(Settings):
             if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
                 yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
 
+    def _mistakes_of_regions(self) -> Iterator[Mistake]:
+        known = (*(name for name in type(self.material).model_fields if name != "kind"), CONTRAST)
+        for region, numbers in self.regions.items():
+            if region not in self.body.regions:
+                hint = nearest(region, self.body.regions) if self.body.regions else "this body has none"
+                yield ("regions", region), f"unknown region; {hint}", numbers
+            for name, value in numbers.items():
+                if name not in known:
+                    message = f"not a constant of '{self.energy}'; {nearest(name, known)}"
+                    yield ("regions", region, name), message, value
+                    continue
+                objection = self.scalars[f"regions.{region}.{name}"].objection(value)
+                if objection is not None:
+                    yield ("regions", region, name), objection, value
+
     def _mistakes_of_fields(self) -> Iterator[Mistake]:
         for i, field in enumerate(self.fields):
             if field.of == "density" and not any(isinstance(load, Gravity) for load in self.loads):
@@ -284,7 +347,7 @@ class Hyperelastic(Settings):
     def _mistakes_of_formulation(self) -> Iterator[Mistake]:
         if self.formulation == "mixed" and not self._splits:
             split = ", ".join(name for name, energy in MATERIALS.items() if splits(energy))
-            message = f"the energy '{self._energy}' has no part of the volume alone; a mixed form has: {split}"
+            message = f"the energy '{self.energy}' has no part of the volume alone; a mixed form has: {split}"
             yield ("formulation",), message, self.formulation
         if self.formulation == "mixed" and self.body.degree < 2:
             message = "a mixed form on cells of degree 1 is not stable, expected body.degree = 2"

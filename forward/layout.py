@@ -74,9 +74,20 @@ class Layout:
 
     def cells(self) -> tuple[NDArray[np.int64], int]:
         """Return all cells (n_cells, k) as canonical nodes in VTK's order, and VTK's number of the type; collective."""
+        cells, kind = self._cells()
+        everywhere = np.concatenate(self._comm.allgather(cells))
+        return everywhere[np.lexsort(everywhere.T[::-1])], kind
+
+    def by_cell(self, values: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return numbers of this rank's cells for all cells (n_cells,), in the order of `cells`; collective."""
+        own, _ = self._cells()
+        cells, found = (np.concatenate(self._comm.allgather(part)) for part in (own, values[: len(own)]))
+        return np.asarray(found[np.lexsort(cells.T[::-1])], dtype=np.int64)
+
+    def _cells(self) -> tuple[NDArray[np.int64], int]:
+        """This rank's cells."""
         local, kind = fenicsx.vtk_cells(self._space)
-        cells = np.concatenate(self._comm.allgather(self.nodes()[local]))
-        return cells[np.lexsort(cells.T[::-1])], kind
+        return self.nodes()[local], kind
 
 
 def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:

@@ -1,13 +1,14 @@
 """Strain energies of hyperelastic materials: one plain function each.
 
-A function takes the operators `ops` (``ln``, ``exp``, ``sqrt``), the invariants I1, I2 of C = FᵀF and J = det F, and
-its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The names of the
-keyword-only arguments *are* the names of the parameters in studies and results, and their annotations are the
-admissible values and their units. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
+A function takes the operators `ops` (``ln``, ``exp``, ``sqrt``, ``positive``: the larger of x and 0), measures of the
+deformation by their names in `measures`, and its constants as keyword-only arguments. UFL reads it for finite elements,
+SymPy for closed forms. The names of the keyword-only arguments *are* the names of the parameters in studies and
+results, and their annotations are the admissible values and their units. All energies are in J/m³ and vanish, with
+their stress, in the undeformed body.
 
 An energy that splits into an isochoric and a volumetric part has a constant called D1, and its volumetric part is
-exactly D1(J−1)²: with D1 = 0 it is the isochoric part W(Ī1, Ī2), of Ī1 = J^(−2/3) I1 and Ī2 = J^(−4/3) I2. No other
-energy may call a constant D1.
+exactly D1(J−1)²: with D1 = 0 it is the isochoric part, of Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2 and λ̄_i = J^(−1/3) λ_i,
+and of fibres. No other energy may call a constant D1.
 """
 
 from __future__ import annotations
@@ -132,6 +133,21 @@ def ogden(
     return total
 
 
+def holzapfel_gasser_ogden(
+    ops: Any, I1: Any, I2: Any, J: Any, I4: Any, *, c: Positive, k1: NonNegative, k2: PositiveRatio, D1: Positive
+) -> Any:
+    """Holzapfel–Gasser–Ogden: W = c/2 (Ī1−3) + Σ_f k1/(2 k2) (exp(k2 ⟨I4_f−1⟩²) − 1) + D1(J−1)².
+
+    One or two families f of fibres along a_f in the undeformed body, I4_f = a_f·C a_f; ⟨x⟩ = max(x, 0): fibres that are
+    shortened bear nothing. I4 is not made isochoric: else fibres would swell a compressible body. c, k1, D1 in Pa; k2
+    is dimensionless. Small strain: μ = c, κ = 2 D1 of the matrix; a fibre stretched by 1 + e adds the tension 4 k1 e.
+    Source: G. A. Holzapfel, T. C. Gasser, R. W. Ogden, J. Elasticity 61 (2000) 1–48; I4 as in D. R. Nolan et al., J.
+    Mech. Behav. Biomed. Mater. 39 (2014) 48–60.
+    """
+    fibres = sum(ops.exp(k2 * ops.positive(squared - 1) ** 2) - 1 for squared in I4)
+    return c / 2 * (J ** (-2 / 3) * I1 - 3) + k1 / (2 * k2) * fibres + D1 * (J - 1) ** 2
+
+
 Energy = Callable[..., Any]
 
 MATERIALS: dict[str, Energy] = {
@@ -143,13 +159,36 @@ MATERIALS: dict[str, Energy] = {
     "demiray": demiray,
     "saint-venant-kirchhoff": saint_venant_kirchhoff,
     "blatz-ko": blatz_ko,
+    "ogden": ogden,
+    "holzapfel-gasser-ogden": holzapfel_gasser_ogden,
 }
 
-OF_STRETCHES: dict[str, Energy] = {"ogden": ogden}
-"""Energies of the principal stretches l1, l2, l3 and J in place of the invariants: for material-point tests."""
+
+_COMPLEX = SimpleNamespace(
+    ln=cmath.log, exp=cmath.exp, sqrt=cmath.sqrt, positive=lambda x: x if complex(x).real > 0 else 0.0
+)
 
 
-_COMPLEX = SimpleNamespace(ln=cmath.log, exp=cmath.exp, sqrt=cmath.sqrt)
+def measures(energy: str | Energy) -> tuple[str, ...]:
+    """Return what an energy, or that of a kind of material, is a function of, by name and in its order.
+
+    I1 and I2 are invariants of C = FᵀF, J = det F; l1, l2, l3 are the principal stretches; I4 is the tuple of the
+    squared stretches of the families of fibres.
+    """
+    _, *names = (
+        name
+        for name, p in inspect.signature(_energy_of(energy)).parameters.items()
+        if p.kind is not inspect.Parameter.KEYWORD_ONLY
+    )
+    return tuple(names)
+
+
+def measured(energy: str | Energy, stretches: tuple[Any, Any, Any], J: Any, I4: tuple[Any, ...] = ()) -> dict[str, Any]:
+    """Return the measures of an energy from principal stretches, J and the squared stretches of fibres."""
+    a, b, c = (stretch**2 for stretch in stretches)
+    known = dict(zip(("l1", "l2", "l3"), stretches, strict=True))
+    known |= {"I1": a + b + c, "I2": a * b + b * c + c * a, "J": J, "I4": I4}
+    return {name: known[name] for name in measures(energy)}
 
 
 def constants(energy: Energy) -> dict[str, Any]:
@@ -172,11 +211,11 @@ def splits(energy: str | Energy) -> bool:
 
 
 def small_strain_moduli(energy: str | Energy, values: Mapping[str, float]) -> tuple[float, float]:
-    """Shear and bulk modulus of the undeformed body.
+    """Shear and bulk modulus of the undeformed body; fibres, which bear tension only, left out.
 
-    A simple shear γ has I1 = I2 = 3 + γ², J = 1 and W = μγ²/2 + …, so that μ = 2 dW/ds along I1 = I2 = 3 + s, J = 1.
-    A dilation F = λI has I1 = 3λ², I2 = 3λ⁴, J = λ³ and W = κ(3(λ−1))²/2 + …, so that κ = W''(λ)/9 at λ = 1. First
-    derivatives are complex steps, which are exact to rounding; the second one adds a central difference of order 4.
+    Pure shear with stretches exp(h), exp(−h), 1 has W = 2μh² + …, so that μ = W''(h)/4 at h = 0. A dilation with all
+    stretches λ has W = κ(3(λ−1))²/2 + …, so that κ = W''(λ)/9 at λ = 1. First derivatives are complex steps, which are
+    exact to rounding; the second one adds a central difference of order 4.
 
     Parameters
     ----------
@@ -193,17 +232,15 @@ def small_strain_moduli(energy: str | Energy, values: Mapping[str, float]) -> tu
     W = _energy_of(energy)
     tiny = 1e-30
 
-    def along_dilation(stretch: float) -> float:
-        x = complex(stretch, tiny)
-        return float(complex(W(_COMPLEX, 3 * x**2, 3 * x**4, x**3, **values)).imag / tiny)
+    def curvature(path: Callable[[complex], tuple[Any, Any, Any]], h: float) -> float:
+        def slope(at: float) -> float:
+            a, b, c = stretches = path(complex(at, tiny))
+            return float(complex(W(_COMPLEX, *measured(W, stretches, a * b * c).values(), **values)).imag / tiny)
 
-    s = complex(3, tiny)
-    h = 1e-3
-    shear = complex(W(_COMPLEX, s, s, 1.0, **values)).imag / tiny
-    second = (
-        8 * (along_dilation(1 + h) - along_dilation(1 - h)) - along_dilation(1 + 2 * h) + along_dilation(1 - 2 * h)
-    ) / (12 * h)
-    return 2 * shear, second / 9
+        return (8 * (slope(h) - slope(-h)) - slope(2 * h) + slope(-2 * h)) / (12 * h)
+
+    shear = curvature(lambda h: (cmath.exp(h), cmath.exp(-h), 1.0), 1e-3)
+    return shear / 4, curvature(lambda h: (1 + h, 1 + h, 1 + h), 1e-3) / 9
 
 
 def _energy_of(energy: str | Energy) -> Energy:

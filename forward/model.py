@@ -54,6 +54,10 @@ class SolveError(Exception):
         self.work = work or Work()
 
 
+class ModelError(ValueError):
+    """A model cannot be made or used at all, wherever its parameters are; the message is one line for the user."""
+
+
 class DerivativeError(Exception):
     """A derivative was asked for that the model or the output does not have."""
 
@@ -118,6 +122,18 @@ class Solution(Protocol):
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U_local,) along a `direction` (d,) of the parameters; (k, U_local)."""
+
+
+class NamedOutput(Protocol):
+    """What a specification says of an output."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def unit(self) -> str:
+        """SI unit of its value; "1" for ratios."""
 
 
 class ForwardModel(Protocol):
@@ -215,7 +231,7 @@ class FunctionModel:
         outputs = np.array(self.function(point), dtype=float, ndmin=1)
         if outputs.shape != (len(self.outputs),):
             message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
-            raise ValueError(message)
+            raise ModelError(message)
         if not np.isfinite(outputs).all():
             raise SolveError("the model's function returned a value that is not finite")
         outputs.flags.writeable = False
@@ -273,4 +289,9 @@ class FunctionSolution:
     def _jacobian(self) -> FloatArray:
         if self.model.jacobian is None:
             raise DerivativeError("this model was given without a jacobian, so it has no derivatives")
-        return np.asarray(self.model.jacobian(self.parameters), dtype=float).reshape(self.outputs.size, -1)
+        jacobian = np.asarray(self.model.jacobian(self.parameters), dtype=float)
+        expected = self.outputs.size, self.parameters.size
+        if jacobian.size != np.prod(expected) or (jacobian.shape != expected and 1 not in expected):
+            message = f"the model's jacobian returned shape {jacobian.shape}, expected {expected}"
+            raise ModelError(message)
+        return jacobian.reshape(expected)

@@ -125,10 +125,6 @@ class ReferenceFactor:
         body.set_state(u)
         return np.asarray(np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations))
 
-    def near(self, u: FloatArray) -> Inverse:
-        """Return the approximate inverse at a state u (U_local,)."""
-        return self.inverse(self.rotation(u))
-
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
         body = self._body

@@ -6,13 +6,15 @@ they alternate, use the factors of one solution. What is observed of a case is B
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.fields import RandomField
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
     from forward.finite_element import FiniteElementSolution, HyperelasticModel
+    from forward.layout import Layout
 
 
 class LoadCase(Settings):
@@ -100,7 +103,7 @@ class Specimen(Settings):
     cases
         Load cases.
     observed
-        What is measured.
+        What is measured; not needed where data say it.
     """
 
     kind: Literal["specimen"] = "specimen"
@@ -111,7 +114,12 @@ class Specimen(Settings):
     solver: SolverSettings = SolverSettings()
     formulation: Literal["displacement", "mixed", "auto"] = "auto"
     cases: tuple[LoadCase, ...] = Field(min_length=1)
-    observed: tuple[Observed, ...] = Field(min_length=1)
+    observed: tuple[Observed, ...] = ()
+
+    @field_validator("solver", mode="before")
+    @classmethod
+    def _kind_alone(cls, given: Any) -> Any:
+        return {"kind": given} if isinstance(given, str) else given
 
     def loaded(self, case: LoadCase) -> Hyperelastic:
         """Return the body in one load case."""
@@ -135,6 +143,11 @@ class Specimen(Settings):
     def coefficients(self) -> tuple[str, ...]:
         """Paths of the coefficients of the random fields, which can be parameters too."""
         return tuple(path for field in self.fields for path in field.paths(self.body))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of each load case."""
+        return self.loaded(self.cases[0]).unknowns
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         """Mesh the body and compile the forms of every case on a communicator; collective.
@@ -167,7 +180,7 @@ class Specimen(Settings):
             except ValidationError as error:
                 for line in error.errors(include_url=False):
                     yield _mistake(("cases", i, *line["loc"]), line["msg"], line["input"])
-            if not self.seen(case):
+            if self.observed and not self.seen(case):
                 yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
         for i, item in enumerate(self.observed):
             yield from self._mistakes_of(i, item)
@@ -228,21 +241,66 @@ class SpecimenModel:
         )
         self.displacements = 0  # states of several cases are no displacement field
         self.differentiable = True
-        self.observations: list[csr_matrix] = []
         names: list[str] = []
-        places, axes, cases = [], [], []
+        places: list[FloatArray] = []
+        axes: list[int] = []
+        cases: list[int] = []
         for number, (case, model) in enumerate(zip(spec.cases, self.models, strict=True)):
-            found = [_observe(model, item) for item in spec.seen(case)]
-            for item, (matrix, where, components) in zip(spec.seen(case), found, strict=True):
-                k = len(item.components)
-                names += [f"{case.name}.{item.label}.{i // k}.{AXES[a]}" for i, a in enumerate(components)]
-                places.append(where)
-                axes.append(components)
-                cases.append(np.full(matrix.shape[0], number))
-            self.observations.append(_stacked([matrix for matrix, _, _ in found]))
-        self.outputs = tuple(names)
-        self.places, self.axes, self.cases = (np.concatenate(parts) for parts in (places, axes, cases))
-        self._ends = np.cumsum([matrix.shape[0] for matrix in self.observations])[:-1]
+            for item in spec.seen(case):
+                where = _places(model, item)
+                names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(where)) for axis in item.components]
+                places.append(np.repeat(where, len(item.components), axis=0))
+                axes += [AXES.index(axis) for axis in item.components] * len(where)
+                cases += [number] * len(where) * len(item.components)
+        self._observing(np.concatenate(places) if places else np.zeros((0, 3)), axes, cases, tuple(names))
+
+    def observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int]) -> SpecimenModel:
+        """Return the same model with other outputs; collective. Both share meshes, forms and factors.
+
+        Parameters
+        ----------
+        places
+            Where (n, 3) displacements are observed, in the undeformed body (m).
+        axes
+            Their components (n,): 0, 1 or 2.
+        cases
+            Their load cases (n,) by number, which do not fall.
+        """
+        other = copy.copy(self)
+        labels = [(self.spec.cases[case].name, AXES[axis]) for case, axis in zip(cases, axes, strict=True)]
+        other._observing(places, axes, cases, tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels)))
+        return other
+
+    def _observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], names: tuple[str, ...]) -> None:
+        self.outputs, self.places = names, places
+        self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
+        numbers = range(len(self.models))
+        self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
+        self.observations: list[csr_matrix] = [
+            _interpolation(model, self.places[self.cases == number], self.axes[self.cases == number])
+            for number, model in zip(numbers, self.models, strict=True)
+        ]
+
+    @cached_property
+    def vertices(self) -> Layout:
+        """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
+        from forward import fenicsx
+        from forward.layout import Layout
+
+        body = self.models[0].body
+        return Layout(fenicsx.scalar_space(body.space.mesh, 1), body.comm)
+
+    def log_fields(self, points: FloatArray) -> FloatArray:
+        """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
+
+        That of all random fields on it together; on every rank.
+        """
+        model = self.models[0]
+        found = np.zeros((len(points), self.spec.body.vertex_count))
+        if self.spec.fields:
+            factors = model.body.comm.bcast(model.factors(points[:, self.positions[0]], 1))
+            found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
+        return found
 
     def solve(
         self,
@@ -337,44 +395,48 @@ class SpecimenSolution:
         return gradients
 
 
-def _observe(model: HyperelasticModel, item: Observed) -> tuple[csr_matrix, FloatArray, NDArray[np.int64]]:
-    """Return B (n, U_local), the places (n, 3) and the components (n,) of what is observed; collective."""
+def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
+    """Where (n, 3) displacements are observed; collective."""
+    if item.on is None:
+        return np.array(item.at)
+    from forward import fenicsx
+
+    body, layout = model.body, model.layout
+    mine = layout.nodes()[fenicsx.boundary_nodes(body.space, body.facets[item.on])]
+    return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
+
+
+def _interpolation(model: HyperelasticModel, places: FloatArray, axes: NDArray[np.int64]) -> csr_matrix:
+    """Return B (n, U_local) of displacement components (n,) at places (n, 3); collective.
+
+    Raises
+    ------
+    ValueError
+        If a place lies in no cell.
+    """
     from scipy.sparse import csr_matrix
 
     from forward import fenicsx
 
     body, layout = model.body, model.layout
+    different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     numbers = layout.nodes()
-    if item.on is not None:
-        mine = numbers[fenicsx.boundary_nodes(body.space, body.facets[item.on])]
-        nodes = np.unique(np.concatenate(body.comm.allgather(mine)))
-        places = layout.coordinates[nodes]
-        weights = [(i, np.array([node]), np.ones(1)) for i, node in enumerate(nodes)]
-    else:
-        places = np.array(item.at)
-        found = fenicsx.point_weights(body.space, places)
-        mine_too = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
-        held: dict[int, Any] = {}
-        for part in reversed(body.comm.allgather(mine_too)):  # the first rank that has a point counts
-            held |= part
-        weights = [(i, *held[i]) for i in range(len(places))]
-    axes = [AXES.index(axis) for axis in item.components]
-    k = len(axes)
+    found = fenicsx.point_weights(body.space, different) if len(places) else []
+    mine = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
+    held: dict[int, Any] = {}
+    for part in reversed(body.comm.allgather(mine)):  # the first rank that has a point counts
+        held |= part
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
-    rows, columns, values = [], [], []
-    for i, at, w in weights:
+    rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for row, (i, axis) in enumerate(zip(which.ravel(), axes, strict=True)):
+        if i not in held:
+            message = f"({', '.join(f'{x:g}' for x in different[i])}) lies in no cell of the mesh"
+            raise ValueError(message)
+        at, w = held[i]
         owned = local[at] >= 0
-        for j, a in enumerate(axes):
-            rows.append(np.full(owned.sum(), k * i + j))
-            columns.append(3 * local[at][owned] + a)
-            values.append(w[owned])
+        rows.append(np.full(owned.sum(), row))
+        columns.append(3 * local[at][owned] + axis)
+        values.append(w[owned])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    matrix = csr_matrix(entries, shape=(k * len(places), body.size))
-    return matrix, np.repeat(places, k, axis=0), np.tile(axes, len(places))
-
-
-def _stacked(matrices: list[csr_matrix]) -> csr_matrix:
-    from scipy.sparse import vstack
-
-    return vstack(matrices, format="csr")
+    return csr_matrix(entries, shape=(len(places), body.size))

@@ -7,8 +7,9 @@ those that it would have if it were true: their squares Σr² ~ χ², and their 
 size of the noise was inferred.
 
 Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i) (A. Vehtari, A. Gelman, J. Gabry, Stat.
-Comput. 27 (2017) 1413–1432). Averaged predictions have the variance Σ P_k V_k within models and Σ P_k (μ_k − μ)²
-between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
+Comput. 27 (2017) 1413–1432), or whole tests t, by ln p(y_t | other tests) = ln Z − ln Z without t: data of one test
+follow one another, so that one of them left out alone is no surprise. Averaged predictions have the variance Σ P_k V_k
+within models and Σ P_k (μ_k − μ)² between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.evidence import Evidence, tail_shape
@@ -63,12 +65,15 @@ class Data:
         Name of the test of each output (M,).
     at
         Where in the test (M,).
+    neighbours
+        Numbers of data that stand beside each other, two (k,); by default those that follow each other in a test.
     """
 
     values: FloatArray
     sigma: FloatArray | None
     tests: tuple[str, ...]
     at: FloatArray
+    neighbours: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
 
 
 @dataclass(frozen=True)
@@ -115,12 +120,12 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
     tails = np.array([tail_shape(np.exp(column)) for column in (log_ratio - top).T])
-    neighbours = _neighbours(data)
+    neighbours = data.neighbours or _neighbours(data)
     m = posterior.data.size
     misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
-    drawn = np.sort(_agreement(errors, neighbours))
-    larger = 1 - np.searchsorted(drawn, _agreement(r, neighbours)) / DRAWS
+    drawn = np.sort(agreement(errors, neighbours))
+    larger = 1 - np.searchsorted(drawn, agreement(r, neighbours)) / DRAWS
     return Criticism(scores, tails, misfit, float(w @ larger))
 
 
@@ -136,7 +141,8 @@ def _neighbours(data: Data) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(first), np.concatenate(second)
 
 
-def _agreement(r: FloatArray, neighbours: tuple[Any, Any]) -> FloatArray:
+def agreement(r: FloatArray, neighbours: tuple[Any, Any]) -> FloatArray:
+    """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
     return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
 
 
@@ -150,6 +156,7 @@ def comparison(
     stated: Mapping[Pair, Assessment],
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
     checks: Mapping[Pair, tuple[float, float]],
+    left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
 ) -> xr.Dataset:
     """Put everything that is known of the candidates into a dataset.
 
@@ -163,6 +170,8 @@ def comparison(
         ln Z and error by the name of the variant, the study as it is first.
     checks
         ln Z and error by nested sampling, if it was asked for.
+    left_out
+        ln Z and error without each test, if they were asked for.
     """
     import xarray as xr
 
@@ -214,12 +223,24 @@ def comparison(
     if checks:
         variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
         variables["nested_log_evidence_error"] = table({pair: error for pair, (_, error) in checks.items()})
+    if left_out:
+        whole = {pair: (e.log_evidence, e.error) for pair, e in found.items()}
+        ours, theirs = zip(
+            *((totals({pair: whole[pair] for pair in rest}), totals(rest)) for rest in left_out.values()), strict=True
+        )
+        dims = ("left_out", "model")
+        variables["held_out_score"] = (dims, np.array([a[0] - b[0] for a, b in zip(ours, theirs, strict=True)]))
+        variables["held_out_score_error"] = (
+            dims,
+            np.array([np.hypot(a[1], b[1]) for a, b in zip(ours, theirs, strict=True)]),
+        )
     columns = [_predictions(names, group, data, posteriors, stated, P) for group, data in groups.items()]
     for name, (dims, _) in columns[0].items():
         variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
     parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
     variables |= _constants(names, list(groups), parameters, posteriors, stated)
     coordinates = {"model": names, "group": list(groups), "variant": list(variants), "parameter": parameters}
+    coordinates |= {"left_out": list(left_out)} if left_out else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
 
 
@@ -253,7 +274,7 @@ def _predictions(
         w, outputs = evidence.weights[used], evidence.density.everything[used]
         mean[k] = w @ outputs
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
-        bands[:, k] = np.array([_quantiles(column, w) for column in outputs.T]).T
+        bands[:, k] = np.array([quantiles(column, w) for column in outputs.T]).T
     average = P @ mean
     missing = np.full(M - m, np.nan)
     sigma = next(posteriors[name, group].sigma for name in names)
@@ -292,9 +313,19 @@ def _constants(
             mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
             mean[k, g, columns] = w @ points
             std[k, g, columns] = np.sqrt(w @ (points - w @ points) ** 2)
-            bands[:, k, g, columns] = np.array([_quantiles(column, w) for column in points.T]).T
+            bands[:, k, g, columns] = np.array([quantiles(column, w) for column in points.T]).T
+    count = max(assessment.evidence.weights.size for assessment in stated.values())
+    places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
+    for k, name in enumerate(names):
+        for g, group in enumerate(groups):
+            posterior, found = posteriors[name, group], stated[name, group].evidence
+            columns = [parameters.index(p) for p in posterior.names]
+            places[k, g, : found.weights.size, columns] = posterior.physical(found.density.x).T
+            shares[k, g, : found.weights.size] = found.weights
     dims = ("model", "group", "parameter")
     return {
+        "point": (("model", "group", "point", "parameter"), places),
+        "point_weight": (("model", "group", "point"), shares),
         "constant_mode": (dims, mode),
         "constant_mean": (dims, mean),
         "constant_std": (dims, std),
@@ -302,7 +333,8 @@ def _constants(
     }
 
 
-def _quantiles(values: FloatArray, weights: FloatArray) -> FloatArray:
+def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:
+    """Return quantiles of values (n,) at points with weights (n,) of sum 1."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order]) - weights[order] / 2
-    return np.interp(QUANTILES, reached, values[order])
+    return np.interp(levels, reached, values[order])

@@ -20,7 +20,7 @@ from typing import Protocol
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Solution
+from forward.model import FloatArray, ForwardModel, Reference, Solution
 
 BLOCK = 32  # vectors whose products are formed together
 
@@ -108,8 +108,8 @@ class FieldPosterior:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
         return self.prior.root(noise) + (0.0 if self.mean is None else self.mean)
 
-    def at(self, noise: FloatArray, start: FloatArray | None = None) -> Point:
-        """Solve at ξ (N,), from a prediction of the state.
+    def at(self, noise: FloatArray, start: FloatArray | None = None, reference: Reference | None = None) -> Point:
+        """Solve at ξ (N,), from a prediction of the state and with the help of a reference.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class FieldPosterior:
         """
         self.counts.solves += 1
         values = self.values(noise)
-        return Point(self, np.array(noise), values, self.model.solve(values, start))
+        return Point(self, np.array(noise), values, self.model.solve(values, start, reference))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.distributions import Distribution
-from uq.evaluate import Evaluate, Prediction, Request
+from uq.evaluate import Evaluate, Request, Start
 from uq.inputs import Inputs
 
 NOISE = "noise"  # name of the coordinate of s
@@ -116,7 +116,7 @@ class Posterior:
     sigma: FloatArray
     noise: Distribution | None = None
     which: tuple[int, ...] | None = None
-    start: Prediction | None = None
+    start: Start | None = None
 
     def __post_init__(self) -> None:
         if self.data.shape != self.sigma.shape:

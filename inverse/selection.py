@@ -24,6 +24,7 @@ from inverse.nested import nested
 from inverse.posterior import Posterior
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate
+from uq.linearisation import linearise
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -86,6 +87,8 @@ class Select(Settings):
         By name: what else the errors might be; all evidences are found again with each.
     subsets
         By name: tests whose data are taken alone; all evidences are found again with each.
+    held_out
+        Predict every test from the others too: all evidences are found again without each of them.
     seed
         Of all draws.
     starts
@@ -99,6 +102,7 @@ class Select(Settings):
     noise: Noise
     other_noises: dict[str, Noise] = Field(default={})
     subsets: dict[str, tuple[str, ...]] = Field(default={})
+    held_out: bool = False
     seed: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 4
     check: Literal["dynesty"] | None = None
@@ -113,7 +117,7 @@ class Select(Settings):
 
     @property
     def variants(self) -> int:
-        """Number of times that all evidences are found."""
+        """Number of times that all evidences are found, without those for tests that are held out."""
         return 1 + len(self.other_noises) + len(self.subsets)
 
     def run(
@@ -147,11 +151,10 @@ class Select(Settings):
             If a model has no answer at any start or any point.
         """
         pairs = [(name, group) for name in candidates for group in groups]
-        posteriors = {
-            (name, group): posterior(candidates[name], groups[group], self.noise, evaluate(name, group))
-            for name, group in pairs
-        }
-        stated = {pair: self._assess(posteriors[pair], pair) for pair in pairs}
+        posteriors, stated = {}, {}
+        for name, group in pairs:
+            one = started(posterior(candidates[name], groups[group], self.noise, evaluate(name, group)))
+            posteriors[name, group], stated[name, group] = self._assess(one, (name, group))
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
         }
@@ -162,33 +165,47 @@ class Select(Settings):
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
-                pair: self._value(
-                    posterior(candidates[pair[0]], groups[pair[1]], noise, posteriors[pair].evaluate), pair
-                )
-                for pair in pairs
+                pair: self._value(_with_noise(posteriors[pair], groups[pair[1]], noise), pair) for pair in pairs
             }
         for label, tests in self.subsets.items():
             variants[label] = {
                 pair: self._value(_only(posteriors[pair], groups[pair[1]], tests), pair)
                 for pair in pairs
-                if set(tests) & set(groups[pair[1]].tests[: len(groups[pair[1]].values)])
+                if set(tests) & set(_tests(groups[pair[1]]))
             }
         checks = {}
         if self.check is not None:
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
-        return comparison(candidates, groups, posteriors, stated, variants, checks)
+        left_out = (
+            {test: self._without(test, groups, posteriors) for test in _testnames(groups)} if self.held_out else {}
+        )
+        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out)
 
-    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> Assessment:
+    def _without(
+        self, test: str, groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
+    ) -> dict[tuple[str, str], tuple[float, float]]:
+        """Return ln Z and its error without a test, in the groups that have it and others."""
+        found = {}
+        for pair, posterior in posteriors.items():
+            rest = _tests(groups[pair[1]])
+            if test in rest and len(rest) > 1:
+                others = tuple(other for other in rest if other != test)
+                found[pair] = self._value(_only(posterior, groups[pair[1]], others), pair)
+        return found
+
+    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[Posterior, Assessment]:
+        """Find mode and evidence; the posterior too, with solves that start from the mode."""
         try:
             gaussian = laplace(posterior, starts=self.starts, seed=self.seed)
-            return Assessment(gaussian, evidence(posterior, gaussian, self.samples, seed=self.seed))
+            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
+            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
         except SolveError as error:
             message = f"candidate '{pair[0]}': {error.reason}"
             raise SolveError(message, error.history) from None
 
     def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
-        found = self._assess(posterior, pair).evidence
+        found = self._assess(posterior, pair)[1].evidence
         return found.log_evidence, found.error
 
 
@@ -196,6 +213,31 @@ def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate
     """Return the posterior of a candidate."""
     sigma = noise.sigma(data.values, data.sigma)
     return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
+
+
+def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
+    """Let solves of a model with states start from its tangent at a point (d,), by default the mean of the prior."""
+    if posterior.start is None and point is not None:
+        return posterior  # a model without states, or without an answer at the mean
+    try:
+        start = linearise(posterior.inputs, posterior.evaluate, point).prediction
+    except SolveError:
+        return posterior
+    return replace(posterior, start=start)
+
+
+def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
+    """The same with other errors."""
+    return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
+
+
+def _tests(data: Data) -> tuple[str, ...]:
+    """Names of the tests that were measured."""
+    return tuple(dict.fromkeys(data.tests[: data.values.size]))
+
+
+def _testnames(groups: Mapping[str, Data]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(test for data in groups.values() for test in _tests(data)))
 
 
 def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:

@@ -1,6 +1,13 @@
 """Bodies of which the compiled forms are the same: compiling is what takes time in tests of finite elements."""
 
+from types import SimpleNamespace
+
+import sympy as sp
+
+from forward import kinematics
 from forward.hyperelastic import Hyperelastic
+from forward.materials import MATERIALS as LAWS
+from forward.materials import measures
 
 MATERIALS = {
     "mooney-rivlin": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 2e4, "D1": 2e5},
@@ -8,12 +15,31 @@ MATERIALS = {
     "neo-hookean-coupled": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 2e5},
     "demiray": {"kind": "demiray", "a": 4e4, "b": 1.5, "D1": 2e5},
 }
+NOT_CONSTANTS = ("kind", "fibres")
 # Of these, what differs from the ones above is the energy: it is compared with closed forms.
 MORE_MATERIALS = {
     "yeoh": {"kind": "yeoh", "C10": 2e4, "C20": -2e3, "C30": 1e3, "D1": 2e5},
     "gent": {"kind": "gent", "mu": 4e4, "Jm": 3.0, "D1": 2e5},
     "saint-venant-kirchhoff": {"kind": "saint-venant-kirchhoff", "lmbda": 1e5, "mu": 4e4},
     "blatz-ko": {"kind": "blatz-ko", "mu": 5e4},
+    "ogden": {
+        "kind": "ogden",
+        "mu1": 2e4,
+        "alpha1": 1.5,
+        "mu2": 1e3,
+        "alpha2": 5.0,
+        "mu3": -1e4,
+        "alpha3": -2.0,
+        "D1": 2e5,
+    },
+    "holzapfel-gasser-ogden": {
+        "kind": "holzapfel-gasser-ogden",
+        "c": 2e4,
+        "k1": 1e4,
+        "k2": 0.8,
+        "D1": 2e5,
+        "fibres": ((1.0, 0.0, 0.0),),
+    },
 }
 CELLS = {
     "mooney-rivlin": ("hexahedron", 1),
@@ -23,6 +49,15 @@ CELLS = {
 } | dict.fromkeys(MORE_MATERIALS, ("tetrahedron", 1))
 MIXED = ("neo-hookean mixed", "mooney-rivlin mixed")  # quadratic tetrahedra, quadratic hexahedra
 FORMS = (*MATERIALS, *MIXED)
+SYMPY = SimpleNamespace(
+    ln=sp.log,
+    exp=sp.exp,
+    sqrt=sp.sqrt,
+    positive=lambda x: sp.Piecewise((x, x > 0), (0, True)),
+    tr=sp.trace,
+    det=lambda F: F.det(),
+    inner=lambda a, b: (a.T * b)[0],
+)
 OUTPUTS = (
     {"kind": "max-displacement", "name": "largest"},
     {"kind": "max-displacement", "name": "largest-z", "component": "z"},
@@ -34,6 +69,13 @@ OUTPUTS = (
     {"kind": "volume-change", "name": "volume"},
     {"kind": "max-von-mises", "name": "stress"},
 )
+
+
+def energy_density(kind, F, fibres=(), **constants):
+    """Energy density by SymPy of a deformation gradient, in symbols or numbers; not of principal stretches."""
+    known = dict(zip(("I1", "I2", "J"), kinematics.invariants(SYMPY, F), strict=True))
+    known["I4"] = tuple(kinematics.fibre_stretch(SYMPY, F, sp.Matrix(fibre)) for fibre in fibres)
+    return LAWS[kind](SYMPY, *(known[name] for name in measures(kind)), **constants)
 
 
 def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **changes):

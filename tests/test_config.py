@@ -1,8 +1,10 @@
 """Studies: reading, checking, writing."""
 
+import json
 import tomllib
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 from forward.geometry import Box
@@ -11,9 +13,10 @@ from forward.loads import Gravity
 from forward.outputs import MaxDisplacement
 from uq.distributions import Normal, Uniform
 from uq.monte_carlo import MonteCarlo
-from workflows.config import Study, StudyError, differences, document, dump, load, parse
+from workflows.__main__ import main
+from workflows.config import Study, StudyError, differences, document, dump, load, parse, schema
 from workflows.plan import plan
-from workflows.starter import starter
+from workflows.starter import _METHODS, starter
 
 CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.toml"))
 
@@ -258,3 +261,44 @@ def test_tails_may_not_reach_the_impossible():
     study = blocks()
     study["parameters"]["material.D1"] = {"kind": "normal", "mean": 3e5, "std": 2e4}
     assert parse(study).parameters["material.D1"] == Normal(mean=3e5, std=2e4)
+
+
+@pytest.fixture(scope="module")
+def validator():
+    found = schema()
+    jsonschema.Draft202012Validator.check_schema(found)
+    return jsonschema.Draft202012Validator(found)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
+def test_shipped_studies_fit_the_schema(validator, path):
+    validator.validate(tomllib.loads(path.read_text()))
+
+
+@pytest.mark.parametrize("kind", [*_METHODS])
+def test_starters_and_dumps_fit_the_schema(validator, kind):
+    validator.validate(tomllib.loads(starter(kind)))
+    validator.validate(document(parse(tomllib.loads(starter(kind)))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        put("method", "sampels", 5),
+        put("model", "body", "degree", 3),
+        put("model", "material", "D1", -1.0),
+        put("model", "material", "kind", "jelly"),
+        put("parameters", "material.D1", {"kind": "uniform", "lower": 0.0}),
+        put("model", {"kind": "python", "function": "f", "parameters": {}, "outputs": []}),
+        put("method", {"kind": "compare", "methods": [{"kind": "monte-carlo", "budgets": [8], "samples": 8}]}),
+    ],
+)
+def test_the_schema_refuses_mistakes(validator, change):
+    document_ = blocks()
+    change(document_)
+    assert not validator.is_valid(document_)
+
+
+def test_the_command_prints_the_schema(capsys):
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == schema()

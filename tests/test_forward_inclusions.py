@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 
 from forward import fenicsx
 from forward.conformance import EXACT, check_derivatives
+from forward.inclusions import Ellipsoid, Sphere, derived
 from tests.bodies import MATERIALS, loaded_body
 
 pytestmark = pytest.mark.fem
@@ -94,3 +96,79 @@ def test_without_inclusions_forms_stay_the_same(material):
     body = loaded_body(material).build(MPI.COMM_SELF, ()).body
     assert body.stiffness_factor == 1
     assert "tanh" not in str(body.stored_energy)
+
+
+# --- ellipsoids ------------------------------------------------------------------------------------------------------
+
+TURNED = {
+    "kind": "ellipsoid",
+    "name": "tumour",
+    "x": 0.55,
+    "y": 0.3,
+    "z": 0.45,
+    "a": 0.4,
+    "b": 0.3,
+    "c": 0.2,
+    "turn_x": 0.3,
+    "turn_y": -0.2,
+    "turn_z": 0.5,
+    "contrast": 8.0,
+    "width": 0.15,
+}
+PLACES = np.random.default_rng(0).uniform(0, 0.8, (400, 3))
+
+
+def factor(inclusion, places):
+    spec = Ellipsoid.model_validate(inclusion) if inclusion.get("kind") == "ellipsoid" else Sphere(**inclusion)
+    found = derived([spec], (), np.zeros((1, 0)), places)
+    return np.array([found[f"stiffness.{i}"][0] for i in range(len(places))])
+
+
+def test_derivatives_in_every_number_of_an_ellipsoid():
+    numbers = [name for name in TURNED if name not in {"kind", "name"}]
+    paths = tuple(f"inclusions.tumour.{number}" for number in numbers)
+    outputs = ({"kind": "mean-displacement", "name": "mean", "on": "x-max", "component": "y"},)
+    spec = loaded_body("neo-hookean-coupled", body=BODY, inclusions=(TURNED,), outputs=outputs)
+    point = np.array([TURNED[number] for number in numbers])
+    scale = np.where(np.char.startswith(numbers, "turn"), 0.3, 0.1 * np.abs(point))
+    model = spec.build(MPI.COMM_SELF, paths)
+    for at in (point, np.where(np.char.startswith(numbers, "turn"), 0.0, point)):  # also where nothing is turned
+        found = check_derivatives(model, at, scale, steps=(1 / 32, 1 / 64, 1 / 128), noise=1e-13)
+        assert found.mistakes() == ()
+        assert found.adjoint.max() <= EXACT
+
+
+def test_an_ellipsoid_of_equal_radii_is_a_sphere():
+    ball = TURNED | {"a": 0.3, "b": 0.3, "c": 0.3}
+    np.testing.assert_allclose(factor(ball, PLACES), factor(TUMOUR, PLACES), rtol=1e-12)
+
+
+def test_an_ellipsoid_is_turned_as_its_rotation_vector_says():
+    rotation = Rotation.from_rotvec([TURNED[f"turn_{axis}"] for axis in "xyz"])
+    centre = np.array([TURNED[axis] for axis in "xyz"])
+    straight = TURNED | dict.fromkeys(("turn_x", "turn_y", "turn_z"), 0.0)
+    np.testing.assert_allclose(factor(TURNED, centre + rotation.apply(PLACES)), factor(straight, centre + PLACES))
+    # On the surface the indicator is ½, and its slope is that of a transition of the given width.
+    directions = PLACES / np.linalg.norm(PLACES, axis=1)[:, None]
+    normal = directions / [0.4, 0.3, 0.2]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    surface = centre + rotation.apply(directions * [0.4, 0.3, 0.2])
+    s = np.log(factor(TURNED, surface)) / np.log(8)
+    np.testing.assert_allclose(s, 0.5, atol=1e-9)
+    h = 1e-6
+    slope = (np.log(factor(TURNED, surface + h * rotation.apply(normal))) / np.log(8) - s) / h
+    np.testing.assert_allclose(slope, -0.5 / 0.15, rtol=0.05)
+
+
+def test_what_follows_from_the_numbers():
+    bodies = (Ellipsoid.model_validate(TURNED), Sphere(**GAP))
+    points = np.array([[0.5, 2.0], [0.1, 4.0]])
+    found = derived(bodies, ("inclusions.tumour.b", "inclusions.gap.contrast"), points, np.array([[0.55, 0.3, 0.45]]))
+    np.testing.assert_allclose(found["inclusions.tumour.volume"], 4 / 3 * np.pi * 0.4 * 0.2 * points[:, 0])
+    np.testing.assert_allclose(found["inclusions.gap.volume"], 4 / 3 * np.pi * 0.2**3)
+    expected = [
+        factor(TURNED | {"b": b}, np.array([[0.55, 0.3, 0.45]]))
+        * factor(GAP | {"contrast": k}, np.array([[0.55, 0.3, 0.45]]))
+        for b, k in points
+    ]
+    np.testing.assert_allclose(found["stiffness.0"], np.concatenate(expected))

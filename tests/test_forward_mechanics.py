@@ -1,7 +1,5 @@
 """Equilibria against closed forms, published values and balances; the closed forms read the same energies by SymPy."""
 
-from types import SimpleNamespace
-
 import mpmath
 import numpy as np
 import pytest
@@ -15,37 +13,69 @@ from forward.functionals import functional
 from forward.hyperelastic import Hyperelastic
 from forward.layout import Layout
 from forward.newton import solve
-from tests.bodies import CELLS, FORMS, MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, unloaded_body
+from tests.bodies import (
+    CELLS,
+    FORMS,
+    MATERIALS,
+    MIXED,
+    MORE_MATERIALS,
+    NOT_CONSTANTS,
+    OUTPUTS,
+    SYMPY,
+    energy_density,
+    unloaded_body,
+)
 
 pytestmark = pytest.mark.fem
-OPS = SimpleNamespace(ln=sp.log, exp=sp.exp, sqrt=sp.sqrt, tr=sp.trace, det=lambda F: F.det())
 SIZE = (1.0, 0.7, 0.8)
 VOLUME = float(np.prod(SIZE))
 ALL_MATERIALS = MATERIALS | MORE_MATERIALS
 
 
+def rationals(block):
+    return {name: sp.Rational(str(value)) for name, value in block.items() if name not in NOT_CONSTANTS}
+
+
 def exact(material, F):
-    """Energy density, nominal stress P and von Mises stress of a homogeneous deformation, by SymPy to 30 digits."""
+    """Energy density, nominal stress P and von Mises stress of a homogeneous deformation, to 30 digits."""
     material = material.split()[0]
-    symbols = sp.Matrix(3, 3, sp.symbols("F:9"))
     block = ALL_MATERIALS[material]
-    constants = {name: sp.Rational(str(value)) for name, value in block.items() if name != "kind"}
-    W = materials.MATERIALS[material](OPS, *kinematics.invariants(OPS, symbols), **constants)
+    if material == "ogden":
+        return of_stretches(block, F)
+    symbols = sp.Matrix(3, 3, sp.symbols("F:9"))
+    W = energy_density(material, symbols, block.get("fibres", ()), **rationals(block))
     at = {s: sp.Float(str(f), 30) for s, f in zip(symbols, np.ravel(F), strict=True)}
     P = sp.Matrix(3, 3, lambda i, j: sp.diff(W, symbols[i, j])).evalf(30, subs=at)
     F = symbols.evalf(30, subs=at)
     cauchy = P * F.T / F.det()
-    stress = kinematics.von_mises(OPS, cauchy, sp.eye(3))
+    stress = kinematics.von_mises(SYMPY, cauchy, sp.eye(3))
     return float(W.evalf(30, subs=at)), np.array(P, dtype=float), float(stress), float(F.det())
+
+
+def of_stretches(block, F):
+    """The same of an energy of principal stretches, from the eigenvectors of C: P = F Σ ∂W/∂λ_k n_k⊗n_k / λ_k."""
+    l = sp.symbols("l1:4", positive=True)
+    W = materials.MATERIALS[block["kind"]](SYMPY, *l, l[0] * l[1] * l[2], **rationals(block))
+    functions = sp.lambdify([l], [W, *(W.diff(stretch) for stretch in l)], "mpmath")
+    with mpmath.workdps(30):
+        F = mpmath.matrix([[mpmath.mpf(str(f)) for f in row] for row in np.asarray(F).tolist()])
+        squares, n = mpmath.eigsy(F.T * F)
+        stretches = [mpmath.sqrt(square) for square in squares]
+        energy, *slopes = functions(stretches)
+        P = F * n * mpmath.diag([s / stretch for s, stretch in zip(slopes, stretches, strict=True)]) * n.T
+        cauchy = sp.Matrix((P * F.T / mpmath.det(F)).tolist())
+        stress = kinematics.von_mises(SYMPY, cauchy, sp.eye(3))
+        return float(energy), np.array(P.tolist(), dtype=float), float(stress), float(mpmath.det(F))
 
 
 def lateral_stretch(material, stretches):
     """Stretches with those that are None chosen (equal) so that their stress vanishes."""
-    material = material.split()[0]
+    block = ALL_MATERIALS[material.split()[0]]
     free = sp.Symbol("free", positive=True)
-    F = sp.diag(*(free if s is None else sp.Rational(str(s)) for s in stretches))
-    constants = {name: sp.Rational(str(v)) for name, v in ALL_MATERIALS[material].items() if name != "kind"}
-    W = materials.MATERIALS[material](OPS, *kinematics.invariants(OPS, F), **constants)
+    a, b, c = (free if s is None else sp.Rational(str(s)) for s in stretches)
+    fibres = (a**2,) if "fibres" in block else ()  # along x
+    law = materials.MATERIALS[block["kind"]]
+    W = law(SYMPY, *materials.measured(law, (a, b, c), a * b * c, fibres).values(), **rationals(block))
     with mpmath.workdps(30):
         value = float(mpmath.findroot(sp.lambdify(free, sp.diff(W, free), "mpmath"), 1))
     return [value if s is None else s for s in stretches]
@@ -87,7 +117,7 @@ def test_homogeneous_stretches(material, stretches):
     force = P[0, 0] * SIZE[1] * SIZE[2]
     expected = [force, -force, W * VOLUME, J - 1, (F[2, 2] - 1) * SIZE[2]]
     np.testing.assert_allclose(found[:-1], expected, rtol=1e-10)
-    assert found[-1] == pytest.approx(stress, rel=1e-10, abs=1e-9)  # it vanishes where only the volume changes
+    assert found[-1] == pytest.approx(stress, rel=1e-10, abs=1e-7)  # it vanishes where only the volume changes
 
 
 class MovedBoundary(Discretisation):
@@ -138,7 +168,7 @@ def test_affine_deformations(material, deformation):
         pressure = 2 * MATERIALS[material.split()[0]]["D1"] * (J - 1)
         np.testing.assert_allclose(u[len(places.ravel()) :], pressure, rtol=1e-9, atol=1e-6)
     forces = [*(P[:, 1] * SIZE[0] * SIZE[2]), *(-P[:, 2] * SIZE[0] * SIZE[1])]
-    np.testing.assert_allclose(found, [*forces, W * VOLUME, J - 1, stress], rtol=1e-10, atol=1e-8)
+    np.testing.assert_allclose(found, [*forces, W * VOLUME, J - 1, stress], rtol=1e-10, atol=1e-6)
 
 
 def test_strain_energy_of_libceed():

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from forward.hyperelastic import Hyperelastic
-from forward.materials import MATERIALS, constants
+from forward.materials import MATERIALS, constants, measures
 from forward.newton import SolverSettings
 
 BLOCKS = {
@@ -92,12 +92,12 @@ def test_the_specification_without_mistakes_is_accepted():
         ({"body": BLOCK, "clamp": ("left",)}, "clamp.0", "unknown boundary"),
         ({"inclusions": (TUMOUR | {"y": 1.1},)}, "inclusions.0", "centre lies outside the body, which lies in [0, 1]"),
         ({"inclusions": (TUMOUR, TUMOUR)}, "inclusions", "2 of them are called 'tumour'"),
-        ({"inclusions": (TUMOUR | {"contrast": 0.0},)}, "inclusions.0.contrast", "greater than 0"),
-        ({"inclusions": (TUMOUR | {"radius": 0.0},)}, "inclusions.0.radius", "greater than 0"),
-        ({"inclusions": (TUMOUR | {"width": 0.0},)}, "inclusions.0.width", "greater than 0"),
-        ({"inclusions": (TUMOUR | {"kind": "cube"},)}, "inclusions.0.kind", "'sphere'"),
-        ({"inclusions": (TUMOUR | {"name": "a.b"},)}, "inclusions.0.name", "pattern"),
-        ({"inclusions": (TUMOUR | {"raduis": 0.1},)}, "inclusions.0.raduis", "did you mean 'radius'"),
+        ({"inclusions": (TUMOUR | {"contrast": 0.0},)}, "inclusions.0.sphere.contrast", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"radius": 0.0},)}, "inclusions.0.sphere.radius", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"width": 0.0},)}, "inclusions.0.sphere.width", "greater than 0"),
+        ({"inclusions": (TUMOUR | {"kind": "cube"},)}, "inclusions.0", "'sphere', 'ellipsoid'"),
+        ({"inclusions": (TUMOUR | {"name": "a.b"},)}, "inclusions.0.sphere.name", "pattern"),
+        ({"inclusions": (TUMOUR | {"raduis": 0.1},)}, "inclusions.0.sphere.raduis", "did you mean 'radius'"),
         ({"solver": {"tolerance": 0.0}}, "solver.tolerance", "greater than 0"),
         ({"formulation": "mixd"}, "formulation", "'displacement', 'mixed' or 'auto'"),
         ({"formulation": "mixed", "body": BLOCKS["body"] | {"degree": 1}}, "formulation", "expected body.degree = 2"),
@@ -186,7 +186,9 @@ def test_a_specification_cannot_be_changed():
 @pytest.mark.parametrize("kind", MATERIALS)
 def test_the_constants_of_a_material_are_the_arguments_of_its_energy(kind):
     values = dict.fromkeys(constants(MATERIALS[kind]), 2.0)
-    spec = Hyperelastic.model_validate(BLOCKS | {"material": {"kind": kind} | values})
+    fibres = {"fibres": [[0.0, 3.0, 4.0]]} if "I4" in measures(kind) else {}
+    spec = Hyperelastic.model_validate(BLOCKS | {"material": {"kind": kind} | values | fibres})
+    assert spec.fibres == (((0.0, 0.6, 0.8),) if fibres else ())
     assert [path for path in spec.scalars if path.startswith("material.")] == [f"material.{name}" for name in values]
 
 

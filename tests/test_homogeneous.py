@@ -5,9 +5,9 @@ import pytest
 from mpi4py import MPI
 from pydantic import ValidationError
 
-from forward.homogeneous import ENERGIES, HomogeneousModel, MaterialTest
+from forward.homogeneous import HomogeneousModel, MaterialTest
 from forward.hyperelastic import Hyperelastic
-from forward.materials import constants, small_strain_moduli
+from forward.materials import MATERIALS, constants, measures, small_strain_moduli
 from forward.model import SolveError
 
 VALUES: dict[str, dict[str, float]] = {
@@ -20,9 +20,10 @@ VALUES: dict[str, dict[str, float]] = {
     "saint-venant-kirchhoff": {"mu": 1e4, "lmbda": 2e4},
     "blatz-ko": {"mu": 1e4},
     "ogden": {"mu1": 1e4, "alpha1": 1.5, "mu2": -2e3, "alpha2": -2.0, "mu3": 100.0, "alpha3": 5.0},
+    "holzapfel-gasser-ogden": {"c": 1e4, "k1": 5e3, "k2": 0.8},
 }
 CASES = [*VALUES.items()] + [
-    (kind, values | {"D1": 3e4}) for kind, values in VALUES.items() if "D1" in constants(ENERGIES[kind])
+    (kind, values | {"D1": 3e4}) for kind, values in VALUES.items() if "D1" in constants(MATERIALS[kind])
 ]
 STRETCHES = (0.7, 0.9, 1.1, 1.4)
 TESTS = [
@@ -38,11 +39,13 @@ TESTS = [
 
 
 def model(kind: str, values: dict[str, float], *tests: MaterialTest) -> HomogeneousModel:
-    return HomogeneousModel(kind, values, tests or TESTS, tuple(values))
+    alike = "I4" in measures(kind)
+    chosen = [test for test in tests or TESTS if not (alike and test.mode == "equibiaxial")]
+    return HomogeneousModel(kind, values, chosen, tuple(values), [(1.0, 0.0, 0.0)] if alike else ())
 
 
 def test_every_energy_is_read():
-    assert set(VALUES) == set(ENERGIES)
+    assert set(VALUES) == set(MATERIALS)
 
 
 def test_incompressible_closed_forms():
@@ -94,28 +97,32 @@ def test_derivatives(kind, values):
 )
 def test_small_strains_are_linear_elasticity(kind, values):
     e = 1e-5
-    tests = [MaterialTest(mode=mode, at=(1 + e, 1 - e)) for mode in ("uniaxial", "equibiaxial", "pure-shear")]
+    if "k1" in values:  # fibres, which are not linear at zero
+        values = values | {"k1": 0.0}
+    modes = ("uniaxial", "pure-shear") if "k1" in values else ("uniaxial", "equibiaxial", "pure-shear")
+    tests = [MaterialTest(mode=mode, at=(1 + e, 1 - e)) for mode in modes]
     tests.append(MaterialTest(mode="simple-shear", at=(e, -e)))
-    found = _at(model(kind, values, *tests)).reshape(4, 2)
+    found = _at(model(kind, values, *tests)).reshape(-1, 2)
     slopes = (found[:, 0] - found[:, 1]) / (2 * e)
-    if kind == "ogden":
-        mu, kappa = sum(values[f"mu{k}"] * values[f"alpha{k}"] for k in (1, 2, 3)) / 2, 2 * values.get("D1", np.inf)
-    else:
-        incompressible = "D1" in constants(ENERGIES[kind]) and "D1" not in values
-        mu, kappa = small_strain_moduli(kind, values | ({"D1": 1.0} if incompressible else {}))
-        kappa = np.inf if incompressible else kappa
+    incompressible = "D1" in constants(MATERIALS[kind]) and "D1" not in values
+    mu, kappa = small_strain_moduli(kind, values | ({"D1": 1.0} if incompressible else {}))
+    kappa = np.inf if incompressible else kappa
     nu = 0.5 if np.isinf(kappa) else (3 * kappa - 2 * mu) / (2 * (3 * kappa + mu))
     E = 2 * mu * (1 + nu)
-    np.testing.assert_allclose(slopes, [E, E / (1 - nu), E / (1 - nu**2), mu], rtol=1e-6)
+    expected = {"uniaxial": E, "equibiaxial": E / (1 - nu), "pure-shear": E / (1 - nu**2), "simple-shear": mu}
+    np.testing.assert_allclose(slopes, [expected[test.mode] for test in tests], rtol=1e-6)
 
 
-def test_finite_elements_agree():
+@pytest.mark.fem
+@pytest.mark.parametrize("kind", ["mooney-rivlin", "ogden", "holzapfel-gasser-ogden"])
+def test_finite_elements_agree(kind):
     """A block between smooth plates deforms homogeneously; its force over its area is the stress."""
-    values = {"C1": 1e4, "C2": 2e4, "D1": 5e4}
+    values = VALUES[kind] | {"D1": 5e4}
+    fibres = {"fibres": [[1.0, 0.0, 0.0]]} if "I4" in measures(kind) else {}
     spec = Hyperelastic.model_validate(
         {
             "body": {"kind": "box", "size": [1.0, 1.0, 1.0], "cells": [1, 1, 1], "cell": "hexahedron", "degree": 1},
-            "material": {"kind": "mooney-rivlin"} | values,
+            "material": {"kind": kind} | values | fibres,
             "displacements": [
                 {"on": "x-min", "name": "a", "x": 0.0},
                 {"on": "y-min", "name": "b", "y": 0.0},
@@ -123,12 +130,46 @@ def test_finite_elements_agree():
                 {"on": "x-max", "name": "pull", "x": 0.0},
             ],
             "outputs": [{"name": "force", "kind": "reaction", "on": "x-max", "component": "x"}],
+            "solver": {"tolerance": 1e-12},
         }
     )
-    body = spec.build(MPI.COMM_SELF, ("displacements.pull.x",))
-    pulled = [float(body.solve(np.array([stretch - 1])).outputs[0]) for stretch in STRETCHES]
-    point = model("mooney-rivlin", values, MaterialTest(mode="uniaxial", at=STRETCHES))
-    np.testing.assert_allclose(np.abs(pulled), np.abs(_at(point)), rtol=1e-7)
+    name = next(iter(values))
+    body = spec.build(MPI.COMM_SELF, ("displacements.pull.x", f"material.{name}"))
+    pulled = [body.solve(np.array([stretch - 1, values[name]])) for stretch in STRETCHES]
+    point = model(kind, values, MaterialTest(mode="uniaxial", at=STRETCHES))
+    stress, slopes = point.stresses_and_derivatives(np.array([list(values.values())]))
+    np.testing.assert_allclose([solution.outputs[0] for solution in pulled], stress[0], rtol=1e-10)
+    along = [solution.tangent(np.array([0.0, 1.0]))[0] for solution in pulled]
+    np.testing.assert_allclose(along, slopes[0, :, 0], rtol=1e-9, atol=1e-12)
+
+
+def test_arteries_in_biaxial_tension():
+    """Two families at ± φ to the first stretch: P₁ = c(λ₁ − λ₃²/λ₁) + 4 k₁ λ₁ cos²φ x exp(k₂ x²), x = ⟨I4 − 1⟩."""
+    c, k1, k2, phi = 1e4, 5e3, 0.8, 0.6
+    direction = (np.cos(phi), np.sin(phi), 0.0)
+    mirrored = (np.cos(phi), -np.sin(phi), 0.0)
+    first, second = np.array([1.1, 1.3, 0.8]), np.array([1.05, 0.9, 0.9])
+    test = MaterialTest(mode="biaxial", at=tuple(first), across=tuple(second))
+    it = HomogeneousModel("holzapfel-gasser-ogden", {"c": c, "k1": k1, "k2": k2}, [test], (), (direction, mirrored))
+    x = np.maximum((first * np.cos(phi)) ** 2 + (second * np.sin(phi)) ** 2 - 1, 0)
+    expected = c * (first - 1 / (first**3 * second**2)) + 4 * k1 * first * np.cos(phi) ** 2 * x * np.exp(k2 * x**2)
+    np.testing.assert_allclose(it.stresses(np.zeros((1, 0)))[0], expected, rtol=1e-12)
+
+
+def test_fibres_that_a_test_would_shear_are_refused():
+    values = {"c": 1e4, "k1": 5e3, "k2": 0.8}
+    for mode, fibres, told in (
+        ("uniaxial", [(1.0, 1.0, 0.0)], "would shear"),
+        ("uniaxial", [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0)], "stretch unlike"),
+        ("equibiaxial", [(1.0, 0.0, 0.0)], "stretch unlike"),
+        ("uniaxial", [], "expected fibres"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            HomogeneousModel("holzapfel-gasser-ogden", values, [MaterialTest(mode=mode, at=(1.1,))], (), fibres)
+    for mode, fibres in (("equibiaxial", [(1.0, 1.0, 0.0), (1.0, -1.0, 0.0)]), ("simple-shear", [(1.0, 2.0, 3.0)])):
+        HomogeneousModel("holzapfel-gasser-ogden", values, [MaterialTest(mode=mode, at=(1.1,))], (), fibres)
+    with pytest.raises(ValueError, match="has no fibres"):
+        HomogeneousModel("neo-hookean", {"C1": 1.0}, TESTS, (), [(1.0, 0.0, 0.0)])
 
 
 def test_many_parameter_sets_at_once():

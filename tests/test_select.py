@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.stats import multivariate_normal
 
 from forward.homogeneous import HomogeneousModel, MaterialTest
 from inverse.comparison import Candidate, Data, criticise, probabilities
@@ -140,6 +141,30 @@ def test_left_out_scores_of_a_linear_model():
         assert found.scores[j] == pytest.approx(exact, abs=0.02)
 
 
+def test_whole_tests_are_held_out():
+    """Of a linear model with normal parameters ln p(y_t | others) is normal: a closed form."""
+    priors = {"C1": Normal(mean=2e5, std=1e5), "C2": Normal(mean=0.0, std=1e5)}
+    it = HomogeneousModel("mooney-rivlin", {}, tuple(TESTS), ("C1", "C2"))
+    inputs = Inputs(priors)
+    stress = it.stresses(np.array([[1.8e5, 1e4]]))[0]
+    values = stress * (1 + 0.1 * np.random.default_rng(0).standard_normal(stress.size))
+    labels = tuple(test.label for test in TESTS for _ in test.at)
+    data = Data(values, None, labels, np.concatenate([test.at for test in TESTS]))
+    method = Select(samples=32, noise=Noise(relative=0.1), held_out=True)
+    found = method.run({"one": Candidate(inputs)}, {"all": data}, lambda *pair: SerialEvaluate(it))
+    A = it.stresses_and_derivatives(inputs.mean[None])[1][0] * inputs.std
+    r, sigma = values - it.stresses(inputs.mean[None])[0], 0.1 * np.abs(values)
+    assert found.left_out.values.tolist() == list(MODES)
+    for k in range(3):
+        held = np.arange(values.size) // len(STRETCHES) == k
+        H = np.eye(2) + (A[~held] / sigma[~held, None] ** 2).T @ A[~held]
+        mean = A[held] @ np.linalg.solve(H, A[~held].T @ (r[~held] / sigma[~held] ** 2))
+        exact = multivariate_normal(mean, np.diag(sigma[held] ** 2) + A[held] @ np.linalg.solve(H, A[held].T))
+        assert found["held_out_score"].values[k, 0] == pytest.approx(exact.logpdf(r[held]), abs=1e-6)
+        assert found["held_out_score_error"].values[k, 0] < 1e-6
+    assert found["point_weight"].sum().item() == pytest.approx(1)
+
+
 def test_least_squares_are_modes_with_wide_priors():
     """Yeoh on all of Treloar's tests: the mode is the solution of the normal equations."""
     study = treloar()
@@ -195,6 +220,7 @@ weight = 2
 [method]
 kind = "select"
 samples = 32
+held_out = true
 noise = { relative = 0.1, absolute = 20 }
 """
 TABLE = "# measured by hand\nmode,stretch,stress\nuniaxial,1.1,0.3\nuniaxial,1.2,0.55\nsimple-shear,0.1,0.1\n"
@@ -252,7 +278,7 @@ def test_one_line_for_a_bad_row(small, row, told):
 def test_subsets_are_of_known_tests(small):
     with pytest.raises(StudyError, match=r"method\.subsets\.x: no test has this name; did you mean 'uniaxial'"):
         load(small, ['method.subsets={x = ["uniaxal"]}'])
-    study = load(small, ['method.subsets={x = ["uniaxial"]}', "method.samples=64"])
+    study = load(small, ['method.subsets={x = ["uniaxial"]}', "method.samples=64", "method.held_out=false"])
     assert "evidences   4" in plan(study)
 
 
@@ -280,13 +306,20 @@ def test_a_study_from_the_command_line(small):
     assert done.returncode == 0, done.stderr
     assert (small.parent / "one/results.nc").read_bytes() == (small.parent / "two/results.nc").read_bytes()
     page = (small.parent / "one" / "report.html").read_text()
-    for words in ("Evidences and probabilities", "measured by hand", "Is the best one good?", "data:image/png"):
+    for words in (
+        "Evidences and probabilities",
+        "measured by hand",
+        "Is the best one good?",
+        "predicted from the others",
+        "Posteriors of",
+        "data:image/png",
+    ):
         assert words in page
     again = run(None, TISSUQ, "run", small, "--out", small.parent / "one")
     assert "nothing to do" in again.stdout
     both = run(None, TISSUQ, "report", small.parent / "one", small.parent / "two")
     assert both.returncode == 2
-    assert "compares models" in both.stderr
+    assert "no estimates of outputs" in both.stderr
     found = xr.load_dataset(small.parent / "one" / "results.nc")
     assert found["prior_probability"].to_numpy() == pytest.approx([1 / 3, 2 / 3])
 

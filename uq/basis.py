@@ -120,9 +120,7 @@ def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatAr
     mean, std = marginal.moments
     rule = _rule(marginal)
     if rule is None:
-        import chaospy
-
-        pair = np.asarray(chaospy.construct_recurrence_coefficients(degree, marginal.dist)[0], dtype=float)
+        pair = marginal.recurrence(degree)
         alpha, beta = (pair[0] - mean) / std, pair[1] / std**2
         beta[0] = 1.0
         return alpha, beta

@@ -127,6 +127,24 @@ class Entry(Settings):
                 raise ValueError(message) from None
         return self
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> Any:
+        """Put the keys of each method beside those of the entry, as files have them."""
+        reference = handler(core)
+        entry = handler.resolve_ref_schema(reference)
+        own = {name: entry["properties"][name] for name in ("name", "budgets")}
+        methods = [handler.resolve_ref_schema(m) for m in entry["properties"]["sampling"]["oneOf"]]
+        entry.clear()
+        entry["oneOf"] = [
+            method
+            | {
+                "properties": {k: v for k, v in method["properties"].items() if k not in _NOT_ITS_OWN} | own,
+                "required": ["kind", "budgets"],
+            }
+            for method in methods
+        ]
+        return reference
+
     @model_serializer(mode="wrap")
     def _joined(self, handler: Any) -> dict[str, Any]:
         block: dict[str, Any] = handler(self)

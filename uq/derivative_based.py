@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ModelError, SolveError
 from uq.basis import gauss, hyperbolic, orthonormal
 from uq.chaos import Regression
 from uq.distributions import Distribution, Gamma, LogNormal, Normal, Uniform
@@ -116,7 +116,7 @@ class DerivativeBased(Amount):
             raise ValueError(objection)
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'derivative-based'"
-            raise ValueError(message)
+            raise ModelError(message)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         R = self.scrambles

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Gt
@@ -20,6 +20,9 @@ TAIL = 1e-16  # nearest to 0 and 1 that a probability is taken to a quantile
 class _Distribution(Settings):
     """A distribution of one parameter, in the units of that parameter."""
 
+    closed: ClassVar[bool] = False
+    """Whether chaospy knows the recurrence of the orthogonal polynomials in closed form."""
+
     @abstractmethod
     def _chaospy(self, cp: Any) -> Any:
         """Build the chaospy distribution."""
@@ -34,9 +37,20 @@ class _Distribution(Settings):
     @cached_property
     def moments(self) -> tuple[float, float]:
         """Expected value and standard deviation."""
+        if self.closed:
+            alpha, beta = self.recurrence(1)
+            return float(alpha[0]), float(np.sqrt(beta[1]))
         import chaospy
 
         return float(chaospy.E(self.dist)), float(chaospy.Std(self.dist))
+
+    def recurrence(self, degree: int) -> FloatArray:
+        """Return α and β (2, degree + 1) of the orthogonal polynomials, where `closed`; β_0 has no meaning.
+
+        From π_k+1 = (x − α_k) π_k − β_k π_k−1 (W. Gautschi, Orthogonal Polynomials (2004), theorem 1.27) follow the
+        expected value α_0 and the variance β_1.
+        """
+        return np.asarray(self.dist.ttr(np.arange(degree + 1)), dtype=float).reshape(2, degree + 1)
 
     @cached_property
     def higher_moments(self) -> tuple[float, float]:
@@ -92,6 +106,7 @@ class _Bounded(_Distribution):
 class Uniform(_Bounded):
     """Uniform on [lower, upper]."""
 
+    closed: ClassVar[bool] = True
     kind: Literal["uniform"] = "uniform"
 
     def _chaospy(self, cp: Any) -> Any:
@@ -141,6 +156,7 @@ class Triangular(_Bounded):
 class Beta(_Bounded):
     """Beta(a, b) stretched to [lower, upper]."""
 
+    closed: ClassVar[bool] = True
     kind: Literal["beta"] = "beta"
     a: PositiveFloat
     b: PositiveFloat
@@ -163,6 +179,7 @@ class TruncatedNormal(_Bounded):
 class Normal(_Distribution):
     """Normal with `mean` and standard deviation `std`."""
 
+    closed: ClassVar[bool] = True
     kind: Literal["normal"] = "normal"
     mean: float
     std: PositiveFloat
@@ -179,6 +196,7 @@ class Normal(_Distribution):
 class LogNormal(_Distribution):
     """Log-normal, given by the `mean` and the standard deviation `std` of the parameter itself."""
 
+    closed: ClassVar[bool] = True
     kind: Literal["log-normal"] = "log-normal"
     mean: PositiveFloat
     std: PositiveFloat
@@ -202,6 +220,7 @@ class LogNormal(_Distribution):
 class Gamma(_Distribution):
     """Gamma with `shape` and `scale`, starting at `shift`: mean shift + shape·scale."""
 
+    closed: ClassVar[bool] = True
     kind: Literal["gamma"] = "gamma"
     shape: PositiveFloat
     scale: PositiveFloat

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from forward.model import ForwardModel
+from forward.model import ForwardModel, ModelError
 from uq.checkpoint import Checkpoint
 from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
@@ -319,9 +319,12 @@ def _abort_all(world: Any) -> Iterator[None]:
     """An exception that only one rank knows of would leave the others waiting for ever: print it and stop them all."""
     try:
         yield
-    except Exception:
+    except Exception as error:
         if world.size == 1:
             raise
-        traceback.print_exc()
+        if isinstance(error, ModelError):
+            sys.stderr.write(f"failed: {error}\n")
+        else:
+            traceback.print_exc()
         sys.stderr.flush()
         world.Abort(1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from forward.settings import Settings
 from uq.evaluate import Evaluate, Prediction, Request
 from uq.inputs import Inputs
@@ -62,8 +62,8 @@ class _StateAndSlopes:
         return lambda solution, _: np.vstack([solution.state, solution.state_tangent(directions)])
 
 
-def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
-    """Solve at the mean parameters, with all derivatives that the model has (of the state, up to `MANY`).
+def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = None) -> Linearisation:
+    """Solve at a point (d,), by default the mean parameters, with all derivatives (of the state, up to `MANY`).
 
     Raises
     ------
@@ -72,14 +72,17 @@ def linearise(inputs: Inputs, evaluate: Evaluate) -> Linearisation:
     """
     derivatives = evaluate.differentiable
     slopes = derivatives and len(evaluate.parameters) <= MANY
-    found = evaluate(Request(inputs.mean[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
+    centre = inputs.mean if point is None else point
+    found = evaluate(Request(centre[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
     for failure in found.failures:
-        message = f"the model has no answer at the mean parameters: {failure.reason}"
+        message = (
+            f"the model has no answer at {'the mean' if point is None else 'the given'} parameters: {failure.reason}"
+        )
         raise SolveError(message, failure.history)
     m, d = len(evaluate.outputs), len(evaluate.parameters)
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
-    return Linearisation(inputs.mean, found.outputs[0], tangents, fields[0], fields[1:])
+    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:])
 
 
 class LocalSensitivity(Settings):
@@ -106,7 +109,7 @@ class LocalSensitivity(Settings):
         """
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
-            raise ValueError(message)
+            raise ModelError(message)
         return local_dataset(inputs, evaluate, linearise(inputs, evaluate), fields=True)
 
 

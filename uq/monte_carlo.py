@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
@@ -105,7 +105,7 @@ class SensitivityMonteCarlo(MonteCarlo):
         """
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'sensitivity-monte-carlo'"
-            raise ValueError(message)
+            raise ModelError(message)
         return _sample(self, inputs, evaluate, control=(self.coefficient, self.second_moment))
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, ModelError, SolveError
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
@@ -114,7 +114,7 @@ class MultilevelMonteCarlo(Amount):
         """
         if self.control != "none" and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
-            raise ValueError(message)
+            raise ModelError(message)
         recorder = Recorder(evaluate)
         meshes = [_Mesh(self, inputs, recorder, None)]
         while len(meshes) < min(self.levels, FIRST_MESHES):

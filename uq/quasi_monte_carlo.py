@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from uq.chaos import FULL, ROWS_PER_TERM, Deviations, fit_deviations
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.inputs import Inputs
@@ -143,7 +143,7 @@ class QuasiMonteCarlo(MonteCarlo):
             raise ValueError(objection)
         if self.control != "none" and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
-            raise ValueError(message)
+            raise ModelError(message)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
         control = None

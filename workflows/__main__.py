@@ -1,4 +1,4 @@
-"""The command line: tissuq check | run | report | init."""
+"""The command line: tissuq check | run | report | serve | init | schema."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from workflows.config import AnyStudy
 
 # One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -26,12 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 done; 1 failed, with one line that says why; 2 bad study or arguments; 3 finished, but some solves failed.
     """
     options = _parser().parse_args(arguments)
-    from forward.model import SolveError
+    from forward.model import ModelError, SolveError
     from workflows.config import StudyError
 
     try:
         return int(options.command(options))
-    except StudyError as error:
+    except (StudyError, ModelError) as error:
         _say(str(error))
         return BAD
     except (SolveError, FileNotFoundError, PermissionError) as error:
@@ -68,8 +72,9 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("check", help="validate a study and print what it will cost")
     run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
     report = commands.add_parser("report", help="build the report of results again; several are compared side by side")
+    serve = commands.add_parser("serve", help="serve the model of a study to other programs by UM-Bridge")
     init = commands.add_parser("init", help="print a commented starter study")
-    for command in (check, run):
+    for command in (check, run, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
         command.add_argument(
             "--set",
@@ -80,29 +85,41 @@ def _parser() -> argparse.ArgumentParser:
         )
     run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
+    serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 takes requests of other machines too")
+    serve.add_argument("--quiet", action="store_true", help="print nothing but errors")
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
+    schema = commands.add_parser("schema", help="print the JSON Schema of study files, for editors")
     init.add_argument("kind", metavar="KIND", help="a method.kind, such as chaos; `tissuq init list` names them all")
     check.set_defaults(command=_check)
     run.set_defaults(command=_run)
     report.set_defaults(command=_report)
+    serve.set_defaults(command=_serve)
     init.set_defaults(command=_init)
+    schema.set_defaults(command=_schema)
     return parser
 
 
-def _check(options: argparse.Namespace) -> int:
+def _load(options: argparse.Namespace) -> AnyStudy:
+    """Read the study; modules of its model are found beside it and in the working directory."""
     from workflows.config import load
-    from workflows.plan import plan
 
     study = load(options.study, options.set)
+    sys.path[:0] = [str(options.study.resolve().parent), str(Path.cwd())]
+    return study
+
+
+def _check(options: argparse.Namespace) -> int:
+    from workflows.plan import plan
+
+    study = _load(options)
     sys.stdout.write("\n".join([f"{options.study}: a valid study", *plan(study)]) + "\n")
     return DONE
 
 
 def _run(options: argparse.Namespace) -> int:
-    from workflows.config import load
-
-    study = load(options.study, options.set)
+    study = _load(options)
     from workflows.study import run
 
     return run(study, options.study.stem, options.out or Path("results") / options.study.stem, quiet=options.quiet)
@@ -118,10 +135,31 @@ def _report(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _serve(options: argparse.Namespace) -> int:
+    from workflows.config import Study, StudyError
+    from workflows.serve import serve
+
+    study = _load(options)
+    if not isinstance(study, Study):
+        message = f"{options.study}: compares models, expected a study of one model to serve"
+        raise StudyError(message)
+    serve(study, options.port, options.host, quiet=options.quiet)
+    return DONE
+
+
 def _init(options: argparse.Namespace) -> int:
     from workflows.starter import starter
 
     sys.stdout.write(starter(options.kind))
+    return DONE
+
+
+def _schema(options: argparse.Namespace) -> int:
+    import json
+
+    from workflows.config import schema
+
+    sys.stdout.write(json.dumps(schema(), indent=2, ensure_ascii=False) + "\n")
     return DONE
 
 

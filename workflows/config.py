@@ -5,12 +5,14 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.hyperelastic import Hyperelastic
+from forward.external import PythonModel, UmBridgeModel
+from forward.hyperelastic import Hyperelastic, Mistake, Scalar
+from forward.model import ModelError
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
@@ -23,8 +25,16 @@ from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import Comparison
 
+    AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
+
+Model = Annotated[
+    Hyperelastic | PythonModel | UmBridgeModel,
+    Field(discriminator="kind"),
+    BeforeValidator(lambda given: {"kind": "hyperelastic"} | given if isinstance(given, dict) else given),
+]
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
 ]
@@ -68,7 +78,7 @@ class Study(Settings):
     Parameters
     ----------
     model
-        The body.
+        A body, or a model of another program.
     parameters
         Distributions by the paths of the numbers of the model that they override; may be left out where the model has
         random fields, whose coefficients are parameters by themselves.
@@ -80,7 +90,7 @@ class Study(Settings):
         Use of ranks.
     """
 
-    model: Hyperelastic
+    model: Model
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Method
@@ -94,14 +104,23 @@ class Study(Settings):
         return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
-    def meshes(self) -> tuple[Hyperelastic, ...]:
-        """The model, and the same on the finer meshes that a multilevel method may use."""
-        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
-        return self.model, *(self.model.refined(level) for level in range(1, levels))
+    def body(self) -> Hyperelastic | None:
+        """The model, if it is a body."""
+        return self.model if isinstance(self.model, Hyperelastic) else None
 
     @property
-    def models(self) -> tuple[Hyperelastic, ...]:
+    def meshes(self) -> tuple[Hyperelastic, ...]:
+        """The body, and the same on the finer meshes that a multilevel method may use."""
+        if self.body is None:
+            return ()
+        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
+        return self.body, *(self.body.refined(level) for level in range(1, levels))
+
+    @property
+    def models(self) -> tuple[Hyperelastic | PythonModel | UmBridgeModel, ...]:
         """The models that the method may ask for, in the order of their numbers."""
+        if not isinstance(self.model, Hyperelastic):
+            return (self.model,) * 3 if isinstance(self.method, Compare) else (self.model,)
         if not isinstance(self.method, Compare):
             return self.meshes
         solver = self.model.solver
@@ -117,26 +136,19 @@ class Study(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Study:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                "Study",
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given
-                    )
-                    for place, m, given in mistakes
-                ],
-            )
+        refused("Study", list(self._mistakes()))
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         try:
             _ = self.models
         except ValidationError as error:
             message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
+        except ModelError as error:
+            yield ("method", "kind"), str(error), self.method.kind
         yield from self._mistakes_of_parameters()
+        yield from self._mistakes_without_body()
         try:
             inputs = self.inputs
         except ValueError as error:
@@ -155,32 +167,37 @@ class Study(Settings):
         if isinstance(self.method, Compare):
             yield from self._compare_mistakes(self.method)
 
-    def _mistakes_of_parameters(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         scalars = self.model.scalars
-        if not self.parameters and not self.model.fields:
-            yield ("parameters",), "no parameter is random, expected at least one, or one of model.fields", {}
-        if self.model.fields and isinstance(self.method, MultilevelMonteCarlo):
+        fields = self.body.fields if self.body is not None else ()
+        if not self.parameters and not fields:
+            or_field = ", or one of model.fields" if self.body is not None else ""
+            yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
+        if fields and isinstance(self.method, MultilevelMonteCarlo):
             message = "random fields have other coefficients on every mesh, expected a method with one mesh"
             yield ("model", "fields"), message, self.method.kind
-        for i, field in enumerate(self.model.fields):
+        for i, field in enumerate(fields):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        for path, distribution in self.parameters.items():
-            if path not in scalars:
-                yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
-                continue
-            ends = distribution.support
-            if ends is None:
-                ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-            for end in ends:
-                objection = scalars[path].objection(end)
-                if objection is not None:
-                    message = f"reaches {end:.4g}, where the model is impossible ({objection})"
-                    yield ("parameters", path), message, distribution.model_dump()
-                    break
+        yield from mistakes_of_parameters(scalars, self.parameters)
 
-    def _compare_mistakes(self, method: Compare) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes_without_body(self) -> Iterator[Mistake]:
+        """What only a body has: meshes, a solver, ranks that share it."""
+        if self.body is not None:
+            return
+        kind = self.model.kind
+        if isinstance(self.method, MultilevelMonteCarlo | MultilevelChaos):
+            what = "meshes" if isinstance(self.method, MultilevelMonteCarlo) else "iterations of a solver"
+            message = f"a model of kind '{kind}' has no {what}, expected another method"
+            yield ("method", "kind"), message, self.method.kind
+        if isinstance(self.method, Compare) and self.method.mesh_error:
+            yield ("method", "mesh_error"), f"a model of kind '{kind}' has no mesh, expected false", True
+        if self.parallel.ranks_per_model > 1:
+            message = f"a model of kind '{kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+
+    def _compare_mistakes(self, method: Compare) -> Iterator[Mistake]:
         for i, entry in enumerate(method.methods):
             shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
             if shortage is not None:
@@ -192,7 +209,36 @@ class Study(Settings):
                 yield ("method", "reference", "values"), message, list(given)
 
 
-def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> Study | Selection:
+def refused(title: str, mistakes: Sequence[Mistake]) -> None:
+    """Raise what pydantic raises, if there are mistakes."""
+    if mistakes:
+        raise ValidationError.from_exception_data(
+            title,
+            [
+                InitErrorDetails(type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given)
+                for place, m, given in mistakes
+            ],
+        )
+
+
+def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible."""
+    for path, distribution in parameters.items():
+        if path not in scalars:
+            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        ends = distribution.support
+        if ends is None:
+            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        for end in ends:
+            objection = scalars[path].objection(end)
+            if objection is not None:
+                message = f"reaches {end:.4g}, where the model is impossible ({objection})"
+                yield ("parameters", path), message, distribution.model_dump()
+                break
+
+
+def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> AnyStudy:
     """Check a document and make a study of it.
 
     Parameters
@@ -202,7 +248,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     overrides
         Assignments such as ``method.samples=512`` that come on top; values are TOML, or else plain text.
     folder
-        Where tables of data are that it names.
+        Where tables of data and meshes are that it names.
 
     Raises
     ------
@@ -213,16 +259,32 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     for assignment in overrides:
         _override(blocks, assignment)
     try:
-        if isinstance(blocks.get("method"), Mapping) and blocks["method"].get("kind") == "select":
-            from workflows.selection import Selection, expanded
+        blocks = _located(blocks, folder)
+        kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
+        if kind in {"invert", "synthesize"}:
+            from workflows.inversion import made
 
-            return Selection.model_validate(expanded(blocks, folder))
+            return made(blocks, folder)
+        if kind == "select":
+            from workflows import selection
+
+            return selection.made(blocks, folder)
         return Study.model_validate(blocks)
     except ValidationError as error:
         raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
+def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Say in full where the file of a mesh is, which the study names from where it stands itself."""
+    model = blocks.get("model")
+    body = model.get("body") if isinstance(model, Mapping) else None
+    file = body.get("file") if isinstance(body, Mapping) else None
+    if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
+        return blocks
+    return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
+
+
+def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -238,12 +300,29 @@ def load(path: Path, overrides: Sequence[str] = ()) -> Study | Selection:
     return parse(document, overrides, path.parent)
 
 
-def document(study: Study | Selection) -> dict[str, Any]:
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema of a study file, by which editors complete and check it."""
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import DataFile, Selection
+    from workflows.specimen_selection import DisplacementFile, SpecimenSelection
+
+    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection | SpecimenSelection | Inversion | Synthesis)
+    found = adapter.json_schema(ref_template="#/$defs/{model}")
+    # A file may name a table in place of the data themselves.
+    for name, file in (("Selection", DataFile), ("SpecimenSelection", DisplacementFile)):
+        table = TypeAdapter(file).json_schema(ref_template="#/$defs/{model}")
+        found["$defs"] |= table.pop("$defs", {}) | {file.__name__: table}
+        data = found["$defs"][name]["properties"]
+        data["data"] = {"anyOf": [data["data"], {"$ref": f"#/$defs/{file.__name__}"}]}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A study of tissuq"} | found
+
+
+def document(study: AnyStudy) -> dict[str, Any]:
     """Return the blocks of a study, complete with defaults: `parse(document(study)) == study`."""
     return study.model_dump(mode="json", exclude_none=True)
 
 
-def dump(study: Study | Selection) -> str:
+def dump(study: AnyStudy) -> str:
     """Write a study as TOML, complete with defaults."""
     import tomli_w
 
@@ -251,14 +330,22 @@ def dump(study: Study | Selection) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """List what changed between two documents, one line for each place; how ranks are used does not count."""
+    """List what changed between two documents, one line for each place.
+
+    How ranks are used does not count, nor where a mesh is, as long as it is the same.
+    """
     before, after = (dict(_leaves({k: v for k, v in d.items() if k != "parallel"})) for d in (old, new))
+    if before.get(_MESH) == after.get(_MESH) is not None:
+        after |= {"model.body.file": before["model.body.file"]}
     places = [*before, *(place for place in after if place not in before)]
     return [
         f"{place}: {before.get(place, 'absent')} → {after.get(place, 'absent')}"
         for place in places
         if before.get(place) != after.get(place)
     ]
+
+
+_MESH = "model.body.contents.digest"
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -341,10 +428,10 @@ def _kinds() -> set[str]:
     """Return the kinds of blocks, which pydantic puts into the places of errors."""
     from typing import get_args
 
-    from forward import geometry, loads, outputs
+    from forward import geometry, inclusions, loads, outputs
     from forward.materials import MATERIALS
 
-    unions = (geometry.Body, loads.Load, outputs.Output, Distribution, Method)
+    unions = (Model, geometry.Body, inclusions.Inclusion, loads.Load, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 

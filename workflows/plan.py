@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from forward.hyperelastic import Hyperelastic
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
 
 if TYPE_CHECKING:
-    from workflows.selection import Selection
+    from workflows.config import AnyStudy
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import Comparison
 
 
 def bytes_per_model(unknowns: int) -> float:
@@ -17,23 +20,23 @@ def bytes_per_model(unknowns: int) -> float:
     return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
 
 
-SECONDS_PER_STRESS = 4e-4  # a material point with its derivatives
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 
-def plan(study: Study | Selection, groups: int = 1) -> list[str]:
+def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     if not isinstance(study, Study):
-        return _comparison(study)
-    method, body = study.method, study.model.body
-    textbook = TEXTBOOK if study.model.solver.kind == "newton" else 1
+        return _of_other_kinds(study)
+    if study.body is None:
+        return _external(study)
+    method, model, body = study.method, study.body, study.body.body
+    textbook = TEXTBOOK if model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
-    memory = sum(bytes_per_model(model.unknowns) for model in study.models)
-    cells = body.cells[0] * body.cells[1] * body.cells[2] * (6 if body.cell == "tetrahedron" else 1)
-    form = "mixed form: displacements and pressures" if study.model.mixed else "displacement form"
+    memory = sum(bytes_per_model(other.unknowns) for other in study.models if isinstance(other, Hyperelastic))
+    form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
     edge = body.longest_edge
-    narrow = [inclusion for inclusion in study.model.inclusions if inclusion.width < edge]
+    narrow = [inclusion for inclusion in model.inclusions if inclusion.width < edge]
     up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
     seconds = study.planned * each[0]
     if isinstance(method, MultilevelMonteCarlo):
@@ -41,19 +44,19 @@ def plan(study: Study | Selection, groups: int = 1) -> list[str]:
         seconds = method.seconds_to_begin(sizes, textbook)
     seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
     names = [*study.parameters]
-    for field in study.model.fields:
+    for field in model.fields:
         paths = field.paths(body)
         names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {method.kind}",
-        f"unknowns    {sizes[0]:,} ({cells:,} cells: {body.cell}, degree {body.degree}; {form})",
+        f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
         *(
             f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
             for k, (size, s) in enumerate(zip(sizes, each, strict=True))
             if k
         ),
         f"parameters  {', '.join(names)}",
-        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"outputs     {', '.join(output.name for output in model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
         f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
@@ -63,19 +66,89 @@ def plan(study: Study | Selection, groups: int = 1) -> list[str]:
             " few quadrature points see the transition, and derivatives by place and size are rough"
             for inclusion in narrow
         ),
+        *(f"warning     {warning}" for warning in body.warnings),
     ]
 
 
-def _comparison(study: Selection) -> list[str]:
-    method, tests = study.method, study.data.tests
-    evidences = len(study.pairs) * method.variants
-    seconds = SECONDS_PER_STRESS * study.planned + SECONDS_PER_SURROGATE * evidences
+def _external(study: Study) -> list[str]:
+    """Find the model, and describe a study of it: no one knows how long a solve takes."""
+    assert not isinstance(study.model, Hyperelastic)
+    model = study.model.build(None, study.inputs.names)
+    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
+    return [
+        f"method      {study.method.kind}",
+        f"model       {study.model.description}; {'with' if model.differentiable else 'without'} derivatives",
+        f"parameters  {', '.join(study.parameters)}",
+        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"solves      {up_to}{study.planned:,}",
+    ]
+
+
+def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study)
+    return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
+
+
+SOLVES_OF_FIELD = 12  # for a mode
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+
+
+def _inversion(study: Inversion) -> list[str]:
+    spec, sets = study.model, study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    each = seconds_per_solve(spec.unknowns) * len(spec.cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + study.method.solves(field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {sum(moved)} points outside the body are moved to its surface"] if sum(moved) else []),
+        f"time        about {_duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _synthesis(study: Synthesis) -> list[str]:
+    spec, sets = study.model, len(study.method.fraction)
+    seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
+    return [
+        f"method      {study.method.kind}",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"data sets   {sets}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
+    ]
+
+
+def _comparison(study: Comparison) -> list[str]:
+    method = study.method
+    evidences = study.evidences
+    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
     check = " and nested sampling, which takes minutes" if method.check else ""
-    groups = f" in {len(study.data.groups)} groups" if len(study.data.groups) > 1 else ""
+    data = study.groups.values()
+    tests = sum(len(study.tests(group)) for group in study.group_names)
+    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    kind = "stresses" if study.quantity == "stress" else "displacements"
+    count = (
+        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
+    )
     return [
         f"method      {method.kind}",
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
-        f"data        {sum(len(test.at) for test in tests)} stresses of {len(tests)} tests{groups}",
+        f"data        {count}{groups}",
         f"evidences   {evidences}{check}",
         f"solves      about {study.planned:,}",
         f"time        about {_duration(seconds)} on 1 core (rough)",

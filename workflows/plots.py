@@ -492,6 +492,17 @@ def axes(height: float = 3.2, width: float = 5.4) -> Axes:
     return ax
 
 
+def grid(count: int, columns: int, height: float = 3.0, width: float = 2.8) -> list[Axes]:
+    """Return axes side by side on a new figure as of `axes`; height and width (inches) are those of each."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    return [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+
+
 def _quantity(dataset: xr.Dataset, output: str) -> str:
     """Name and unit of an output."""
     unit = str(dataset["unit"].sel(output=output).item())

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from workflows.selection import Selection
+    from workflows.config import AnyStudy
 
 LEVELS_DRAWN = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
 DERIVATIVES_DRAWN = 6  # parameters whose effect on the body is drawn
@@ -50,8 +50,10 @@ def write_report(directory: Path) -> Path:
     dataset, summary, study = _read(directory)
     if isinstance(study, Study):
         write_text(path, _render("report.html.jinja", _context(Results(dataset, summary, study))))
-    else:
+    elif "probability" in dataset:
         write_text(path, _render("selection.html.jinja", _comparison(dataset, summary, study)))
+    else:
+        write_text(path, _render("inversion.html.jinja", _inversion(dataset, summary, study)))
     return path
 
 
@@ -68,7 +70,7 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     for name, directory in zip(names, directories, strict=True):
         dataset, summary, study = _read(directory)
         if not isinstance(study, Study):
-            message = f"{directory}: compares models, expected studies that estimate outputs to lay side by side"
+            message = f"{directory}: holds no estimates of outputs, expected studies that do, to lay side by side"
             raise StudyError(message)
         studies[name] = Results(dataset, summary, study)
     outputs = dict.fromkeys(output for results in studies.values() for output in results.outputs)
@@ -81,7 +83,7 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     return out
 
 
-def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], Study | Selection]:
+def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], AnyStudy]:
     dataset = read_dataset(directory)
     summary = read_summary(directory)
     if summary is None:
@@ -131,6 +133,7 @@ def _context(results: Results) -> dict[str, Any]:
         **_sobol(results),
         "bounds": [_bounds(results, output) for output in results.outputs] if "total_bound" in dataset else [],
         "charts": [(output, _charts(dataset, output)) for output in results.outputs] if sampled else [],
+        "has_body": results.study.body is not None,
         "field_lines": field_lines,
         "bodies": drawn,
         "sensitivities": [(o, tables.sensitivities(results, o)) for o in results.outputs] if differentiated else [],
@@ -144,10 +147,33 @@ def _context(results: Results) -> dict[str, Any]:
     }
 
 
-def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: Selection) -> dict[str, Any]:
+def _inversion(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> dict[str, Any]:
+    """Everything that the template of an inversion shows."""
+    from workflows import inversion_report
+
+    found = inversion_report.context(dataset, study)
+    for one in found["sets"]:
+        one["pictures"] = [_picture(*drawn) for drawn in one["pictures"]]
+    return _of_all(dataset, summary, study) | found
+
+
+def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> dict[str, Any]:
     """Everything that the template of a comparison of models shows."""
     from workflows import selection_report
+    from workflows.selection import Comparison
 
+    assert isinstance(study, Comparison)
+    return {
+        **_of_all(dataset, summary, study),
+        "charts": [
+            (heading, [_picture(*drawn) for drawn in shown]) for heading, shown in selection_report.pictures(dataset)
+        ],
+        **selection_report.context(dataset, study),
+    }
+
+
+def _of_all(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> dict[str, Any]:
+    """What these templates show alike."""
     return {
         "title": f"Study {summary['study']}",
         "method": str(type(study.method).__doc__).partition("\n")[0],
@@ -156,10 +182,6 @@ def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: Selection) 
         "times": list(tables.times(summary)),
         "provenance": list(tables.provenance(summary)),
         "config": dataset.attrs["config"],
-        "charts": [
-            (heading, [_picture(*drawn) for drawn in shown]) for heading, shown in selection_report.pictures(dataset)
-        ],
-        **selection_report.context(dataset, study),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,22 +26,27 @@ def write_text(path: Path, text: str) -> None:
     partial.replace(path)
 
 
-def write_dataset(path: Path, dataset: xr.Dataset) -> None:
-    """Write a netCDF-4 file and rename it into place; equal datasets give equal bytes."""
+def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
+    """Write a netCDF-4 file, with groups, and rename it into place; equal datasets give equal bytes."""
     import h5netcdf
     import h5py
     from xarray.backends import H5NetCDFStore
 
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    # HDF5 stamps its root group with the time unless it is told not to; netCDF-4 needs the order of creation.
-    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
-    creation.set_obj_track_times(False)
+    # HDF5 stamps groups with the time unless it is told not to; netCDF-4 needs the order of creation.
+    of_file, of_group = (h5py.h5p.create(kind) for kind in (h5py.h5p.FILE_CREATE, h5py.h5p.GROUP_CREATE))
     order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
-    creation.set_link_creation_order(order)
-    creation.set_attr_creation_order(order)
-    created = h5py.h5f.create(os.fsencode(partial), fcpl=creation)
+    for creation in (of_file, of_group):
+        creation.set_obj_track_times(False)
+        creation.set_link_creation_order(order)
+        creation.set_attr_creation_order(order)
+    created = h5py.h5f.create(os.fsencode(partial), fcpl=of_file)
+    for name in groups or {}:
+        h5py.h5g.create(created, name.encode(), gcpl=of_group)
     with h5py.File(created) as file, h5netcdf.File(file, "a") as netcdf:
         dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
+        for name, part in (groups or {}).items():
+            part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
     partial.replace(path)
 
 
@@ -72,6 +77,12 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
+    if "alone_eigenvalue" in dataset:
+        from workflows.inversion import summary as of_inversion
+
+        return of_inversion(dataset)
+    if "clean" in dataset:
+        return {"data": int(np.isfinite(dataset["values"]).sum())}
     if "log_evidence" in dataset:
         shown = ("log_evidence", "log_evidence_error", "probability")
         return {
@@ -132,6 +143,20 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     return summary
 
 
+def inverted(summary: Mapping[str, Any]) -> list[str]:
+    """Say in a line what was found for each data set, if data were inverted."""
+    lines = []
+    for name, found in summary.get("data_sets", {}).items():
+        if "failed" in found:
+            lines.append(f"{name}: failed: {found['failed']}")
+            continue
+        values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
+        lines += [f"{name}: {', '.join(values)}", f"{name}: {found['verdict']}"]
+    if "data" in summary:
+        lines.append(f"{summary['data']} data made")
+    return lines
+
+
 def _methods(dataset: xr.Dataset) -> dict[str, list[dict[str, Any]]]:
     """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
     gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
@@ -189,6 +214,13 @@ def with_random_fields(
     return dataset
 
 
+def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.int64] | None) -> xr.Dataset:
+    """Add the regions of the cells, where there are some and the mesh is kept."""
+    if numbers is None or "cell" not in dataset.dims:
+        return dataset
+    return dataset.assign_coords(region=list(names)).assign(cell_region=(("cell",), numbers))
+
+
 def body_grid(dataset: xr.Dataset) -> Any:
     """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
     import pyvista
@@ -199,18 +231,27 @@ def body_grid(dataset: xr.Dataset) -> Any:
     grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
     for name, values in node_fields(dataset).items():
         grid.point_data[name] = values
+    if "cell_region" in dataset:
+        grid.cell_data["region"] = dataset["cell_region"].to_numpy()
     return grid
 
 
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
-    """Write the displacement fields of the results on the undeformed mesh, for ParaView; nothing if there are none."""
+    """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
+
+    Displacements are in one file, what data sets say of the interior in one for each.
+    """
     if "cell_nodes" not in dataset:
         return None
     directory.mkdir(exist_ok=True)
-    path = directory / "displacement.vtu"
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    body_grid(dataset).save(partial)
-    partial.replace(path)
+    parts = {"displacement": dataset}
+    if "data_set" in dataset.dims:
+        parts = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
+    for name, part in parts.items():
+        path = directory / f"{name}.vtu"
+        partial = path.with_name(f".{os.getpid()}.{path.name}")
+        body_grid(part).save(partial)
+        partial.replace(path)
     return path
 
 
@@ -230,6 +271,9 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
                     arrays[f"{name} {field} {i}"] = values
         elif variable.dims == ("node",):
             arrays[str(name)] = variable.to_numpy()
+        elif variable.dims[1:] == ("node",):
+            labels = variable[variable.dims[0]].values
+            arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
     return arrays
 
 

@@ -6,22 +6,25 @@ import csv
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.homogeneous import ENERGIES, HomogeneousModel, MaterialTest, Mode
-from forward.materials import constants
+from forward.geometry import Vector
+from forward.homogeneous import HomogeneousModel, MaterialTest, Mode, unfit
+from forward.hyperelastic import Mistake
+from forward.materials import MATERIALS, constants
+from forward.model import ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
-from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError
+from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, refused
 
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
+SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 WHOLE = "all"  # name of the group where there is one
 
 
@@ -168,7 +171,8 @@ class CandidateModel(Settings):
     Parameters
     ----------
     material
-        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible.
+        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible. Fibres, where
+        it has them, by their components along the first stretch, along the second one and across both.
     parameters
         Priors of the constants that do.
     correlations
@@ -177,7 +181,7 @@ class CandidateModel(Settings):
         Its probability before the data, up to a common factor.
     """
 
-    material: dict[str, float | str]
+    material: dict[str, float | str | tuple[Vector, ...]]
     parameters: dict[str, Distribution] = Field(min_length=1)
     correlations: tuple[Correlation, ...] = ()
     weight: Annotated[float, Field(gt=0)] = 1.0
@@ -195,19 +199,25 @@ class CandidateModel(Settings):
     @property
     def fixed(self) -> dict[str, float]:
         """Constants that do not vary."""
-        return {name: float(value) for name, value in self.material.items() if name != "kind"}
+        return {name: value for name, value in self.material.items() if isinstance(value, float)}
+
+    @property
+    def fibres(self) -> tuple[Vector, ...]:
+        """Directions of the families of fibres."""
+        return tuple(self.material.get("fibres", ()))  # type: ignore[arg-type]
 
     @model_validator(mode="after")
     def _check(self) -> CandidateModel:
         kind = self.material.get("kind")
-        if kind not in ENERGIES:
-            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(ENERGIES))}"
+        if kind not in MATERIALS:
+            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(MATERIALS))}"
             raise ValueError(message)
-        words = [name for name, value in self.material.items() if name != "kind" and isinstance(value, str)]
+        numbers = {name for name, value in self.material.items() if isinstance(value, float)}
+        words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
         if words:
             message = f"material.{words[0]}: {self.material[words[0]]!r}, expected a number"
             raise ValueError(message)
-        known = constants(ENERGIES[self.kind])
+        known = constants(MATERIALS[self.kind])
         given = dict.fromkeys([*self.fixed, *self.parameters])
         for name in given:
             if name not in known:
@@ -232,7 +242,95 @@ class CandidateModel(Settings):
         return self
 
 
-class Selection(Settings):
+class Comparison(Settings):
+    """What studies that compare models have in common: candidates by name, groups of data, the method."""
+
+    quantity: ClassVar[str]  # what was measured
+    costly: ClassVar[bool]  # whether solves are worth a file
+    candidates: Mapping[str, Any]
+    method: Select
+    parallel: Parallel = Parallel()
+
+    @property
+    def source(self) -> tuple[str, ...]:
+        """Where the data are from, line by line."""
+        raise NotImplementedError
+
+    @property
+    def seconds_per_solve(self) -> float:
+        """Processor time of a solve, roughly."""
+        raise NotImplementedError
+
+    def described(self, name: str) -> str:
+        """What a candidate is, in words."""
+        raise NotImplementedError
+
+    def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
+        """Make the model of a candidate in a group on a communicator; collective."""
+        raise NotImplementedError
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """Names of the groups."""
+        raise NotImplementedError
+
+    @property
+    def groups(self) -> dict[str, Data]:
+        """Data by group."""
+        raise NotImplementedError
+
+    def tests(self, group: str) -> tuple[str, ...]:
+        """Names of the tests that were measured in a group."""
+        raise NotImplementedError
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Candidates and groups, in the order of the models."""
+        return [(name, group) for name in self.candidates for group in self.group_names]
+
+    @property
+    def models(self) -> dict[str, Candidate]:
+        """The candidates as the method wants them."""
+        return {name: Candidate(candidate.inputs, candidate.weight) for name, candidate in self.candidates.items()}
+
+    @property
+    def planned(self) -> int:
+        """Number of solves, roughly: the searches for the modes take as many as they take."""
+        searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
+        return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
+
+    @property
+    def evidences(self) -> int:
+        """Number of evidences that are found."""
+        counts = [len(self.tests(group)) for group in self.group_names]
+        held_out = sum(count for count in counts if count > 1) if self.method.held_out else 0
+        return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
+
+    def mistakes_of_method(self) -> Iterator[Mistake]:
+        """Find what does not fit the candidates and the data."""
+        known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
+        for name, tests in self.method.subsets.items():
+            for test in tests:
+                if test not in known:
+                    yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
+        for name, candidate in self.candidates.items():
+            try:
+                candidate.inputs  # noqa: B018 - checks the correlations
+            except ValueError as error:
+                yield ("candidates", name, "correlations"), str(error), name
+        for place, noise in (
+            (("noise",), self.method.noise),
+            *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
+        ):
+            for data in self.groups.values():
+                try:
+                    noise.sigma(data.values, data.sigma)
+                except ValueError as error:
+                    yield ("method", *place), str(error), noise.model_dump(exclude_none=True)
+                    break
+
+
+class Selection(Comparison):
     """What to compare.
 
     Parameters
@@ -255,16 +353,31 @@ class Selection(Settings):
     method: Select
     parallel: Parallel = Parallel()
 
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Candidates and groups, in the order of the models."""
-        return [(name, group) for name in self.candidates for group in self.data.groups]
+    quantity: ClassVar[str] = "stress"
+    costly: ClassVar[bool] = False
 
     @property
-    def planned(self) -> int:
-        """Number of solves, roughly: the searches for the modes take as many as they take."""
-        searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
-        return (self.method.samples * len(self.pairs) + searches) * self.method.variants
+    def source(self) -> tuple[str, ...]:
+        """Where the data are from."""
+        return self.data.source
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """Names of the groups."""
+        return self.data.groups
+
+    def tests(self, group: str) -> tuple[str, ...]:
+        """Names of the tests that were measured in a group."""
+        return tuple(test.label for test in self._measured(group))
+
+    @property
+    def seconds_per_solve(self) -> float:
+        """Processor time of the stresses and their derivatives, roughly."""
+        return SECONDS_PER_STRESS
+
+    def described(self, name: str) -> str:
+        """Material of a candidate."""
+        return self.candidates[name].kind
 
     @property
     def groups(self) -> dict[str, Data]:
@@ -282,15 +395,15 @@ class Selection(Settings):
             )
         return found
 
-    @property
-    def models(self) -> dict[str, Candidate]:
-        """The candidates as the method wants them."""
-        return {name: Candidate(candidate.inputs, candidate.weight) for name, candidate in self.candidates.items()}
-
-    def build(self, name: str, group: str) -> HomogeneousModel:
+    def build(self, name: str, group: str, comm: Any = None) -> HomogeneousModel:
         """Make the model of a candidate in a group."""
         candidate = self.candidates[name]
-        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), tuple(candidate.parameters))
+        names = tuple(candidate.parameters)
+        return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), names, candidate.fibres)
+
+    @property
+    def _all_tests(self) -> tuple[MaterialTest, ...]:
+        return (*self.data.tests, *self.predict)
 
     def _measured(self, group: str) -> list[MeasuredTest]:
         return [test for test in self.data.tests if test.group == group]
@@ -300,46 +413,39 @@ class Selection(Settings):
 
     @model_validator(mode="after")
     def _check(self) -> Selection:
-        mistakes = list(self._mistakes())
-        if mistakes:
-            raise ValidationError.from_exception_data(
-                "Selection",
-                [
-                    InitErrorDetails(
-                        type=PydanticCustomError("study", "{message}", {"message": message}), loc=place, input=given
-                    )
-                    for place, message, given in mistakes
-                ],
-            )
+        refused("Selection", list(self._mistakes()))
         return self
 
-    def _mistakes(self) -> Iterator[tuple[tuple[str | int, ...], str, Any]]:
+    def _mistakes(self) -> Iterator[Mistake]:
         for group in self.data.groups:
             labels = [test.label for test in self._tests(group)]
             twice = next((label for label in labels if labels.count(label) > 1), None)
             if twice is not None:
                 yield ("data", "tests"), f"several tests of group '{group}' have this name, expected one", twice
                 return
-        known = tuple(dict.fromkeys(test.label for test in self.data.tests))
-        for name, tests in self.method.subsets.items():
-            for test in tests:
-                if test not in known:
-                    yield ("method", "subsets", name), f"no test has this name; {nearest(test, known)}", test
         for name, candidate in self.candidates.items():
-            try:
-                candidate.inputs  # noqa: B018 - checks the correlations
-            except ValueError as error:
-                yield ("candidates", name, "correlations"), str(error), name
-        for place, noise in (
-            (("noise",), self.method.noise),
-            *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
-        ):
-            for data in self.groups.values():
-                try:
-                    noise.sigma(data.values, data.sigma)
-                except ValueError as error:
-                    yield ("method", *place), str(error), noise.model_dump(exclude_none=True)
-                    break
+            objections = (unfit(candidate.kind, test.mode, candidate.fibres) for test in self._all_tests)
+            objection = next(filter(None, objections), None)
+            if objection is not None:
+                yield ("candidates", name, "material"), objection, candidate.material
+        yield from self.mistakes_of_method()
+
+
+def made(blocks: Mapping[str, Any], folder: Path) -> Comparison:
+    """Check the blocks of a study that compares models of a specimen, where there is one, or of material points.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        For mistakes in the blocks.
+    StudyError
+        For mistakes in the data.
+    """
+    if "model" in blocks:
+        from workflows import specimen_selection
+
+        return specimen_selection.SpecimenSelection.model_validate(specimen_selection.expanded(blocks, folder))
+    return Selection.model_validate(expanded(blocks, folder))
 
 
 def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:

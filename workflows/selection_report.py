@@ -16,19 +16,23 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from workflows.selection import Selection
+    from workflows.selection import Comparison
 
 
-def context(dataset: xr.Dataset, study: Selection) -> dict[str, Any]:
+UNITS = {"stress": "Pa", "displacement": "m"}
+
+
+def context(dataset: xr.Dataset, study: Comparison) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     return {
         "findings": findings(dataset),
-        "source": study.data.source,
+        "source": study.source,
         "priors": priors(study),
         "evidences": evidences(dataset),
         "routes": routes(dataset),
         "variants": variants(dataset),
         "criticism": criticism(dataset),
+        "held_out": held_out(dataset) if "held_out_score" in dataset else None,
         "constants": constants(dataset),
         "averages": averages(dataset),
     }
@@ -45,27 +49,39 @@ def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]
     )
     tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
     several = dataset.sizes["group"] > 1
-    yield (
-        "Curves over the data",
-        [
+    if dataset.attrs["quantity"] == "displacement":
+        drawn = [
+            (residuals(dataset, str(test)), f"{test}: measured less predicted, over the errors.") for _, test in tests
+        ]
+        yield "What is left of the data", drawn
+    else:
+        drawn = [
             (curves(dataset, str(group), str(test)), f"{test}{f' of {group}' if several else ''}: mean and 90 % band.")
             for group, test in tests
-        ],
-    )
+        ]
+        yield "Curves over the data", drawn
+    best = ranking(dataset["log_evidence"])[0]
+    pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
+    drawn = [
+        (corner(dataset, *pair), f"{pair[0]}{f' ({pair[1]})' if several else ''}")
+        for pair in pairs
+        if not several or pair[0] == best
+    ]
+    yield "Posteriors of the constants" + (f" of {best}" if several else ""), drawn
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
-def priors(study: Selection) -> Table:
+def priors(study: Comparison) -> Table:
     """The candidates with the priors of their constants."""
     rows = []
     for name, candidate in study.candidates.items():
         for constant, distribution in candidate.parameters.items():
             block = distribution.model_dump()
-            unit = unit_of(f"material.{constant}")
-            rows.append((name, candidate.kind, constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
-    return Table(("candidate", "material", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
+            unit = _unit(constant)
+            rows.append((name, study.described(name), constant, f"{block['kind']}: {settings(block, 'kind')}", unit))
+    return Table(("candidate", "model", "constant", "prior", "unit"), rows, text=frozenset(range(5)))
 
 
 def evidences(dataset: xr.Dataset) -> Table:
@@ -170,6 +186,20 @@ def criticism(dataset: xr.Dataset) -> Table:
     return Table(head, rows, text=frozenset({0, 6}), long=frozenset({6}))
 
 
+def held_out(dataset: xr.Dataset) -> Table:
+    """Predictive scores of whole tests."""
+    scores, errors = dataset["held_out_score"], dataset["held_out_score_error"]
+    rows = []
+    for model in ranking(scores.sum("left_out")):
+        cells = [
+            with_error(float(value), float(error))
+            for value, error in zip(scores.sel(model=model).values, errors.sel(model=model).values, strict=True)
+        ]
+        total = with_error(float(scores.sel(model=model).sum()), float(np.sqrt((errors.sel(model=model) ** 2).sum())))
+        rows.append((model, *cells, total))
+    return Table(("model", *map(str, dataset.left_out.values), "sum"), rows)
+
+
 def constants(dataset: xr.Dataset) -> Table:
     """Posterior of every constant."""
     rows = []
@@ -180,7 +210,7 @@ def constants(dataset: xr.Dataset) -> Table:
                 of_name = one.sel(parameter=name)
                 if np.isnan(float(of_name["constant_mode"])):
                     continue
-                unit = "1" if name == "noise" else unit_of(f"material.{name}")
+                unit = _unit(str(name))
                 low, high = of_name["constant_quantiles"].values
                 values = (of_name["constant_mode"], of_name["constant_mean"], of_name["constant_std"], low, high)
                 rows.append((str(model), str(group), str(name), *(with_unit(number(float(v)), unit) for v in values)))
@@ -191,6 +221,7 @@ def constants(dataset: xr.Dataset) -> Table:
 def averages(dataset: xr.Dataset) -> Table:
     """Predictions averaged over the models at the end of each test, with both parts of their variance."""
     rows = []
+    quantity = str(dataset.attrs["quantity"])
     tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
@@ -202,9 +233,9 @@ def averages(dataset: xr.Dataset) -> Table:
                 str(group),
                 str(test),
                 number(float(one["output_at"])),
-                with_unit(number(float(one["measured"])), "Pa"),
-                with_unit(number(float(one["average_mean"])), "Pa"),
-                *(with_unit(number(std, 3), "Pa") for std in stds),
+                with_unit(number(float(one["measured"])), UNITS[quantity]),
+                with_unit(number(float(one["average_mean"])), UNITS[quantity]),
+                *(with_unit(number(std, 3), UNITS[quantity]) for std in stds),
             )
         )
     head = ("group", "test", "at", "measured", "averaged prediction", "std within models", "std between models")
@@ -243,6 +274,85 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.set_xlim(0, 1)
     ax.set_xlabel("probability")
     ax.figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    return ax
+
+
+def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
+    """Draw the posterior of the constants of a model, each alone and in pairs; large points have large weights."""
+    one = dataset.sel(model=model, group=group)
+    names = [
+        str(name) for name in dataset.parameter.values if np.isfinite(float(one["constant_mode"].sel(parameter=name)))
+    ]
+    n = len(names)
+    first = plots.axes(height=1.0 + 1.25 * n, width=1.4 + 1.45 * n)
+    figure = first.get_figure(root=True)
+    assert figure is not None
+    first.remove()
+    grid = figure.subplots(n, n, squeeze=False, sharex="col")
+    weights = one["point_weight"].values
+    used = weights > 1e-6 * weights.max()
+    weights = weights[used]
+    columns = [one["point"].sel(parameter=name).values[used] for name in names]
+    modes = [float(one["constant_mode"].sel(parameter=name)) for name in names]
+    ends = []
+    for x in columns:
+        order = np.argsort(x)
+        low, high = np.interp((0.002, 0.998), np.cumsum(weights[order]), x[order])
+        ends.append((low - 0.1 * (high - low), high + 0.1 * (high - low)))
+    colour = plots.COLOURS[list(dataset.model.values).index(model) % len(plots.COLOURS)]
+    for i, j in np.ndindex(n, n):
+        ax = grid[i, j]
+        if j > i:
+            ax.remove()
+            continue
+        if i == j:
+            ax.hist(columns[i], bins=24, range=ends[i], weights=weights, color=colour, alpha=0.6)
+            ax.axvline(modes[i], color=plots.DARK, linewidth=1)
+            ax.set_yticks([])
+        else:
+            ax.scatter(columns[j], columns[i], s=300 * weights / weights.max() / np.sqrt(len(weights)), color=colour)
+            ax.plot(modes[j], modes[i], "+", color=plots.DARK)
+            ax.set_ylim(ends[i])
+        ax.set_xlim(ends[j])
+        ax.ticklabel_format(style="sci", scilimits=(-2, 3), useMathText=True)
+        ax.tick_params(labelsize="x-small")
+        ax.xaxis.get_offset_text().set_fontsize("x-small")
+        ax.yaxis.get_offset_text().set_fontsize("x-small")
+        ax.spines[["top", "right"]].set_visible(False)
+        if i == n - 1:
+            ax.set_xlabel(_with_unit(names[j]), fontsize="small")
+        if j == 0 and i > 0:
+            ax.set_ylabel(_with_unit(names[i]), fontsize="small")
+        elif j > 0:
+            ax.tick_params(labelleft=False)
+    corner_axes: Axes = grid[0, 0]
+    return corner_axes
+
+
+def _unit(constant: str) -> str:
+    """SI unit of a constant of a material, or of a number of a model by its path."""
+    return "1" if constant == "noise" else unit_of(constant if "." in constant else f"material.{constant}")
+
+
+def _with_unit(constant: str) -> str:
+    unit = _unit(constant)
+    return constant if unit == "1" else f"{constant} ({unit})"
+
+
+def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
+    """Draw what each model leaves of the data of a test, over the stated errors, against what was measured."""
+    ax = ax or plots.axes(height=3.4)
+    one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
+    measured = one["measured"].values
+    for k, model in enumerate(dataset.model.values):
+        left = (measured - one["prediction_mean"].sel(model=model).values) / one["sigma"].values
+        P = float(dataset["probability"].sel(model=model))
+        colour = plots.COLOURS[k % len(plots.COLOURS)]
+        ax.plot(measured, left, ".", markersize=4, color=colour, label=f"{model} ({P:.2g})")
+    ax.axhspan(-2, 2, color=plots.DARK, alpha=0.08, linewidth=0)
+    ax.set_xlabel("measured displacement (m)")
+    ax.set_ylabel("residual / σ")
+    ax.legend(fontsize="small", frameon=False)
     return ax
 
 

@@ -12,14 +12,19 @@ _MODEL = """\
 kind = "hyperelastic"
 # A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
 # kind = "block" has corners = [...] instead: the images of the corners of a cube, x goes first, then y, then z.
+# kind = "mesh" has file = "liver.msh" (or .xdmf, .vtk, .vtu) and unit = 1e-3: its groups are boundaries and regions.
+# A model of another program in place of a body: kind = "python" or "um-bridge", see README.
 # cell = "hexahedron" | "tetrahedron", degree = 1 | 2
 body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
 # In Pa, but for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1), "yeoh" (C10, C20, C30, D1),
 # "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda), "saint-venant-kirchhoff" (lmbda, mu),
 # "blatz-ko" (mu).
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
+# Others: neo-hookean, neo-hookean-coupled, yeoh, gent, demiray, ogden, saint-venant-kirchhoff, blatz-ko, and
+# holzapfel-gasser-ogden, c = 2e4, k1 = 1e4, k2 = 1, D1 = 2e5, fibres = [[1, 1, 0], [1, -1, 0]]
 # formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
+# (kind = "ellipsoid" has radii a, b, c and a rotation vector turn_x, turn_y, turn_z (rad) instead of a radius)
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]
 # A random factor on the stiffness (or the density), log-normal, that varies over the body; its modes are parameters:
 # fields = [{ of = "stiffness", length = 0.03, std = 0.3, modes = 10 }]
@@ -41,7 +46,8 @@ outputs = [
 
 [parameters]
 # Any number of the model by its path: material.*, loads.<name or kind>.density|size, displacements.<name or boundary>.x
-# inclusions.<name or kind>.contrast|radius|x|y|z|width
+# inclusions.<name or kind>.contrast|radius|x|y|z|width (or a|b|c|turn_x|turn_y|turn_z of an ellipsoid)
+# regions.<name>.contrast|<constant>, in a mesh from a file
 # uniform, log-uniform, triangular, beta, truncated-normal, normal, log-normal, gamma
 "material.C1" = { kind = "uniform", lower = 0.5e4, upper = 1.5e4 }
 "loads.gravity.density" = { kind = "truncated-normal", mean = 1000, std = 50, lower = 800, upper = 1200 }
@@ -150,6 +156,7 @@ kind = "local-sensitivity"
 
 _SELECTION = """\
 # A comparison of material models with tissuq. Check it with `tissuq check FILE`, run it with `tissuq run FILE`.
+# For models of a specimen given its displacements see configs/inclusion-material.toml.
 
 [data]
 # Tests, here in full. Or a table beside this file, whose lines with # are kept as its source:
@@ -163,7 +170,7 @@ tests = [
 ]
 
 # A candidate: constants that do not vary stand in material, priors of the others in parameters. Without D1, an energy
-# that has it is that of an incompressible material. Energies as of other studies, and "ogden".
+# that has it is that of an incompressible material. Energies as of other studies.
 [candidates.neo-hookean]
 material = { kind = "neo-hookean" }
 parameters.C1 = { kind = "log-normal", mean = 500, std = 300 }
@@ -185,8 +192,76 @@ seed = 1
 noise = { relative = 0.05, absolute = 10 }  # factor = { kind = "log-uniform", lower = 0.2, upper = 20 }
 other_noises = { "twice the errors" = { relative = 0.1, absolute = 20 } }
 subsets = { "tension alone" = ["uniaxial"] }
+# held_out = true     # predict every test from the others, too
 # check = "dynesty"   # nested sampling beside it, for minutes
 """
+
+
+_SPECIMEN = """\
+# What is inside a specimen, with tissuq. SI units throughout. Check it with `tissuq check FILE`, run it with
+# `tissuq run FILE`.
+
+[model]
+kind = "specimen"
+# As of other studies, but for loads and outputs: bodies, materials, inclusions, fields.
+body = { kind = "box", size = [0.05, 0.05, 0.05], cells = [4, 4, 4], cell = "hexahedron", degree = 2 }
+material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 4e3 }
+inclusions = [{ name = "lump", x = 0.025, y = 0.025, z = 0.025, radius = 0.012, contrast = 4, width = 8e-3 }]
+# Load cases, each with clamp, displacements and loads as of other studies.
+[[model.cases]]
+name = "pull"
+clamp = ["z-min"]
+loads = [{ kind = "traction", on = "z-max", direction = [0, 0, 1], size = 100 }]
+"""
+
+_INVERT = """
+[parameters]
+# Priors of the numbers that are unknown, by their paths. Or none, and a field whose values at the vertices are:
+# model.fields = [{ of = "stiffness", length = 0.02, std = 0.5, basis = "nodes" }]
+"inclusions.lump.x" = { kind = "uniform", lower = 0.01, upper = 0.04 }
+"inclusions.lump.contrast" = { kind = "log-uniform", lower = 1, upper = 16 }
+
+[data]
+# Tables with the columns x, y, z, any of ux, uy, uz, optionally sigma and case (empty cells: not measured), or meshes
+# that meshio reads; files, folders or patterns. Each is a data set by itself.
+files = ["measured.csv"]
+sigma = 2e-5          # standard deviation (m) of the errors, where a file does not say
+# unit = 1e-3         # m per unit of the files
+# tolerance = 1e-4    # how far (m) points may lie outside the body
+
+[method]
+"""
+
+_SYNTHESIZE = """
+
+# What is measured: all nodes of boundaries, or points (at = [[x, y, z], …]).
+[[model.observed]]
+on = "z-max"
+
+[parameters]
+# What is drawn for each data set.
+"inclusions.lump.x" = { kind = "uniform", lower = 0.015, upper = 0.035 }
+
+[method]
+"""
+
+_METHODS["invert"] = """\
+kind = "invert"
+samples = 64          # solves that correct Laplace's Gaussian; of a field, 0 is none
+starts = 2            # of the search for the mode
+# noise = { kind = "log-uniform", lower = 0.2, upper = 5 }   # of a factor on all sigma, if their size is unknown
+# chains = "pcn"      # Markov chains beside it; or "emcee"
+seed = 1
+"""
+
+_METHODS["synthesize"] = """\
+kind = "synthesize"
+noise = { relative = 0.01 }   # of the root mean square of the displacements of a load case; or absolute (m)
+fraction = [0.5, 0.1]         # of the points, for each data set
+missing = 0.0                 # share of components that are lost
+seed = 1
+"""
+_HEADS = {"select": _SELECTION, "invert": _SPECIMEN + _INVERT, "synthesize": _SPECIMEN + _SYNTHESIZE}
 
 
 def starter(kind: str) -> str:
@@ -200,4 +275,4 @@ def starter(kind: str) -> str:
     if kind not in _METHODS:
         message = f"init {kind}: unknown kind of study; {nearest(kind, tuple(_METHODS))}"
         raise StudyError(message)
-    return (_SELECTION if kind == "select" else _MODEL) + _METHODS[kind]
+    return _HEADS.get(kind, _MODEL) + _METHODS[kind]

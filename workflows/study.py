@@ -8,9 +8,9 @@ import platform
 import sys
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -18,15 +18,20 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from forward.external import PythonModel
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
 from workflows.results import (
+    inverted,
     label,
     read_summary,
     summarise,
     with_random_fields,
+    with_regions,
     write_dataset,
     write_fields,
     write_text,
@@ -40,14 +45,17 @@ if TYPE_CHECKING:
     from uq.checkpoint import Checkpoint
     from uq.ensemble import Ensemble
     from uq.inputs import Inputs
-    from workflows.selection import Selection
+    from workflows.config import AnyStudy
+    from workflows.inversion import Inversion, Synthesis
+    from workflows.selection import Comparison
 
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 REALISATIONS = 3  # of random fields, to look at
+_STOPPED = {"select": "all evidences found", "invert": "all data sets inverted", "synthesize": "all data made"}
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
-def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = False) -> int:
+def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
     Parameters
@@ -100,7 +108,7 @@ def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = F
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
-    job = _sampling(study, ensemble) if isinstance(study, Study) else _selection(study)
+    job = _job(study, ensemble, name)
     kept = checkpoint if job.costly else None
     dataset = ensemble.run(
         job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
@@ -114,7 +122,7 @@ def run(study: Study | Selection, name: str, directory: Path, *, quiet: bool = F
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
     if isinstance(study, Study) and len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, job.recorders["/"])
-    _leave(directory, dataset, evaluations, summary, checkpoint)
+    _leave(directory, dataset, evaluations, summary, checkpoint, job)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
     return PARTIAL if summary["failed"] else DONE
@@ -126,10 +134,14 @@ def _leave(
     evaluations: dict[str, Evaluations],
     summary: dict[str, Any],
     checkpoint: Checkpoint,
+    job: _Job,
 ) -> None:
     """Write all results, in an order that a kill cannot spoil."""
-    write_dataset(directory / "results.nc", dataset)
+    write_dataset(directory / "results.nc", dataset, job.groups(dataset))
     write_fields(directory / "fields", dataset)
+    for name, text in job.texts(dataset).items():
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        write_text(directory / name, text)
     checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
@@ -159,6 +171,10 @@ class _Job:
         Adds to the results what the method does not know.
     costly
         Whether solves are worth a file: where they are not, an interrupted study begins again.
+    groups
+        Groups of results.nc beside its own variables.
+    texts
+        Further files of the directory, by name.
     """
 
     model: ForwardModel
@@ -167,37 +183,57 @@ class _Job:
     recorders: dict[str, Recorder]
     labelled: Callable[[xr.Dataset], xr.Dataset]
     costly: bool = True
+    groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
+    texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
+
+
+def _job(study: AnyStudy, ensemble: Ensemble, name: str) -> _Job:
+    if isinstance(study, Study):
+        return _sampling(study, ensemble)
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study, ensemble)
+    return _synthesis(study, ensemble, name) if isinstance(study, Synthesis) else _selection(study, ensemble)
 
 
 def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
-    inputs = study.inputs
-    model = study.model.build(ensemble.group, inputs.names)
-    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
-    cells, kind = model.layout.cells()
-    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         return study.method.run(inputs, recorders["/"])
 
+    others: list[Callable[[], ForwardModel]] = [
+        partial(other.build, ensemble.group, inputs.names) for other in study.models[1:]
+    ]
+    if study.body is None:
+        function = study.model.build(ensemble.group, inputs.names)
+        return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+
+    spec = study.body
+    model = spec.build(ensemble.group, inputs.names)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
+    regions = model.region_of_cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = label(found, _units(study), model.layout.coordinates, cells, kind)
+        found = label(found, units, model.layout.coordinates, cells, kind)
+        found = with_regions(found, spec.body.regions, regions)
         return with_random_fields(found, factors, model.variance_kept)
 
-    others: list[Callable[[], ForwardModel]] = [
-        partial(spec.build, ensemble.group, inputs.names) for spec in study.models[1:]
-    ]
     return _Job(model, others, task, recorders, labelled)
 
 
-def _selection(study: Selection) -> _Job:
-    """The candidates, each for each group of data."""
+def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
+    """The candidates, each for each group of data; making them is collective over the group."""
     from uq.evaluate import SerialEvaluate
 
     pairs = study.pairs
-    makers = [partial(study.build, *pair) for pair in pairs]
+    makers = [partial(study.build, *pair, ensemble.group) for pair in pairs]
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -205,19 +241,113 @@ def _selection(study: Selection) -> _Job:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
             return recorders[f"{name}/{group}"]
 
-        # What nested sampling solves is too much, and too cheap, to keep.
-        return study.method.run(
-            study.models, study.groups, recorded, lambda name, group: SerialEvaluate(study.build(name, group))
-        )
+        def free(name: str, group: str) -> Evaluate:
+            # What nested sampling solves is too much, and too cheap, to keep.
+            return SerialEvaluate(study.build(name, group))
 
-    return _Job(makers[0](), list(makers[1:]), task, recorders, lambda found: found, costly=False)
+        return study.method.run(study.models, study.groups, recorded, free)
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        return found.assign_attrs(quantity=study.quantity)
+
+    return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, costly=study.costly)
 
 
-def _identity(study: Study | Selection) -> dict[str, Any]:
-    return {key: value for key, value in document(study).items() if key != "parallel"}
+def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
+    """One data set, whose solves all groups share, or data sets side by side; collective over the group."""
+    from forward.model import SolveError
+    from inverse.field_posterior import FieldPosterior
+    from inverse.inversion import Inversions, Vertices, invert_by_all, invert_by_group, invert_field
+    from uq.evaluate import Request
+    from workflows import inversion
+
+    method = study.method
+    model = study.model.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
+    vertices = (model.vertices.coordinates, *model.vertices.cells())
+    layout = study.variables
+    prior = study.model.fields[0].prior(study.model.body) if study.field else None
+    recorders: dict[str, Recorder] = {}
+
+    def look(points: FloatArray) -> FloatArray:
+        return study.stiffness(vertices[0], points) + model.log_fields(points)
+
+    def invert(parameters: FloatArray) -> FloatArray:
+        number = int(parameters[0])
+        if study.measurements[number] is None:
+            raise SolveError(study.data.sets[number].refused)
+        data = study.measurements[number].observations.components()
+        observed = model.observing(data.places, data.axes, data.cases)
+        if prior is None:
+            return layout.pack(invert_by_group(study.inputs, observed, data, method, look))
+        posterior = FieldPosterior(observed, data.values, data.sigma, prior)
+        offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
+        return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass)))
+
+    def one(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        data = study.measurements[0].observations.components()
+        row = layout.pack(invert_by_all(study.inputs, recorders["/"], data, method, look))
+        return inversion.dataset(study, row[None], {}, vertices)
+
+    def many(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        found = recorders["/"](Request(np.arange(len(study.data.sets), dtype=float)[:, None]))
+        reasons = {failure.index: failure.reason for failure in found.failures}
+        if len(reasons) == len(study.data.sets):
+            raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
+        return inversion.dataset(study, found.outputs, reasons, vertices)
+
+    first: ForwardModel = Inversions(invert, ("data_set",), layout.names)
+    if study.together:
+        data = study.measurements[0].observations.components()
+        first = model.observing(data.places, data.axes, data.cases)
+    return _Job(
+        first,
+        [],
+        one if study.together else many,
+        recorders,
+        lambda found: found,
+        groups=partial(inversion.groups, study),
+        texts=lambda found: {"batch.csv": inversion.batch_table(found)},
+    )
 
 
-def _prepare(study: Study | Selection, directory: Path, ranks: int) -> int | None:
+def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
+    """The specimen that is known; collective over the group."""
+    from workflows import inversion
+
+    model = study.model.build(ensemble.group, study.inputs.names)
+    places, points = model.models[0].layout.coordinates, inversion.points_of(model)
+    factor = np.ones((len(study.method.fraction), 1))
+    if study.model.fields and ensemble.index == 0:
+        drawn = model.models[0].factors(study.method.truths(study.inputs)[:, model.positions[0]])
+        for one in (random for random in study.model.fields if random.of == "stiffness" and ensemble.group.rank == 0):
+            factor = factor * drawn[one.label]
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        return study.method.run(study.inputs, recorders["/"], model.cases, points)
+
+    def texts(found: xr.Dataset) -> dict[str, str]:
+        made = inversion.synthetic_files(study, name, found, (points, model.cases, model.axes, model.places))
+        return {f"data/{file}": text for file, text in made.items()}
+
+    labelled = partial(inversion.with_factor, study, places=places, fields=factor)
+    return _Job(model, [], task, recorders, labelled, texts=texts)
+
+
+def _identity(study: AnyStudy) -> dict[str, Any]:
+    """Return what decides on evaluations."""
+    blocks = {key: value for key, value in document(study).items() if key != "parallel"}
+    if isinstance(study, Study) and isinstance(study.model, PythonModel):
+        blocks["source"] = study.model.source
+    if isinstance(study, Study) and study.body is not None:
+        blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
+    return blocks
+
+
+def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
     share = study.parallel.ranks_per_model
     if ranks % share:
@@ -265,14 +395,10 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
 
     They are the first samples of Monte Carlo with the seed of the study.
     """
-    if not study.model.fields:
+    if not study.model.coefficients:
         return {}
     seed = getattr(study.method, "seed", 0)
     return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
-
-
-def _units(study: Study) -> dict[str, str]:
-    return {output.name: output.unit for output in study.model.outputs}
 
 
 def _version() -> str:
@@ -283,7 +409,7 @@ def _version() -> str:
 
 
 def _summary(
-    study: Study | Selection,
+    study: AnyStudy,
     name: str,
     dataset: xr.Dataset,
     evaluations: dict[str, Evaluations],
@@ -300,9 +426,7 @@ def _summary(
         "study": name,
         "method": study.method.kind,
         "status": "partial" if failed else "complete",
-        "stopped": dataset.attrs.get(
-            "stopped", "one linearisation" if isinstance(study, Study) else "all evidences found"
-        ),
+        "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
         "evaluations": sum(len(found.points) for found in every),
         "failed": failed,
@@ -344,10 +468,14 @@ def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
     return found
 
 
-def _parameters(study: Study | Selection, label: str) -> tuple[str, ...]:
+def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
     """Names of the parameters of a model by the name that its evaluations are kept under."""
     if isinstance(study, Study):
         return study.inputs.names
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion | Synthesis):
+        return study.inputs.names if isinstance(study, Synthesis) or study.together else ("data_set",)
     return tuple(study.candidates[label.partition("/")[0]].parameters)
 
 
@@ -382,6 +510,7 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         for model, found in summary.get("models", {}).items()
     ]
     lines += summary.get("findings", [])
+    lines += inverted(summary)
     for output, values in summary.get("outputs", {}).items():
         unit = dataset.unit.sel(output=output).item()
         lines.append(
@@ -392,7 +521,7 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
             lines[-1] += (
                 f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
             )
-    first = next(iter(dataset.output.values))
+    first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
     for name, rows in summary.get("methods", {}).items():
         last = rows[-1]
         lines.append(

@@ -75,8 +75,8 @@ def parameters(results: Results) -> Table:
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
         rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, unit_of(name)))
-    for field in results.study.model.fields:
-        paths = field.paths(results.study.model.body)
+    body = results.study.body
+    for field, paths in [(field, field.paths(body.body)) for field in body.fields] if body is not None else []:
         kept = float(results.dataset["variance_kept"].sel(random_field=field.label))
         law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
         rows.append((f"fields.{field.label}.0 to {len(paths) - 1}", law, "0", "1", "1"))

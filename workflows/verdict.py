@@ -74,6 +74,10 @@ def findings(dataset: xr.Dataset) -> list[str]:
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
         said.append(f"Left-out data are predicted best by {predicts}.")
+    if "held_out_score" in dataset:
+        predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
+        if predicts != best:
+            said.append(f"Whole tests are predicted best, from the others, by {predicts}.")
     doubtful = [
         f"{model}" + (f" ({group})" if dataset.sizes["group"] > 1 else "")
         for model in order

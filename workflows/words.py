@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from typing import Any, assert_never
 
 from forward.fields import RandomField
+from forward.hyperelastic import Hyperelastic
 from forward.inclusions import Inclusion
 from forward.loads import Gravity, Load, Pressure, Traction
-from forward.materials import MATERIALS, OF_STRETCHES, units
+from forward.materials import MATERIALS, constants, units
 from forward.outputs import Output
 from workflows.config import Study
 
@@ -57,18 +58,21 @@ def worth(ratio: float) -> str:
 
 
 def unit_of(path: str) -> str:
-    """SI unit of a number of the model, by its path; "1" for ratios."""
+    """SI unit of a number of the model, by its path; "1" for ratios and for models of other programs."""
     block, _, name = path.partition(".")
     if block == "material":
         # A name has the same unit in every material.
-        return next(of[name] for of in map(units, (MATERIALS | OF_STRETCHES).values()) if name in of)
-    if block == "fields":
-        return "1"
+        return next((of[name] for of in map(units, MATERIALS.values()) if name in of), "1")
     if block == "inclusions":
-        return "1" if path.endswith(".contrast") else "m"
+        return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
+            path.rpartition(".")[2], "m"
+        )
+    if block == "regions":
+        name = path.rpartition(".")[2]
+        return "1" if name == "contrast" else unit_of(f"material.{name}")
     if path.endswith(".density"):
         return "kg/m³"
-    return "m" if block == "displacements" else "Pa"
+    return {"displacements": "m", "loads": "Pa"}.get(block, "1")
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -90,17 +94,26 @@ def settings(block: dict[str, Any], *left_out: str) -> str:
 
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     """Say what was solved: headings, each with its lines."""
-    model = study.model
-    body = model.body
-    cells = " × ".join(f"{n}" for n in body.cells)
+    if study.body is None:
+        yield from _external_in_words(study)
+        return
+    model, body = study.body, study.body.body
+    cells = body.cells_in_words
     coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
-    kind = str(model.material.model_dump()["kind"])
-    constants = {name: _scalar(study, f"material.{name}") for name in model.material.model_dump() if name != "kind"}
+    kind = model.energy
+    numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(MATERIALS[kind])]
+    fibres = [f"fibres along {' and '.join(map(_value, model.fibres))}"] if model.fibres else []
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
-    yield "material", [law, ", ".join(f"{name} = {value}" for name, value in constants.items())]
+    yield "material", [law, ", ".join(numbers), *fibres]
+    if model.regions:
+        named = {
+            region: ", ".join(f"{name} = {_scalar(study, f'regions.{region}.{name}')}" for name in numbers)
+            for region, numbers in model.regions.items()
+        }
+        yield "regions", [f"{region}: {numbers}" for region, numbers in named.items()]
     if model.inclusions:
         yield "inclusions", [_inclusion(study, inclusion) for inclusion in model.inclusions]
     if model.fields:
@@ -113,6 +126,14 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     yield "held", held
     yield "loads", [_load(study, load) for load in model.loads] or ["none"]
     yield "outputs", [_output(output) for output in model.outputs]
+
+
+def _external_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
+    model = study.model
+    assert not isinstance(model, Hyperelastic)
+    yield "model", [model.description]
+    yield "parameters", [f"{name} = {_scalar(study, name)}" for name in model.parameters]
+    yield "outputs", [f"{output.name}{'' if output.unit == '1' else f' ({output.unit})'}" for output in model.outputs]
 
 
 def _output(output: Output) -> str:

@@ -1,0 +1,493 @@
+"""Bodies meshed by other programs: gmsh's .msh, XDMF, VTK and VTU files with named boundaries and regions.
+
+A study keeps, beside the name of the file, what it needs to know of it (`Contents`), so that results can be read where
+the file is not; a hash says whether it is the same file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from functools import lru_cache
+from io import StringIO
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self
+
+import numpy as np
+from annotated_types import Gt
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, ModelError
+from forward.settings import Settings, nearest
+
+if TYPE_CHECKING:
+    import meshio
+
+Point = tuple[float, float, float]
+IntArray = NDArray[np.int64]
+LARGE, SMALL = 10.0, 1e-4  # m: bodies of tissue are between these
+FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
+CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
+ALL = "body"  # the name of the only region, where the file names none
+_SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
+_MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
+_TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write
+_FACES = {
+    "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
+    "hexahedron": [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]],
+}
+_EDGES = {
+    "tetrahedron": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
+    "hexahedron": [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]],
+}
+_TETRAHEDRA = {
+    "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
+}
+# Corners of hexahedra with their neighbours, in an order that makes all determinants positive.
+_CORNERS = [
+    [0, 1, 3, 4],
+    [1, 2, 0, 5],
+    [2, 3, 1, 6],
+    [3, 0, 2, 7],
+    [4, 7, 5, 0],
+    [5, 4, 6, 1],
+    [6, 5, 7, 2],
+    [7, 6, 4, 3],
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A mesh in memory.
+
+    Attributes
+    ----------
+    points
+        Vertices (n, 3) in m.
+    cells
+        Vertices of each cell, in VTK's order.
+    cell
+        "tetrahedron" or "hexahedron".
+    boundaries
+        Facets (k, 3 or 4) of the surface of the body by name.
+    regions
+        Names of the regions.
+    region
+        Number of the region of each cell.
+    """
+
+    points: FloatArray
+    cells: IntArray
+    cell: Literal["tetrahedron", "hexahedron"]
+    boundaries: dict[str, IntArray]
+    regions: tuple[str, ...]
+    region: IntArray
+
+
+class Contents(Settings):
+    """What a file holds, found when it is read.
+
+    Parameters
+    ----------
+    digest
+        Hash of the file.
+    cell
+        Shape of the cells.
+    cells, vertices, edges, faces
+        How many there are.
+    bounds
+        Smallest and largest coordinate (m) along each axis.
+    longest_edge
+        Of all cells (m).
+    boundaries
+        Names of the boundaries, each with up to four points (m) that span it.
+    regions
+        Names of the regions, each with its volume (m³).
+    """
+
+    digest: str
+    cell: Literal["tetrahedron", "hexahedron"]
+    cells: int
+    vertices: int
+    edges: int
+    faces: int
+    bounds: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    longest_edge: float
+    boundaries: dict[str, tuple[Point, ...]]
+    regions: dict[str, float]
+
+
+class OwnMesh(Settings):
+    """A body from a file with a mesh of linear tetrahedra or hexahedra.
+
+    Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
+    the numbers that an array of the cells gives to triangles or quadrilaterals (boundaries) and to cells (regions).
+
+    Parameters
+    ----------
+    file
+        The file (.msh, .xdmf, .vtk, .vtu, and what else meshio reads), beside the study.
+    unit
+        Length (m) of one unit of its coordinates: 1e-3 for millimetres.
+    degree
+        Polynomial degree of the displacement.
+    quadrature_degree
+        Degree that the integrals are exact for, as of other bodies.
+    names
+        Names for numbers of boundaries and regions: ``{ vessel = 3 }``.
+    tags
+        Name of the array with the numbers, where it is not a usual one and not the only one.
+    contents
+        What the file holds; it need not be given.
+    """
+
+    kind: Literal["mesh"] = "mesh"
+    file: str
+    unit: Annotated[float, Gt(0)] = 1.0
+    degree: Literal[1, 2] = 2
+    quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
+    names: dict[Annotated[str, Field(pattern=r"^[^.\s]+$")], int] = Field(default={})
+    tags: str | None = None
+    contents: Contents | None = None
+
+    @model_validator(mode="after")
+    def _read(self) -> OwnMesh:
+        if self.contents is None:
+            object.__setattr__(self, "contents", contents(self.load(), _digest(self.file)))
+        lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
+        needed = lowest[self.cell, self.degree]
+        if self.quadrature < needed:
+            message = f"quadrature_degree = {self.quadrature} leaves deformations without energy, expected {needed}"
+            raise ValueError(message)
+        return self
+
+    def load(self) -> Loaded:
+        """Read the file.
+
+        Raises
+        ------
+        ModelError
+            If that is not possible, or it is another file than the study was made for.
+        """
+        digest = _digest(self.file)
+        if self.contents is not None and digest != self.contents.digest:
+            message = f"model.body.file: {self.file} is not the file that the study was made for: it has changed"
+            raise ModelError(message)
+        return _load(self.file, digest, self.unit, tuple(self.names.items()), self.tags)
+
+    @property
+    def found(self) -> Contents:
+        """What the file holds."""
+        assert self.contents is not None
+        return self.contents
+
+    @property
+    def cell(self) -> Literal["tetrahedron", "hexahedron"]:
+        """Shape of the cells."""
+        return self.found.cell
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells."""
+        return self.found.cells
+
+    @property
+    def cells_in_words(self) -> str:
+        """How many cells there are."""
+        return f"{self.cell_count:,}"
+
+    @property
+    def boundaries(self) -> tuple[str, ...]:
+        """Names of the boundaries."""
+        return tuple(self.found.boundaries)
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Names of the regions."""
+        return tuple(self.found.regions)
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of the displacement."""
+        found = self.found
+        if self.degree == 1:
+            return found.vertices
+        inside = found.faces + found.cells if found.cell == "hexahedron" else 0
+        return found.vertices + found.edges + inside
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices of the mesh."""
+        return self.found.vertices
+
+    @property
+    def quadrature(self) -> int:
+        """The degree of quadrature in force."""
+        default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
+        return self.quadrature_degree or default[self.cell, self.degree]
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest coordinate (m) along each axis."""
+        return self.found.bounds
+
+    @property
+    def vertices(self) -> tuple[Point, ...]:
+        """Corners (m) of a box around the body."""
+        return tuple((x, y, z) for z, y, x in product(*self.bounds[::-1]))
+
+    @property
+    def longest_edge(self) -> float:
+        """Length (m) of the longest edge of a cell."""
+        return self.found.longest_edge
+
+    @property
+    def description(self) -> str:
+        """The body in words."""
+        extents = " × ".join(f"{high - low:.3g}" for low, high in self.bounds)
+        regions = ", ".join(f"{name} ({volume:.3g} m³)" for name, volume in self.found.regions.items())
+        return f"mesh {Path(self.file).name} of {extents} m; regions: {regions}"
+
+    @property
+    def warnings(self) -> Iterator[str]:
+        """What is odd about it, without being wrong."""
+        extent = max(high - low for low, high in self.bounds)
+        if not SMALL <= extent <= LARGE:
+            yield (
+                f"model.body.unit = {self.unit:g} makes the body {extent:.3g} m long: "
+                "is that meant? Coordinates in millimetres have unit = 1e-3"
+            )
+
+    def contains(self, point: Point) -> bool:
+        """Whether a point (m) lies in a box around the body; where the mesh is made, it must lie in a cell."""
+        return all(low <= x <= high for x, (low, high) in zip(point, self.bounds, strict=True))
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        mesh = self.load()
+        tetrahedra = mesh.points[mesh.cells[:, _TETRAHEDRA[mesh.cell]].reshape(-1, 4)]
+        faces = mesh.cells[:, _FACES[mesh.cell]].reshape(-1, len(_FACES[mesh.cell][0]))
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        outer = faces[first[count == 1]]
+        triangles = mesh.points[
+            np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
+        ]
+        lows, highs = tetrahedra.min(axis=1), tetrahedra.max(axis=1)
+        slack = CLOSE * max(high - low for low, high in self.bounds)
+        found = np.array(points, dtype=float)
+        for i, point in enumerate(found):
+            near = ((lows <= point + slack) & (point - slack <= highs)).all(axis=1)
+            a, b, c, d = np.moveaxis(tetrahedra[near], 1, 0)
+            shares = np.linalg.solve(np.stack([b - a, c - a, d - a], axis=2), (point - a)[..., None])[..., 0]
+            if ((shares >= -CLOSE).all(axis=1) & (shares.sum(axis=1) <= 1 + CLOSE)).any():
+                continue
+            places = _nearest_of(triangles, point)
+            found[i] = places[((places - point) ** 2).sum(axis=1).argmin()]
+        return found
+
+    def corners_of(self, boundary: str) -> list[Point]:
+        """Points (m) that span a boundary."""
+        return list(self.found.boundaries[boundary])
+
+    def refined(self, level: int) -> Self:
+        """Return the body itself for level 0; there are no finer meshes of it."""
+        if level:
+            message = "a mesh from a file has no finer ones, expected a body of kind 'box' or 'block'"
+            raise ModelError(message)
+        return self
+
+
+def _digest(file: str) -> str:
+    try:
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    except OSError as error:
+        message = f"file: {file}: cannot be read: {error.strerror}"
+        raise ModelError(message) from None
+
+
+@lru_cache(maxsize=1)
+def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...], tags: str | None) -> Loaded:
+    """Read a file of known hash."""
+    import meshio
+
+    def refuse(problem: str) -> NoReturn:
+        message = f"file: {file}: {problem}"
+        raise ModelError(message)
+
+    try:
+        with redirect_stdout(StringIO()):  # meshio prints empty lines
+            mesh = meshio.read(file)
+    except (Exception, SystemExit) as error:  # readers fail in many ways, some of them by exiting
+        said = (str(error).splitlines() or [""])[0]
+        refuse(f"cannot be read as a mesh: {said or type(error).__name__}")
+    kinds = [_MESHIO[block.type] for block in mesh.cells if block.type in _MESHIO]
+    others = {block.type for block in mesh.cells if block.dim == 3 and block.type not in _MESHIO}
+    if others or len(set(kinds)) != 1:
+        have = ", ".join(sorted(others | set(kinds))) or "no solid cells"
+        refuse(f"holds {have}, expected linear tetrahedra or linear hexahedra alone")
+    cell: Literal["tetrahedron", "hexahedron"] = "tetrahedron" if kinds[0] == "tetrahedron" else "hexahedron"
+    numbers = _numbers(mesh, tags, refuse)
+    words = _words(mesh, names, numbers, refuse)
+    cells, region_numbers = _gathered(mesh, numbers, next(k for k, v in _MESHIO.items() if v == cell))
+    facets, facet_numbers = _gathered(mesh, numbers, _SURFACES[cell])
+    used, cells = np.unique(cells, return_inverse=True)
+    cells = cells.reshape(-1, len(_CORNERS) if cell == "hexahedron" else 4)
+    points = unit * np.asarray(mesh.points, dtype=float)[used]
+    if points.shape[1] != 3 or not np.isfinite(points).all():
+        refuse("its points are not finite ones in three dimensions")
+    _check_geometry(points, cells, cell, refuse)
+    new = np.full(len(mesh.points), -1)
+    new[used] = np.arange(len(used))
+    boundaries = _outer(new[facets], facet_numbers, cells, cell, lambda n: words.get((2, n), f"{n}"))
+    if not boundaries:
+        refuse(f"names no boundary, expected {_SURFACES[cell]}s of the surface with numbers (gmsh: physical surfaces)")
+    present = np.unique(region_numbers)
+    regions = tuple(words.get((3, int(n)), ALL if len(present) == 1 and not n else f"{n}") for n in present)
+    return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers))
+
+
+def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]:
+    """Return the numbers that the file gives to the cells of each block; zeros where it gives none."""
+    arrays = {
+        name: values
+        for name, values in mesh.cell_data.items()
+        if all(np.issubdtype(v.dtype, np.number) for v in values)
+    }
+    if tags is not None and tags not in arrays:
+        refuse(f"has no array '{tags}'; {nearest(tags, tuple(arrays))}")
+    usual = [name for name in _TAGS if name in arrays]
+    whole = [
+        name
+        for name, values in arrays.items()
+        if not name.startswith("gmsh:") and all(v.ndim == 1 and (v == np.round(v)).all() for v in values)
+    ]
+    chosen = tags or (usual[0] if usual else whole[0] if len(whole) == 1 else None)
+    if chosen is None and len(whole) > 1:
+        refuse(f"has several arrays of numbers, expected tags = one of: {', '.join(whole)}")
+    if chosen is None:
+        return [np.zeros(len(block.data), dtype=np.int64) for block in mesh.cells]
+    return [np.asarray(values).astype(np.int64) for values in arrays[chosen]]
+
+
+def _words(
+    mesh: meshio.Mesh, names: tuple[tuple[str, int], ...], numbers: list[IntArray], refuse: Any
+) -> dict[tuple[int, int], str]:
+    """Return names by dimension and number: those of the file, and those that are given."""
+    words = {(int(dim), int(number)): name.replace(" ", "-") for name, (number, dim) in _named_groups(mesh)}
+    present = {int(n) for part in numbers for n in np.unique(part)}
+    for name, number in names:
+        if number not in present:
+            refuse(f"has no number {number} (names.{name}), expected one of: {', '.join(map(str, sorted(present)))}")
+        words |= {(dim, number): name for dim in (2, 3)}
+    return words
+
+
+def _named_groups(mesh: meshio.Mesh) -> list[tuple[str, Any]]:
+    return [(name, values) for name, values in mesh.field_data.items() if np.size(values) == 2]
+
+
+def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str) -> tuple[IntArray, IntArray]:
+    """Put the cells of a kind together, with their numbers."""
+    parts = [(block.data, n) for block, n in zip(mesh.cells, numbers, strict=True) if block.type == kind]
+    if not parts:
+        return np.zeros((0, 4 if kind == "quad" else 3), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    cells, found = zip(*parts, strict=True)
+    return np.concatenate(cells).astype(np.int64), np.concatenate(found)
+
+
+def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
+    """Refuse cells without volume, and parts that only seem to be joined."""
+    corners = [[0, 1, 2, 3]] if cell == "tetrahedron" else _CORNERS
+    edges = points[cells[:, corners]]  # cells, corners, 4, 3
+    sides = edges[:, :, 1:] - edges[:, :, :1]
+    volumes = np.linalg.det(sides)
+    size = np.linalg.norm(sides, axis=-1).max(axis=(1, 2)) ** 3
+    flat = ~((volumes > FLAT * size[:, None]).all(axis=1) | (volumes < -FLAT * size[:, None]).all(axis=1))
+    if flat.any():
+        refuse(f"{flat.sum()} of {len(cells)} cells have no volume or are turned inside out")
+    grid = np.round((points - points.min(axis=0)) / (CLOSE * np.ptp(points, axis=0).max())).astype(np.int64)
+    twins = len(points) - len(np.unique(grid, axis=0))
+    if twins:
+        refuse(f"{twins} points lie where others lie: its parts are not joined, expected a mesh without double points")
+
+
+def _outer(facets: IntArray, numbers: IntArray, cells: IntArray, cell: str, name: Any) -> dict[str, IntArray]:
+    """Return the facets by name that belong to one cell only: those on the surface of the body."""
+    faces = np.sort(cells[:, _FACES[cell]].reshape(-1, facets.shape[1]), axis=1)
+    sorted_facets = np.sort(facets, axis=1)
+    unique, which = np.unique(np.concatenate([faces, sorted_facets]), axis=0, return_inverse=True)
+    which = which.ravel()
+    of_cells = np.bincount(which[: len(faces)], minlength=len(unique))
+    outside = of_cells[which[len(faces) :]] == 1
+    found = {name(int(n)): facets[outside & (numbers == n)] for n in np.unique(numbers)}
+    return {word: part for word, part in found.items() if len(part)}
+
+
+def contents(mesh: Loaded, digest: str) -> Contents:
+    """Say what a study needs to know of a mesh."""
+    points, cells = mesh.points, mesh.cells
+    edges = np.unique(np.sort(cells[:, _EDGES[mesh.cell]].reshape(-1, 2), axis=1), axis=0)
+    faces = np.unique(
+        np.sort(cells[:, _FACES[mesh.cell]].reshape(len(cells) * len(_FACES[mesh.cell]), -1), axis=1), axis=0
+    )
+    corners = [[0, 1, 2, 3]] if mesh.cell == "tetrahedron" else _CORNERS
+    at = points[cells[:, corners]]
+    # Of a hexahedron, the mean of the volumes at its corners: near enough to be shown.
+    share = 6 if mesh.cell == "tetrahedron" else 1
+    volumes = np.abs(np.linalg.det(at[:, :, 1:] - at[:, :, :1])).mean(axis=1) / share
+    sums = np.bincount(mesh.region, weights=volumes, minlength=len(mesh.regions))
+    low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return Contents(
+        digest=digest,
+        cell=mesh.cell,
+        cells=len(cells),
+        vertices=len(points),
+        edges=len(edges),
+        faces=len(faces),
+        bounds=((low[0], high[0]), (low[1], high[1]), (low[2], high[2])),
+        longest_edge=float(np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max()),
+        boundaries={name: _spanning(points[np.unique(facets)]) for name, facets in mesh.boundaries.items()},
+        regions={name: float(f"{volume:.6g}") for name, volume in zip(mesh.regions, sums, strict=True)},
+    )
+
+
+def _nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
+    """Return the place (n, 3) of each triangle (n, 3, 3) that is nearest to a point (3,)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    square = (normal**2).sum(axis=1)
+    foot = point - (((point - a) * normal).sum(axis=1) / square)[:, None] * normal
+    inside = np.ones(len(triangles), dtype=bool)
+    best, least = foot, np.full(len(triangles), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along = end - start
+        inside &= (np.cross(along, foot - start) * normal).sum(axis=1) >= 0
+        share = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+        place = start + share[:, None] * along
+        distance = ((place - point) ** 2).sum(axis=1)
+        best = np.where((distance < least)[:, None], place, best)
+        least = np.minimum(least, distance)
+    return np.where(inside[:, None], foot, best)
+
+
+def _spanning(points: FloatArray) -> tuple[Point, ...]:
+    """Return up to four points, each as far as possible from what those before it span."""
+    chosen = [points[0]]
+    directions: list[FloatArray] = []
+    extent = np.ptp(points, axis=0).max()
+    for _ in range(3):
+        apart = points - chosen[0]
+        for direction in directions:
+            apart = apart - np.outer(apart @ direction, direction)
+        lengths = np.linalg.norm(apart, axis=1)
+        k = int(lengths.argmax())
+        if lengths[k] <= 1e-9 * extent:
+            break
+        chosen.append(points[k])
+        directions.append(apart[k] / lengths[k])
+    return tuple((float(x), float(y), float(z)) for x, y, z in chosen)

@@ -1,0 +1,391 @@
+"""Displacements that were measured of a specimen: files of them, and what is wrong with them.
+
+A table of comma-separated values has the columns x, y, z (of the undeformed body), any of ux, uy, uz, and optionally
+sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Empty cells
+and ``nan`` say that a component was not measured. Lines that begin with # say where the data are from; those that read
+``# truth.NAME = VALUE`` what they were made of, if they are synthetic. Other files are meshes that meshio reads, with
+the displacements of a load case at their points as ``displacement_CASE``, or ``displacement`` where there is one.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from forward.settings import nearest
+
+TABLES = (".csv", ".txt")
+MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
+POSITION, MOTION, ERRORS = ("x", "y", "z"), ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
+COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
+SAME = 1e-9  # of the extent of all points: distance of points that are one
+TRUTH = "truth."
+
+
+class DataError(ValueError):
+    """Data that cannot be used; each argument is one line: the place, what was found and what was expected."""
+
+    def __str__(self) -> str:
+        """All mistakes, a line each."""
+        return "\n".join(self.args)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Displacements at n points.
+
+    Attributes
+    ----------
+    places
+        Where (n, 3) in the undeformed body (m).
+    displacements
+        What was measured (n, 3) there (m); NaN where it was not.
+    sigma
+        Standard deviations (n, 3) of the errors (m); NaN where the file does not say.
+    cases
+        Names of the load cases, and `case` (n,) the number of each.
+    labels
+        Where (n,) each point stands in its file.
+    source
+        Where they are from, line by line.
+    truth
+        By name, what they were made of, as text.
+    """
+
+    places: FloatArray
+    displacements: FloatArray
+    sigma: FloatArray
+    cases: tuple[str, ...]
+    case: NDArray[np.int64]
+    labels: tuple[str, ...]
+    source: tuple[str, ...] = ()
+    truth: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Which components (n, 3) were measured."""
+        return np.isfinite(self.displacements)
+
+    def with_sigma(self, sigma: float | None) -> Observations:
+        """Return the same with a standard deviation (m) where the file does not say one.
+
+        Raises
+        ------
+        DataError
+            If it is needed and not given.
+        """
+        unknown = self.measured & ~np.isfinite(self.sigma)
+        if not unknown.any():
+            return self
+        if sigma is None:
+            at = self.labels[int(np.flatnonzero(unknown.any(axis=1))[0])]
+            message = f"{at}: no sigma, expected a column sigma or data.sigma (m)"
+            raise DataError(message)
+        return replace(self, sigma=np.where(np.isfinite(self.sigma), self.sigma, sigma))
+
+    def on(
+        self, nearest_place: Callable[[FloatArray], FloatArray], extent: float, tolerance: float
+    ) -> tuple[Observations, FloatArray]:
+        """Put the points on a body.
+
+        Parameters
+        ----------
+        nearest_place
+            Places (n, 3) of the body that are nearest to points (n, 3).
+        extent
+            Size of the body (m).
+        tolerance
+            Largest distance (m) from the body.
+
+        Returns
+        -------
+        tuple
+            The same with points that lie outside moved to the nearest place, and how far (n,) each was moved (m).
+
+        Raises
+        ------
+        DataError
+            If points are farther away, or displacements larger than the body.
+        """
+        mistakes = []
+        largest = np.nanmax(np.abs(self.displacements))
+        if largest > extent:
+            at = self.labels[int(np.flatnonzero((np.abs(self.displacements) == largest).any(axis=1))[0])]
+            mistakes.append(
+                f"{at}: a displacement of {largest:g} m in a body of {extent:g} m, expected a smaller one: "
+                "is data.unit right (m per unit of the file)?"
+            )
+        moved = nearest_place(self.places)
+        distance = np.linalg.norm(moved - self.places, axis=1)
+        distance[distance < SAME * extent] = 0.0
+        far = np.flatnonzero(distance > tolerance)
+        if far.size:
+            worst = far[distance[far].argmax()]
+            where = ", ".join(f"{x:g}" for x in self.places[worst])
+            mistakes.append(
+                f"{self.labels[worst]}: ({where}) lies {distance[worst]:.3g} m outside the body, expected at most "
+                f"data.tolerance = {tolerance:g} m{_others(far.size - 1)}"
+            )
+        if mistakes:
+            raise DataError(*mistakes)
+        return replace(self, places=moved), distance
+
+    def components(self) -> Components:
+        """Return what was measured, component by component, load case after load case."""
+        which, axes = np.nonzero(self.measured)
+        order = np.argsort(self.case[which], kind="stable")
+        which, axes = which[order], axes[order]
+        return Components(
+            self.places[which],
+            axes.astype(np.int64),
+            self.case[which],
+            self.displacements[which, axes],
+            self.sigma[which, axes],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Measured components of displacements, load case after load case.
+
+    Attributes
+    ----------
+    places
+        Where (m, 3), in m.
+    axes
+        Which component (m,): 0, 1 or 2.
+    cases
+        Numbers (m,) of the load cases.
+    values, sigma
+        What was measured (m,), and the standard deviations (m,) of the errors, in m.
+    """
+
+    places: FloatArray
+    axes: NDArray[np.int64]
+    cases: NDArray[np.int64]
+    values: FloatArray
+    sigma: FloatArray
+
+
+def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
+    """Return the files that are meant by names, folders (all data files in them) and patterns such as ``*.csv``.
+
+    Parameters
+    ----------
+    patterns
+        What is meant.
+    folders
+        Where to look for them: the first one that has something counts.
+
+    Raises
+    ------
+    DataError
+        If one of them means nothing.
+    """
+    found: dict[Path, None] = {}
+    missing = []
+    for pattern in patterns:
+        for folder in folders:
+            path = folder / pattern
+            if path.is_dir():
+                here = sorted(child for child in path.iterdir() if child.suffix in TABLES + MESHES)
+            elif path.is_file():
+                here = [path]
+            else:
+                here = sorted(folder.glob(pattern)) if any(sign in pattern for sign in "*?[") else []
+            if here:
+                found |= dict.fromkeys(here)
+                break
+        else:
+            missing.append(f"{pattern}: no such file, expected a file, a folder of data files or a pattern")
+    if missing:
+        raise DataError(*missing)
+    return list(found)
+
+
+def read(path: Path, cases: Sequence[str], unit: float = 1.0) -> Observations:
+    """Read a file.
+
+    Parameters
+    ----------
+    path
+        A table, or a mesh.
+    cases
+        Names of the load cases.
+    unit
+        m per unit of the file.
+
+    Raises
+    ------
+    DataError
+        With every kind of mistake in the file.
+    """
+    if path.suffix not in TABLES + MESHES:
+        message = f"{path.name}: unknown kind of file, expected one of: {', '.join(TABLES + MESHES)}"
+        raise DataError(message)
+    found = _table(path, tuple(cases), unit) if path.suffix in TABLES else _mesh(path, tuple(cases), unit)
+    mistakes = list(_mistakes(found, path.name))
+    if mistakes:
+        raise DataError(*mistakes)
+    return found
+
+
+def _mistakes(found: Observations, name: str) -> list[str]:
+    mistakes = []
+    for number, case in enumerate(found.cases):
+        of_case = found.case == number
+        if not found.measured[of_case].any():
+            mistakes.append(f"{name}: no data in load case '{case}', expected some in every load case of the model")
+    bad = np.flatnonzero((found.sigma <= 0).any(axis=1))
+    if bad.size:
+        value = found.sigma[bad[0]][found.sigma[bad[0]] <= 0][0]
+        mistakes.append(f"{found.labels[bad[0]]}: sigma = {value:g}, expected more than 0{_others(bad.size - 1)}")
+    step = SAME * float(np.ptp(found.places, axis=0).max() or 1.0)
+    keys = np.column_stack([np.round(found.places / step), found.case])
+    _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    which = which.ravel()
+    twice = [
+        (int(first[which[i]]), i)
+        for i in np.flatnonzero(first[which] != np.arange(len(which)))
+        if (found.measured[i] & found.measured[first[which[i]]]).any()
+    ]
+    if twice:
+        one, other = twice[0]
+        mistakes.append(
+            f"{found.labels[other]}: the point of {found.labels[one].rpartition(': ')[2]} again in load case "
+            f"'{found.cases[found.case[other]]}', expected each once{_others(len(twice) - 1)}"
+        )
+    return mistakes
+
+
+def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
+    name = path.name
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{name}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read: {error.strerror}") from None
+    remarks = [line.lstrip("# ") for line in lines if line.startswith("#")]
+    numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
+    table = csv.DictReader((line for _, line in numbered), skipinitialspace=True)
+    columns = tuple(column.strip() for column in table.fieldnames or ())
+    table.fieldnames = columns
+    wrong = [
+        f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
+    ]
+    wrong += [f"{name}: no column '{column}', expected x, y, z" for column in POSITION if column not in columns]
+    if not any(column in columns for column in MOTION):
+        wrong.append(f"{name}: no column of displacements, expected at least one of ux, uy, uz")
+    if "case" not in columns and len(cases) > 1:
+        wrong.append(f"{name}: no column 'case', expected one where there are several load cases: {', '.join(cases)}")
+    if wrong:
+        raise DataError(*wrong)
+    rows = list(table)
+    labels = tuple(f"{name}: line {n}" for n, _ in numbered[1:])
+    if not rows:
+        raise DataError(f"{name}: no rows, expected displacements at points")
+    numbers: dict[str, FloatArray] = {}
+    mistakes = []
+    for column in (*POSITION, *MOTION, "sigma", *ERRORS):
+        if column not in columns:
+            continue
+        values = [_number(row[column]) for row in rows]
+        needed = column in POSITION
+        bad = [i for i, v in enumerate(values) if v is None or math.isinf(v) or (needed and math.isnan(v))]
+        if bad:
+            given = rows[bad[0]][column]
+            mistakes.append(f"{labels[bad[0]]}: {column} is {given!r}, expected a number{_others(len(bad) - 1)}")
+        numbers[column] = unit * np.array([math.nan if v is None else v for v in values])
+    given_cases = [(row.get("case") or "").strip() if "case" in columns else cases[0] for row in rows]
+    strange = [i for i, case in enumerate(given_cases) if case not in cases]
+    if strange:
+        word = given_cases[strange[0]]
+        more = _others(len(strange) - 1)
+        mistakes.append(f"{labels[strange[0]]}: unknown load case '{word}'; {nearest(word, cases)}{more}")
+    if mistakes:
+        raise DataError(*mistakes)
+    nothing = np.full(len(rows), np.nan)
+    common = numbers.get("sigma", nothing)
+    return Observations(
+        np.column_stack([numbers[column] for column in POSITION]),
+        np.column_stack([numbers.get(column, nothing) for column in MOTION]),
+        np.column_stack([numbers.get(column, common) for column in ERRORS]),
+        cases,
+        np.array([cases.index(case) for case in given_cases]),
+        labels,
+        tuple(line for line in remarks if not line.startswith(TRUTH)),
+        dict(_assignment(line) for line in remarks if line.startswith(TRUTH)),
+    )
+
+
+def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
+    import contextlib
+    import io
+
+    try:
+        import meshio
+    except ImportError:
+        message = f"{path.name}: files of this kind need meshio (pip install meshio)"
+        raise DataError(message) from None
+    if not path.exists():
+        raise DataError(f"{path.name}: cannot be read: No such file or directory")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # where meshio prints what it warns of
+            mesh = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise DataError(f"{path.name}: cannot be read as {path.suffix}: {error}") from None
+    fields = {case: f"displacement_{case}" for case in cases}
+    if len(cases) == 1 and fields[cases[0]] not in mesh.point_data:
+        fields[cases[0]] = "displacement"
+    missing = [name for name in fields.values() if name not in mesh.point_data]
+    if missing:
+        raise DataError(
+            *(
+                f"{path.name}: no point data '{name}'; {nearest(name, tuple(mesh.point_data) or ('none',))}"
+                for name in missing
+            )
+        )
+    motions = [np.asarray(mesh.point_data[name], dtype=float) for name in fields.values()]
+    points = np.asarray(mesh.points, dtype=float)
+    n = len(points)
+    for name, motion in zip(fields.values(), motions, strict=True):
+        if motion.shape != (n, 3) or points.shape != (n, 3):
+            raise DataError(f"{path.name}: '{name}' has the shape {motion.shape}, expected ({n}, 3)")
+    if not np.isfinite(points).all():
+        raise DataError(f"{path.name}: a point has a coordinate that is no number")
+    if any(np.isinf(motion).any() for motion in motions):
+        raise DataError(f"{path.name}: a displacement is infinite, expected numbers, or nan where nothing was measured")
+    return Observations(
+        unit * np.tile(points, (len(cases), 1)),
+        unit * np.concatenate(motions),
+        np.full((n * len(cases), 3), np.nan),
+        cases,
+        np.repeat(np.arange(len(cases)), n),
+        tuple(f"{path.name}: point {i}" for _ in cases for i in range(n)),
+    )
+
+
+def _number(text: str | None) -> float | None:
+    """A number, NaN for an empty cell, nothing where it is neither."""
+    text = (text or "").strip()
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        return None
+
+
+def _assignment(line: str) -> tuple[str, str]:
+    name, _, value = line.removeprefix(TRUTH).partition("=")
+    return name.strip(), value.strip().strip('"')
+
+
+def _others(count: int) -> str:
+    return f" (and {count} more)" if count else ""

@@ -1,0 +1,87 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Moments and Sobol' indices of a finished study
+#
+# A study leaves one file, `results.nc`, that xarray reads. This notebook reads the directory that
+# `TISSUQ_RESULTS` names; where it names none, it runs a coarse beam first, which takes some seconds.
+
+# %%
+# %matplotlib inline
+import os
+import tempfile
+from pathlib import Path
+
+from workflows import bodies, plots
+from workflows.config import load
+from workflows.results import read_dataset
+from workflows.study import run
+
+CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
+directory = Path(os.environ.get("TISSUQ_RESULTS") or tempfile.mkdtemp())
+if not (directory / "results.nc").exists():
+    method = "method={kind='sobol', design='chaos', samples=15, second_order=true}"
+    run(load(CONFIGS / "tiny.toml", [method]), "beam", directory, quiet=True)
+data = read_dataset(directory)
+data
+
+# %% [markdown]
+# ## What is in it
+#
+# Every estimate `x` has its standard error beside it, `x_error`. Units are in the coordinate `unit`.
+
+# %%
+table = data[["mean", "mean_error", "std", "std_error"]].to_dataframe()
+table
+
+# %% [markdown]
+# ## Which parameter matters
+#
+# The total index of a parameter is the share of the variance that would be left if all others were known.
+
+# %%
+data["sobol_total"].to_pandas().round(4)
+
+# %%
+output = str(data["output"].values[0])
+plots.index_bars(data, output).figure
+
+# %%
+plots.index_shares(data).figure
+
+# %% [markdown]
+# To first order the same can be read from derivatives at the mean parameters, which cost one solve:
+
+# %%
+plots.tornado(data, output).figure
+
+# %% [markdown]
+# ## Where on the body
+#
+# Indices of the displacement at every node. Bodies are drawn by pyvista without a display; on a machine that
+# cannot draw them at all, there is no picture.
+
+# %%
+strongest = str(data["parameter"].values[data["field_sobol_total"].argmax().item()])
+drawn = bodies.pictures(data, [f"sobol_total {strongest}"])
+if drawn is not None:
+    from IPython.display import Image, display
+
+    display(Image(next(iter(drawn.values())), width=700))
+
+# %% [markdown]
+# The data behind the picture are plain arrays, one row for each node:
+
+# %%
+moving = data["node_sobol_total"].sum("parameter") > 0
+data["node_sobol_total"].isel(node=moving.values).to_pandas().T.describe().loc[["min", "mean", "max"]]

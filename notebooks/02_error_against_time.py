@@ -1,0 +1,88 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Error against time
+#
+# What does a method really err, and what does that cost? `compare` runs methods with growing numbers of samples,
+# each several times over, against a reference. Here on the coarse beam, or from the directory that
+# `TISSUQ_COMPARISON` names, such as `results/beam-compare`.
+
+# %%
+# %matplotlib inline
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+
+from uq.compare import gains
+from workflows import plots
+from workflows.config import parse
+from workflows.results import read_dataset
+from workflows.study import run
+
+METHOD = """
+kind = "compare"
+repeats = 3
+textbook = 0
+seed = 1
+reference = { kind = "chaos", fit = "projection", max_order = 5 }
+methods = [
+    { kind = "monte-carlo", budgets = [8, 32] },
+    { kind = "sensitivity-monte-carlo", budgets = [8, 32] },
+    { kind = "quasi-monte-carlo", control = "tangent", scrambles = 8, budgets = [16, 32] },
+    { kind = "chaos", max_order = 4, budgets = [4, 8, 12] },
+]
+"""
+
+CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
+directory = Path(os.environ.get("TISSUQ_COMPARISON") or tempfile.mkdtemp())
+if not (directory / "results.nc").exists():
+    study = tomllib.loads((CONFIGS / "tiny.toml").read_text()) | {"method": tomllib.loads(METHOD)}
+    run(parse(study), "beam", directory, quiet=True)
+data = read_dataset(directory)
+
+# %% [markdown]
+# ## Errors of the mean
+#
+# Root mean square over the repeats; set-up is charged. Hollow markers are below what the reference can resolve.
+
+# %%
+output = str(data["output"].values[0])
+plots.errors(data, output, "mean", "solves").figure
+
+# %%
+plots.errors(data, output, "mean", "cpu_seconds").figure
+
+# %% [markdown]
+# ## Are claimed errors honest?
+#
+# A method claims a standard error with each estimate. Over the repeats, the claims (`mean_claimed`) should be
+# about as large as what was really erred (`mean_rmse`). With three repeats both are known to 40 % only: for more,
+# more repeats.
+
+# %%
+one = data.sel(output=output)
+table = one[["row_method", "budget", "solves", "mean_rmse", "mean_claimed", "mean_coverage"]].to_dataframe()
+table.drop(columns=["output", "unit"], errors="ignore")
+
+# %% [markdown]
+# ## What a method is worth
+#
+# Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number over what the method
+# costs.
+
+# %%
+worth = gains(one, "mean")
+for i, name in enumerate(one["row_method"].values):
+    listed = ", ".join(f"{float(gain[i]):.3g} in {word.replace('_', ' ')}" for word, gain in worth.items())
+    print(f"{name:28} {int(one['budget'][i]):4} samples: {listed}")

@@ -1,0 +1,126 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Comparing materials
+#
+# Treloar stretched rubber in three ways. Which law do his tests support? Here three candidates with few solves;
+# `configs/treloar.toml` has five, and `TISSUQ_SELECTION=results/treloar` shows that study.
+
+# %%
+# %matplotlib inline
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+
+from workflows import plots, selection_report
+from workflows.config import parse
+from workflows.results import read_dataset
+from workflows.study import run
+from workflows.verdict import findings
+
+STUDY = """
+[data]
+file = "data/treloar.csv"
+measured = "P_MPa"
+unit = 1e6
+modes = { pure_shear = "pure-shear" }
+
+[candidates.neo-hookean]
+material = { kind = "neo-hookean" }
+parameters.C1 = { kind = "log-normal", mean = 2e5, std = 1e5 }
+
+[candidates.mooney-rivlin]
+material = { kind = "mooney-rivlin" }
+parameters.C1 = { kind = "log-normal", mean = 2e5, std = 1e5 }
+parameters.C2 = { kind = "uniform", lower = 0, upper = 2e5 }
+
+[candidates.gent]
+material = { kind = "gent" }
+parameters.mu = { kind = "log-normal", mean = 4e5, std = 2e5 }
+parameters.Jm = { kind = "log-uniform", lower = 60, upper = 300 }
+
+[method]
+kind = "select"
+samples = 64
+seed = 1
+noise = { relative = 0.05, absolute = 5e3, factor = { kind = "log-uniform", lower = 0.2, upper = 20 } }
+subsets = { "uniaxial tension alone" = ["uniaxial"] }
+"""
+
+CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
+directory = Path(os.environ.get("TISSUQ_SELECTION") or tempfile.mkdtemp())
+if not (directory / "results.nc").exists():
+    run(parse(tomllib.loads(STUDY), folder=CONFIGS), "treloar", directory, quiet=True)
+data = read_dataset(directory)
+print(*findings(data), sep="\n")
+
+# %% [markdown]
+# ## Evidence
+#
+# ln Z of each model less the largest, with three standard errors. Before anything is read from it: can all of
+# them be trusted?
+
+# %%
+data["trusted"].to_pandas()
+
+# %%
+selection_report.evidence_bars(data).figure
+
+# %% [markdown]
+# ## What the ranking depends on
+#
+# Other errors, part of the data, priors half and twice as wide.
+
+# %%
+selection_report.probability_bars(data).figure
+
+# %% [markdown]
+# ## Is the best one any good?
+#
+# The most probable of the candidates may still be wrong. If a model were true, residuals as large, and neighbours
+# as much alike, as those that were found would have these probabilities:
+
+# %%
+data[["misfit_probability", "correlation_probability"]].min("group").to_pandas()
+
+# %%
+group = str(data["group"].values[0])
+test = str(data["output_test"].values[0])
+selection_report.curves(data, group, test).figure
+
+# %% [markdown]
+# ## Posteriors of the constants
+#
+# Points of the best model with their weights; the crosses are the modes.
+
+# %%
+best = str(data["model"].values[data["log_evidence"].argmax().item()])
+selection_report.corner(data, best, group).figure
+
+# %% [markdown]
+# Any other picture is some lines of matplotlib on `plots.axes()`: the predicted stress at the last stretch, with
+# what the models do not agree on.
+
+# %%
+last = data.isel(output=[i for i, name in enumerate(data["output_test"].values) if name == test][-1])
+ax = plots.axes()
+names = [str(name) for name in data["model"].values]
+low, high = last["prediction_quantiles"].sel(quantile=[0.05, 0.95]).transpose("quantile", "model").values / 1e6
+middle = last["prediction_mean"].values / 1e6
+ax.errorbar(range(len(names)), middle, yerr=[middle - low, high - middle], fmt="o", color=plots.CONTROLLED, capsize=4)
+ax.axhline(float(last["measured"]) / 1e6, color=plots.DARK, linestyle="--", label="measured")
+ax.set_xticks(range(len(names)), names)
+ax.set_ylabel(f"stress of {test} at {float(last['output_at']):.3g} (MPa)")
+ax.legend()
+ax.figure

@@ -1,0 +1,356 @@
+"""Inversion as a study: records, few parameters and fields, batches, synthetic data, and the command line."""
+
+import csv
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from forward.model import FunctionModel
+from inverse.inversion import (
+    Inversions,
+    Invert,
+    Synthesize,
+    Variables,
+    invert_by_all,
+    invert_by_group,
+    sentence,
+    variables,
+)
+from inverse.observations import Components
+from tests.launch import run
+from uq.distributions import LogNormal, LogUniform, Normal
+from uq.evaluate import Request, SerialEvaluate
+from uq.inputs import Inputs
+from workflows.config import StudyError, load, parse
+from workflows.plan import plan
+from workflows.starter import starter
+
+TISSUQ = Path(sys.executable).parent / "tissuq"
+ROOT = Path(__file__).parent.parent
+
+# --- records ---------------------------------------------------------------------------------------------------------
+
+
+def test_records_are_vectors():
+    found = Variables({"a": ("x",), "b": (), "c": ("y", "x")}, {"x": 3, "y": 2})
+    row = found.pack({"a": np.array([1.0, 2.0]), "b": np.array(5.0), "c": np.ones((2, 4))})
+    assert len(found.names) == len(row) == 3 + 1 + 6
+    record = found.unpack(row[None])
+    np.testing.assert_array_equal(record["a"], [[1, 2, np.nan]])
+    np.testing.assert_array_equal(record["b"], [5])
+    np.testing.assert_array_equal(record["c"], np.ones((1, 2, 3)))
+
+
+# --- few parameters, by closed forms ---------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(5)
+MATRIX = RNG.standard_normal((12, 3))
+PRIORS = {name: Normal(mean=mean, std=std) for name, mean, std in (("a", 1.0, 0.5), ("b", -1.0, 2.0), ("c", 0.0, 1.0))}
+DATA = Components(
+    RNG.uniform(size=(12, 3)),
+    np.arange(12) % 3,
+    np.repeat([0, 1], 6),
+    MATRIX @ [1.2, -0.5, 0.4] + 0.1 * RNG.standard_normal(12),
+    np.full(12, 0.1),
+)
+
+
+def linear():
+    return FunctionModel(lambda p: MATRIX @ p, ("a", "b", "c"), tuple(map(str, range(12))), lambda p: MATRIX)
+
+
+def test_linear_models_have_the_exact_posterior():
+    method = Invert(samples=64, starts=2)
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    prior_std = np.array([p.std for p in PRIORS.values()])
+    mean = np.array([p.mean for p in PRIORS.values()])
+
+    def posterior(rows):
+        A = MATRIX[rows] / 0.1
+        precision = A.T @ A + np.diag(prior_std**-2.0)
+        right = A.T @ DATA.values[rows] / 0.1 + mean / prior_std**2
+        return np.linalg.solve(precision, right), np.linalg.inv(precision)
+
+    exact, covariance = posterior(np.arange(12))
+    np.testing.assert_allclose(record["mode"], exact, rtol=1e-8)
+    np.testing.assert_allclose(record["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
+    np.testing.assert_allclose(record["std"], np.sqrt(np.diag(covariance)), rtol=0.3)
+    np.testing.assert_allclose(record["laplace_std"], np.sqrt(np.diag(covariance)), rtol=0.02)
+    S = 0.01 * np.eye(12) + (MATRIX * prior_std**2) @ MATRIX.T
+    gap = DATA.values - MATRIX @ mean
+    log_evidence = -(gap @ np.linalg.solve(S, gap) + np.linalg.slogdet(S)[1] + 12 * np.log(2 * np.pi)) / 2
+    assert record["log_evidence"] == pytest.approx(log_evidence, abs=1e-8)
+    for k in range(2):
+        rows = np.flatnonzero(DATA.cases == k)
+        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(posterior(rows)[1])), rtol=1e-8)
+        A = MATRIX[rows] * prior_std / 0.1
+        np.testing.assert_allclose(record["alone_eigenvalue"][k], np.linalg.eigvalsh(A.T @ A)[::-1], rtol=1e-8)
+        assert record["misfit"][k] == pytest.approx((record["residual"][rows] ** 2).sum())
+    assert (record["alone_eigenvalue"] <= record["eigenvalue"]).all()
+    assert record["misfit_degrees"].sum() == pytest.approx(record["residual_degrees"])
+    assert sentence(record["why"]).startswith("Laplace's Gaussian can be trusted")
+
+
+def test_the_noise_can_be_unknown():
+    method = Invert(samples=256, starts=1, noise=LogUniform(lower=0.1, upper=10.0))
+    record = invert_by_all(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1])
+    assert len(record["mode"]) == 4
+    assert record["lower"][3] < 1 < record["upper"][3]
+    assert np.isnan(record["alone_std"][:, 3]).all()
+    np.testing.assert_array_equal(record["direction_parameter"][:, 3], 0)
+
+
+def test_inversions_are_evaluations():
+    """Two data sets, one of which has no answer: the other's record is that of the inversion alone."""
+    method = Invert(samples=32, starts=1)
+    names = ("a", "b", "c")
+    layout = variables(names, field=False, cases=2, data=14, nodes=1, method=method)
+
+    def look(points):
+        return points[:, :1]
+
+    def invert(parameters):
+        return layout.pack(invert_by_group(Inputs(PRIORS), linear(), DATA, method, look))
+
+    found = SerialEvaluate(Inversions(invert, ("data_set",), layout.names))(Request(np.array([[0.0], [1.0]])))
+    record = layout.unpack(found.outputs)
+    np.testing.assert_array_equal(record["mode"][0], record["mode"][1])
+    np.testing.assert_array_equal(np.isnan(record["measured"][0]), np.arange(14) >= 12)
+
+
+def test_synthetic_data_have_the_errors_that_were_asked():
+    points = np.repeat(np.arange(200), 3)
+    cases = np.repeat([0, 1], 300)
+    model = FunctionModel(
+        lambda p: p[0] * np.where(cases == 0, 1.0, 10.0), ("a",), tuple(map(str, range(600))), lambda p: None
+    )
+    method = Synthesize(noise={"relative": 0.1}, fraction=(1.0, 0.25), missing=0.2, seed=3)
+    inputs = Inputs({"a": LogNormal(mean=2.0, std=0.5)})
+    found = method.run(inputs, SerialEvaluate(model), cases, points)
+    a = found["truth"].to_numpy()[:, 0]
+    np.testing.assert_allclose(found["sigma"].to_numpy()[:, [0, 300]], np.outer(a, [0.1, 1.0]))
+    z = ((found["values"] - found["clean"]) / found["sigma"]).to_numpy()
+    assert np.nanstd(z) == pytest.approx(1, abs=0.1)
+    assert np.isnan(z[0]).mean() == pytest.approx(0.2, abs=0.05)
+    kept = np.isfinite(z[1]).reshape(200, 3)
+    assert kept.any(axis=1).sum() <= 50
+    xr.testing.assert_identical(found, method.run(inputs, SerialEvaluate(model), cases, points))
+
+
+# --- studies ---------------------------------------------------------------------------------------------------------
+
+CUBE = """
+[model]
+kind = "specimen"
+body = { size = [1.0, 1.0, 1.0], cells = [CELLS, CELLS, CELLS], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e4, lmbda = 4e4 }
+cases = [
+    { name = "shear", clamp = ["z-min"], loads = [TRACTION, direction = [1, 0, 0] }] },
+    { name = "pull", clamp = ["z-min"], loads = [TRACTION, direction = [0, 0, 1] }] },
+]
+""".replace("TRACTION", '{ kind = "traction", on = "z-max", size = 900')
+LUMP = 'inclusions = [{ name = "lump", x = 0.6, y = 0.5, z = 0.5, radius = 0.3, contrast = 4, width = 0.4 }]\n'
+MADE = (
+    CUBE.replace("CELLS", "3")
+    + LUMP
+    + """
+observed = [{ on = "x-max" }, { on = "z-max" }]
+
+[method]
+kind = "synthesize"
+noise = { relative = 0.02 }
+fraction = [1.0, 0.3]
+seed = 1
+"""
+)
+FEW = (
+    CUBE.replace("CELLS", "2")
+    + LUMP
+    + """
+[parameters]
+"inclusions.lump.contrast" = { kind = "log-uniform", lower = 1, upper = 16 }
+"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }
+
+[data]
+files = ["data"]
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+draws = 50
+"""
+)
+FIELD = (
+    CUBE.replace("CELLS", "2")
+    + """
+fields = [{ of = "stiffness", length = 0.6, std = 0.4, basis = "nodes" }]
+
+[data]
+files = ["data/made-1.csv"]
+
+[method]
+kind = "invert"
+draws = 20
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Studies with two synthetic data sets, one that has the wrong columns, and one of other units."""
+    place = tmp_path_factory.mktemp("inversion")
+    for name, text in (("made", MADE), ("few", FEW), ("field", FIELD)):
+        (place / f"{name}.toml").write_text(text)
+    done = run(None, TISSUQ, "run", place / "made.toml", "--out", place / "made")
+    assert done.returncode == 0, done.stderr
+    (place / "made" / "data").rename(place / "data")
+    (place / "data" / "wrong.csv").write_text("x,y,z,vx\n0,0,0,1\n")
+    return place
+
+
+def test_synthetic_data_say_what_they_are_of(folder):
+    text = (folder / "data" / "made-2.csv").read_text()
+    assert "# truth.inclusions.lump.contrast = 4.0\n" in text
+    assert text.startswith("# Synthetic: 3 × 3 × 3 cells (hexahedron, degree 1), errors relative 0.02, seed 1.")
+    study = load(folder / "few.toml", ["data.files=['data/made-*.csv']"])
+    counts = [len(set(map(tuple, m.observations.places))) for m in study.measurements]
+    assert counts == [28, round(0.3 * 28)]
+    assert study.measurements[0].truth["material.mu"] == 1e4
+    page = (folder / "made" / "report.html").read_text()
+    assert "2 data sets" in page
+
+
+def test_a_batch_from_the_command_line(folder):
+    """One bad file does not stop the others; one rank or two: the same bytes."""
+    done = run(None, TISSUQ, "run", folder / "few.toml", "--out", folder / "one")
+    assert done.returncode == 3, done.stderr
+    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
+    rows = list(csv.DictReader((folder / "one" / "batch.csv").read_text().splitlines()))
+    assert [(row["data_set"], row["ok"]) for row in rows] == [("made-1", "yes"), ("made-2", "yes"), ("wrong", "no")]
+    assert "unknown column" in rows[2]["why"]
+    widths = [float(row["inclusions.lump.contrast std"]) for row in rows[:2]]
+    assert widths[1] > widths[0]
+    summary = json.loads((folder / "one" / "summary.json").read_text())
+    assert summary["failed"] == 1
+    assert summary["data_sets"]["wrong"] == {"failed": rows[2]["why"]}
+    assert set(summary["data_sets"]["made-1"]["posterior"]["material.mu"]) == {"mode", "std", "lower", "upper"}
+    done = run(2, TISSUQ, "run", folder / "few.toml", "--out", folder / "two")
+    assert done.returncode == 3, done.stderr
+    assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
+    page = (folder / "one" / "report.html").read_text()
+    for words in ("All data sets", "could not be inverted", "Load cases", "data:image/png", "log-uniform"):
+        assert words in page
+    assert (folder / "one" / "fields" / "made-1.vtu").exists()
+    found = xr.load_dataset(folder / "one" / "results.nc", engine="h5netcdf")
+    np.testing.assert_array_equal(found["ok"], [True, True, False])
+    assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
+
+
+def test_one_data_set_and_what_others_read_of_it(folder):
+    alone = ["--set", "data.files=['data/made-1.csv']"]
+    done = run(None, TISSUQ, "run", folder / "few.toml", *alone, "--out", folder / "single")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((folder / "single" / "summary.json").read_text())
+    assert summary["evaluations"] > 32
+    assert set(summary["posterior"]) == {"inclusions.lump.contrast", "material.mu"}
+    assert summary["log_evidence_error"] < 1
+    arviz = pytest.importorskip("arviz")
+    kept = arviz.from_netcdf(folder / "single" / "results.nc")
+    assert kept.posterior["material.mu"].shape == (1, 50)
+    assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
+    again = run(None, TISSUQ, "run", folder / "few.toml", *alone, "--out", folder / "single")
+    assert "nothing to do" in again.stdout
+
+
+def test_a_field_from_the_command_line(folder):
+    done = run(None, TISSUQ, "run", folder / "field.toml", "--out", folder / "field")
+    assert done.returncode == 0, done.stderr
+    found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
+    assert found.sizes["node"] == 27
+    assert (found["stiffness_std"] < found["stiffness_prior_std"]).all()
+    assert (found["alone_stiffness_std"] >= found["stiffness_std"] - 1e-9).all()
+    assert int((found["eigenvalue"] > 1).sum()) > int((found["alone_eigenvalue"] > 1).sum("direction").max())
+    assert np.isfinite(found["stiffness_true"]).all()
+    centre = int(np.abs(found["node_position"] - [0.5, 0.5, 0.5]).sum("axis").argmin())
+    assert float(found["stiffness_true"][centre]) == pytest.approx(np.log(4), abs=0.5)
+    page = (folder / "field" / "report.html").read_text()
+    for words in ("directions that the data constrain most", "by each load case alone", "log-normal field", "penalty"):
+        assert words in page
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "told"),
+    [
+        (FEW, 'files = ["data"]', 'files = ["nothing"]', r"data.files: nothing: no such file"),
+        (FEW, 'files = ["data"]', 'files = ["data/wrong.csv"]', r"data: wrong.csv: unknown column 'vx'"),
+        (FEW, 'files = ["data"]', 'files = ["data/made-1.csv"]\nunit = 1e3', r"expected a smaller one: is data\.unit"),
+        (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
+        (FEW, "lower = 1,", "lower = -1,", "lower"),
+        (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',
+         "a field of nodal values is inverted alone"),
+        (FIELD, "draws = 20", 'chains = "emcee"', "expected 'pcn'"),
+        (FIELD, "draws = 20", "samples = 8", "expected at least 32"),
+        (FIELD, 'of = "stiffness"', 'of = "density"', "no load is gravity"),
+        (MADE, "observed = ", "# observed = ", "model.observed: nothing is observed"),
+        (MADE, "relative = 0.02", "", "expected either relative or absolute"),
+        (MADE, "fraction = [1.0, 0.3]", "fraction = [1.5]", "method.fraction"),
+    ],
+)  # fmt: skip
+def test_one_line_for_a_mistake(folder, text, old, new, told):
+    path = folder / "mistake.toml"
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(StudyError, match=told):
+        load(path)
+
+
+def test_points_outside_the_body_are_told(folder):
+    text = (folder / "data" / "made-1.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(text) if line.startswith("1,"))
+    text[first] = "1.001" + text[first][1:]
+    (folder / "outside.csv").write_text("\n".join(text))
+    study = load(folder / "few.toml", ["data.files=['outside.csv']", "data.tolerance=0.01"])
+    assert study.measurements[0].moved.max() == pytest.approx(1e-3)
+    assert any("1 points outside the body" in line for line in plan(study))
+    with pytest.raises(StudyError, match=r"lies 0.001 m outside the body.*data\.tolerance = 0 m"):
+        load(folder / "few.toml", ["data.files=['outside.csv']"])
+
+
+def test_starters(tmp_path):
+    (tmp_path / "measured.csv").write_text("x,y,z,uz\n0.025,0.025,0.05,0.002\n")
+    assert parse(tomllib.loads(starter("invert")), folder=tmp_path).method.kind == "invert"
+    assert parse(tomllib.loads(starter("synthesize"))).method.kind == "synthesize"
+
+
+# --- what is recovered -----------------------------------------------------------------------------------------------
+
+
+def shipped(name, out, *changes):
+    done = run(None, TISSUQ, "run", ROOT / "configs" / f"{name}.toml", "--out", out, *changes)
+    assert done.returncode == 0, done.stderr
+    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+
+
+@pytest.mark.slow
+def test_the_shipped_inclusion_is_recovered(tmp_path):
+    found = shipped("inclusion", tmp_path / "out").isel(data_set=0)
+    error = dict(zip(found.parameter.values, np.abs(found["mean"] - found["true"]).to_numpy(), strict=True))
+    assert max(error[f"inclusions.lump.{axis}"] for axis in "xyz") < 0.02 * 0.05
+    assert error["inclusions.lump.radius"] < 0.05 * 0.012
+    contrast = found.sel(parameter="inclusions.lump.contrast")
+    assert contrast["lower"] < contrast["true"] < contrast["upper"]
+
+
+@pytest.mark.slow
+def test_the_shipped_field_is_recovered(tmp_path):
+    found = shipped("stiffness-field", tmp_path / "out").isel(data_set=0)
+    z = np.abs(found["stiffness_mean"] - found["stiffness_true"]) / found["stiffness_std"]
+    assert float((z < 2).mean()) >= 0.9
+    assert np.corrcoef(found["stiffness_mean"], found["stiffness_true"])[0, 1] > 0.7
+    assert int((found["eigenvalue"] > 1).sum()) > int((found["alone_eigenvalue"] > 1).sum("direction").max())

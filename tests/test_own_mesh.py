@@ -1,0 +1,375 @@
+"""Bodies from files: the same as a box where the mesh is the same; names, regions, units, mistakes."""
+
+import json
+import shutil
+import tomllib
+from itertools import product
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+import xarray as xr
+from mpi4py import MPI
+
+from forward.conformance import check_derivatives
+from forward.geometry import Box
+from forward.hyperelastic import Hyperelastic
+from forward.model import ModelError
+from forward.own_mesh import OwnMesh
+from tests.bodies import loaded_body
+from tests.launch import ROOT, run_script
+from workflows.config import StudyError, differences, document, load, parse
+from workflows.plan import plan
+
+SIZE, CELLS = (1.0, 0.7, 0.8), (2, 1, 1)
+CUBE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+TETRAHEDRA = [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
+NAMES = ("x-min", "x-max", "y-min", "y-max", "z-min", "z-max")
+FACES = {"hexahedron": ("quad", 4), "tetra": ("triangle", 3)}
+
+
+def box(kind="hexahedron", scale=1.0):
+    """The mesh of a box: its right half is the region `right`, its faces have the names of those of a box."""
+    lengths = np.array(CELLS) + 1
+    grid = np.array(list(product(*map(range, lengths))))
+    points = grid / np.array(CELLS) * SIZE * scale
+    number = {tuple(place): i for i, place in enumerate(grid)}
+    cells, regions = [], []
+    for corner in product(*map(range, CELLS)):
+        corners = np.array([number[tuple(np.add(corner, step))] for step in CUBE])
+        made = [corners] if kind == "hexahedron" else corners[TETRAHEDRA]
+        cells += list(made)
+        regions += [1 + (corner[0] > 0)] * len(made)
+    local = (
+        [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+        if kind == "hexahedron"
+        else [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
+    )
+    facets, numbers = [], []
+    for cell in cells:
+        for face in np.asarray(cell)[local]:
+            for axis in range(3):
+                for end, place in enumerate((0, CELLS[axis])):
+                    if (grid[face, axis] == place).all():
+                        facets.append(face)
+                        numbers.append(10 + 2 * axis + end)
+    of_cells = [np.array(regions, dtype=np.int32), np.array(numbers, dtype=np.int32)]
+    return meshio.Mesh(
+        points,
+        [(kind, np.array(cells)), (FACES[kind][0], np.array(facets))],
+        cell_data={"gmsh:physical": of_cells, "gmsh:geometrical": of_cells},
+        field_data={
+            "left": np.array([1, 3]),
+            "right": np.array([2, 3]),
+            **{name: np.array([10 + k, 2]) for k, name in enumerate(NAMES)},
+        },
+    )
+
+
+def numbered(mesh):
+    """The same without names, as formats have it that know none."""
+    return meshio.Mesh(mesh.points, mesh.cells, cell_data={"part": mesh.cell_data["gmsh:physical"]})
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "box.msh"
+    meshio.write(path, box(), file_format="gmsh22", binary=True)
+    return path
+
+
+def spec(file, **changes):
+    body = {"kind": "mesh", "file": str(file), "degree": 1} | changes.pop("body", {})
+    boxed = loaded_body("mooney-rivlin").model_dump(exclude_none=True)
+    return Hyperelastic.model_validate(boxed | {"body": body} | changes)
+
+
+def built(model, *parameters):
+    return model.build(MPI.COMM_SELF, parameters)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(("form", "extension"), [("gmsh22", "msh"), ("vtu", "vtu"), ("xdmf", "xdmf")])
+def test_the_same_mesh_gives_the_same_solution(tmp_path, form, extension):
+    path = tmp_path / f"box.{extension}"
+    mesh = box(scale=1000.0)
+    body = {"unit": 1e-3}
+    if extension != "msh":
+        mesh = numbered(mesh)
+        body["names"] = {"left": 1, "right": 2} | {name: 10 + k for k, name in enumerate(NAMES)}
+    meshio.write(path, mesh, file_format=form)
+    own = spec(path, body=body)
+    assert set(own.body.boundaries) == set(NAMES)
+    assert set(own.body.regions) == {"left", "right"}
+    ours, theirs = (built(model).solve(np.zeros(0)) for model in (own, loaded_body("mooney-rivlin")))
+    np.testing.assert_allclose(ours.outputs, theirs.outputs, rtol=1e-9)
+
+
+def test_what_is_found_is_that_of_the_box(file):
+    own, boxed = OwnMesh(file=str(file)), Box(size=SIZE, cells=CELLS)
+    assert own.nodes == boxed.nodes
+    assert own.vertex_count == boxed.vertex_count
+    assert own.cell_count == boxed.cell_count
+    assert own.longest_edge == pytest.approx(boxed.longest_edge)
+    np.testing.assert_allclose(own.bounds, boxed.bounds)
+    np.testing.assert_allclose(own.vertices, boxed.vertices)
+    assert own.found.regions == pytest.approx({"left": 0.28, "right": 0.28})
+    for name in NAMES:
+        spanned = np.array(own.corners_of(name))
+        assert len(spanned) == 3
+        assert {tuple(p) for p in spanned.round(9).tolist()} <= {
+            tuple(np.round(p, 9)) for p in boxed.corners_of(name) + np.array(own.corners_of(name)).tolist()
+        }
+
+
+@pytest.mark.parametrize("kind", ["hexahedron", "tetra"])
+def test_nearest_places_are_those_of_the_box(tmp_path, kind):
+    meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
+    points = np.random.default_rng(0).uniform(-0.4, 1.4, (60, 3))
+    found = OwnMesh(file=str(tmp_path / "box.vtu")).nearest(points)
+    np.testing.assert_allclose(found, Box(size=SIZE, cells=CELLS).nearest(points), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("kind", ["hexahedron", "tetra"])
+def test_nodes_are_those_of_the_space(tmp_path, kind, degree):
+    from forward import fenicsx
+
+    meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
+    own = OwnMesh(file=str(tmp_path / "box.vtu"), degree=degree)
+    msh, facets = fenicsx.mesh_body(MPI.COMM_SELF, own)
+    assert len(fenicsx.node_coordinates(fenicsx.scalar_space(msh, degree))) == own.nodes
+    per_face = 1 if kind == "hexahedron" else 2
+    assert {name: len(found) for name, found in facets.items()} == {
+        f"{10 + k}": per_face * (1 if k < 2 else 2) for k in range(6)
+    }
+    assert own.regions == ("1", "2")
+
+
+REGION = {"C1": 1e4, "C2": 2e4, "D1": 2e5, "contrast": 1.0}  # constants as outside
+NUMBERS = ("material.C1", *(f"regions.right.{name}" for name in REGION))
+FEW = ({"kind": "max-displacement", "name": "largest"}, {"kind": "strain-energy", "name": "energy"})
+
+
+def regional(file):
+    """A model of which the right half has numbers of its own."""
+    return spec(file, regions={"right": REGION}, outputs=FEW)
+
+
+@pytest.mark.fem
+def test_derivatives_by_the_numbers_of_regions(file):
+    point = np.array([1e4, 2e4, 3e4, 1e5, 1.5])
+    check_derivatives(built(regional(file), *NUMBERS), point, 0.1 * point, noise=1e-10).require()
+
+
+@pytest.mark.fem
+def test_constants_and_contrast_say_the_same(file):
+    model = built(regional(file), *NUMBERS)
+    plain = built(spec(file)).solve(np.zeros(0))
+    base = np.array([*REGION.values()])
+    at_base = model.solve(np.array([1e4, *base]))
+    np.testing.assert_allclose(at_base.state, plain.state, rtol=1e-9, atol=1e-12)
+    thrice = base * [1, 1, 1, 3]
+    stiff = model.solve(np.array([1e4, *thrice])).outputs
+    np.testing.assert_allclose(model.solve(np.array([1e4, *(base * [3, 3, 3, 1])])).outputs, stiff, rtol=1e-9)
+    assert np.abs(stiff / at_base.outputs - 1).max() > 0.02
+
+
+RANKS = """
+import sys, json
+import numpy as np
+from mpi4py import MPI
+from tests.test_own_mesh import NUMBERS, regional
+model = regional(sys.argv[1]).build(MPI.COMM_WORLD, NUMBERS)
+solution = model.solve(np.array([1e4, 2e4, 3e4, 1e5, 1.5]))
+state = model.gather(solution.state[None])
+found = [solution.outputs, solution.tangent(np.eye(5)).ravel(), solution.adjoint(np.eye(2)).ravel()]
+if MPI.COMM_WORLD.rank == 0:
+    print(json.dumps([values.tolist() for values in (*found, state[0])]))
+"""
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_ranks_that_share_the_mesh_agree(file):
+    one, two = (run_script(ranks, RANKS, file) for ranks in (1, 2))
+    assert one.returncode == two.returncode == 0, two.stderr
+    for a, b in zip(*(json.loads(done.stdout.splitlines()[-1]) for done in (one, two)), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
+
+
+@pytest.mark.fem
+def test_results_hold_the_regions(tmp_path, file):
+    from workflows.study import run
+
+    blocks = document(parse(tomllib.loads((ROOT / "configs" / "tiny.toml").read_text())))
+    blocks["model"] = spec(file, outputs=FEW, displacements=(), loads=loaded_body("mooney-rivlin").loads).model_dump(
+        mode="json", exclude_none=True
+    )
+    blocks["parameters"] = {"loads.gravity.density": {"kind": "uniform", "lower": 500, "upper": 700}}
+    study = parse(blocks, ["method={kind='monte-carlo', samples=2}"])
+    assert run(study, "own", tmp_path / "own", quiet=True) == 0
+    data = xr.load_dataset(tmp_path / "own" / "results.nc")
+    grid = pyvista.read(tmp_path / "own" / "fields" / "displacement.vtu")
+    middles = grid.cell_centers().points[:, 0]
+    assert list(data.region.values) == ["left", "right"]
+    np.testing.assert_array_equal(grid.cell_data["region"], middles > 0.5)
+    np.testing.assert_array_equal(data["cell_region"], middles > 0.5)
+
+
+@pytest.mark.fem
+def test_fields_on_a_mesh_of_tetrahedra(tmp_path):
+    meshio.write(tmp_path / "box.vtu", numbered(box("tetra")))
+    field = {"of": "stiffness", "length": 0.5, "std": 0.3, "modes": 2}
+    blocks = {
+        "fields": (field,),
+        "clamp": ("10",),
+        "displacements": (),
+        "outputs": ({"name": "u", "kind": "max-displacement"},),
+    }
+    loads = ({"kind": "gravity", "direction": (0.0, -1.0, 0.3), "density": 600.0},)
+    model = spec(tmp_path / "box.vtu", loads=loads, **blocks)
+    names = ("fields.stiffness.0", "fields.stiffness.1")
+    check_derivatives(built(model, *names), np.array([0.3, -0.5]), np.ones(2), noise=1e-10).require()
+
+
+def test_groups_of_gmsh(tmp_path):
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Terminal", 0)
+    gmsh.model.occ.addBox(0, 0, 0, 2, 1, 1)
+    gmsh.model.occ.synchronize()
+    gmsh.model.addPhysicalGroup(3, [1], name="whole liver")
+    gmsh.model.addPhysicalGroup(2, [1], name="held")
+    gmsh.model.addPhysicalGroup(2, [2], tag=7)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.7)
+    gmsh.model.mesh.generate(3)
+    gmsh.write(str(tmp_path / "box.msh"))
+    gmsh.finalize()
+    own = OwnMesh(file=str(tmp_path / "box.msh"), unit=0.1, names={"pulled": 7})
+    assert (own.boundaries, own.regions) == (("held", "pulled"), ("whole-liver",))
+    assert own.found.regions["whole-liver"] == pytest.approx(2e-3)
+    np.testing.assert_allclose(np.array(own.corners_of("held"))[:, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(np.array(own.corners_of("pulled"))[:, 0], 0.2)
+
+
+def write(path, mesh):
+    meshio.write(path, mesh)
+    return path
+
+
+def lacking(mesh):
+    return meshio.Mesh(mesh.points, mesh.cells[:1])
+
+
+def doubled(mesh):
+    points = np.vstack([mesh.points, mesh.points])
+    cells = [(mesh.cells[0].type, np.vstack([mesh.cells[0].data[:1], mesh.cells[0].data[1:] + len(mesh.points)]))]
+    cells += [(mesh.cells[1].type, mesh.cells[1].data)]
+    return meshio.Mesh(points, cells, cell_data=mesh.cell_data)
+
+
+def flat(mesh):
+    mesh.points[:, 2] = 0
+    return mesh
+
+
+def mixed(mesh):
+    other = box("tetra")
+    cells = [*mesh.cells, *other.cells]
+    return meshio.Mesh(
+        mesh.points, cells, cell_data={"part": [*mesh.cell_data["part"], *other.cell_data["gmsh:physical"]]}
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "message"),
+    [
+        (lacking, {}, "names no boundary, expected quads of the surface"),
+        (doubled, {}, "4 points lie where others lie: its parts are not joined"),
+        (flat, {}, "2 of 2 cells have no volume"),
+        (mixed, {}, "holds hexahedron, tetrahedron, expected linear tetrahedra or linear hexahedra alone"),
+        (lambda mesh: mesh, {"names": {"tool": 99}}, r"has no number 99 \(names.tool\), expected one of: 1, 2, 10"),
+        (lambda mesh: mesh, {"tags": "prt"}, r"has no array 'prt'; did you mean 'part'"),
+    ],
+)
+def test_one_line_for_a_file_that_will_not_do(tmp_path, change, settings, message):
+    path = write(tmp_path / "bad.vtu", change(numbered(box())))
+    with pytest.raises(ValueError, match=message):
+        OwnMesh(file=str(path), **settings)
+
+
+STUDY = """
+[model]
+body = {{ kind = "mesh", file = "box.msh", unit = {unit} }}
+material = {{ kind = "neo-hookean", C1 = 1e4, D1 = 1e5 }}
+regions = {{ {region} = {{ {number} = 2e4 }} }}
+clamp = ["{clamp}"]
+loads = [{{ kind = "gravity", density = 1000 }}]
+outputs = [{{ name = "u", kind = "max-displacement" }}]
+[parameters]
+"material.C1" = {{ kind = "uniform", lower = 5e3, upper = 2e4 }}
+[method]
+kind = "{method}"
+samples = {samples}
+"""
+
+
+def text(**changes):
+    usual = {"unit": 1.0, "samples": 16, "region": "right", "number": "C1", "clamp": "x-min", "method": "monte-carlo"}
+    return STUDY.format(**(usual | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"region": "rigth"}, "model.regions.rigth: unknown region; did you mean 'right'"),
+        ({"number": "C2"}, "model.regions.right.C2: not a constant of 'neo-hookean'; did you mean 'C1'"),
+        ({"clamp": "x-mid"}, "model.clamp[0]: unknown boundary; did you mean 'x-min'"),
+        ({"method": "multilevel-monte-carlo"}, "method.kind: a mesh from a file has no finer ones"),
+    ],
+)
+def test_mistakes_in_a_study(file, changes, message):
+    with pytest.raises(StudyError) as caught:
+        parse(tomllib.loads(text(**changes)), folder=file.parent)
+    assert len(caught.value.args) == 1, caught.value.args
+    assert caught.value.args[0].startswith(message)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(StudyError, match=r"model\.body: file: .*box\.msh: cannot be read: No such file"):
+        parse(tomllib.loads(text()), folder=tmp_path)
+
+
+def test_units_are_checked(file):
+    warned = [line for line in plan(parse(tomllib.loads(text(unit=1e-5)), folder=file.parent)) if "warning" in line]
+    assert len(warned) == 1
+    assert "model.body.unit = 1e-05 makes the body 1e-05 m long" in warned[0]
+    assert not any("warning" in line for line in plan(parse(tomllib.loads(text()), folder=file.parent)))
+
+
+def test_a_study_knows_its_mesh_again(file, tmp_path):
+    path = tmp_path / "elsewhere" / "box.msh"
+    path.parent.mkdir()
+    shutil.copy(file, path)
+    here, there = (parse(tomllib.loads(text()), folder=place.parent) for place in (file, path))
+    assert differences(document(here), document(there)) == []
+    path.unlink()
+    again = parse(document(there))  # as a report reads it where the file is not
+    assert again == there
+    meshio.write(path, box(scale=2.0), file_format="gmsh22", binary=True)
+    with pytest.raises(ModelError, match="is not the file that the study was made for"):
+        again.model.body.load()
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+def test_the_organ(tmp_path):
+    from workflows.study import run
+
+    study = load(ROOT / "configs" / "organ.toml", ["method.samples=16"])
+    assert study.model.unknowns >= 10_000
+    assert run(study, "organ", tmp_path / "organ", quiet=True) == 0
+    data = xr.load_dataset(tmp_path / "organ" / "results.nc")
+    assert -0.01 < float(data["mean"].sel(output="push")) < 0

@@ -1,0 +1,375 @@
+"""UM-Bridge both ways: the server as its protocol and its own client see it, and models behind servers in studies."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import tomllib
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import jsonschema
+import numpy as np
+import pytest
+import umbridge
+from scipy.optimize import minimize
+
+from forward.conformance import check_derivatives
+from forward.external import UmBridgeModel
+from forward.model import ModelError, SolveError
+from tests.launch import ROOT, environment
+from uq.evaluate import SerialEvaluate
+from workflows.config import load, parse
+from workflows.serve import RefusalError, Service
+
+TISSUQ = Path(sys.executable).parent / "tissuq"
+POINT = [750.0, 2e5]
+FUNCTION = """
+[model]
+kind = "python"
+function = "tests.functions.{0}"
+jacobian = "tests.functions.slopes"
+parameters = {{ E = 1.0, load = 1.0, length = 1.0 }}
+outputs = ["tip", "weight"]
+
+[parameters]
+E = {{ kind = "uniform", lower = 0.5, upper = 1.5 }}
+load = {{ kind = "uniform", lower = 0.5, upper = 1.5 }}
+[method]
+kind = "monte-carlo"
+samples = 8
+"""
+
+
+@contextmanager
+def command(*arguments):
+    """A server as a process of its own, that says on its first line where it listens."""
+    process = subprocess.Popen(
+        list(map(str, arguments)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+        cwd=ROOT,
+    )
+    try:
+        first = process.stdout.readline()
+        assert "http://" in first, process.stderr.read()
+        yield "http://" + first.split("http://")[1].split(",")[0].strip(), process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.wait(timeout=20)
+        process.stdout.close()
+        process.stderr.close()
+
+
+@pytest.fixture(scope="module")
+def beam():
+    """The tiny beam: density and bulk stiffness in, two deflections out."""
+    with command(TISSUQ, "serve", "configs/tiny.toml", "--port", 0) as (url, _):
+        yield url
+
+
+@pytest.fixture(scope="module")
+def function(tmp_path_factory):
+    path = tmp_path_factory.mktemp("serve") / "function.toml"
+    path.write_text(FUNCTION.format("beam"))
+    with command(TISSUQ, "serve", path, "--port", 0) as (url, _):
+        yield url
+
+
+def ask(url, what, question=None):
+    data = None if question is None else json.dumps(question).encode()
+    try:
+        with urlopen(Request(f"{url}/{what}", data)) as answer:
+            return answer.status, json.load(answer)
+    except HTTPError as error:
+        return error.code, json.loads(error.read())
+
+
+ERROR = {
+    "type": "object",
+    "required": ["error"],
+    "additionalProperties": False,
+    "properties": {
+        "error": {
+            "type": "object",
+            "required": ["type", "message"],
+            "additionalProperties": False,
+            "properties": {"type": {"type": "string"}, "message": {"type": "string"}},
+        }
+    },
+}
+NUMBERS = {"type": "array", "minItems": 1, "items": {"type": "number"}}
+
+
+def schema(key, of):
+    return {"type": "object", "required": [key], "additionalProperties": False, "properties": {key: of}}
+
+
+@pytest.mark.fem
+def test_answers_are_those_of_the_protocol(beam):
+    integers = {"type": "array", "minItems": 1, "items": {"type": "integer"}}
+    assert ask(beam, "Info") == (200, {"protocolVersion": 1.0, "models": ["forward"]})
+    status, support = ask(beam, "ModelInfo", {"name": "forward"})
+    assert (status, set(support["support"])) == (200, {"Evaluate", "Gradient", "ApplyJacobian", "ApplyHessian"})
+    assert all(value is True for value in support["support"].values())
+    for what, key in (("InputSizes", "inputSizes"), ("OutputSizes", "outputSizes")):
+        status, sizes = ask(beam, what, {"name": "forward"})
+        jsonschema.validate(sizes, schema(key, integers))
+        assert (status, sizes[key]) == (200, [2])
+    asked = {"name": "forward", "input": [POINT], "config": {}, "outWrt": 0, "inWrt": 0, "inWrt1": 0, "inWrt2": 0}
+    asked |= {"sens": [0, 0], "vec": [0, 0]}
+    for what, of in (
+        ("Evaluate", {"type": "array", "minItems": 1, "items": NUMBERS}),
+        *((what, NUMBERS) for what in ("Gradient", "ApplyJacobian", "ApplyHessian")),
+    ):
+        status, answer = ask(beam, what, asked)
+        jsonschema.validate(answer, schema("output", of))
+        assert status == 200
+        assert len(answer["output"][0] if what == "Evaluate" else answer["output"]) == 2
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("what", ["Evaluate", "Gradient", "ApplyJacobian", "ApplyHessian"])
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ({"name": "wrong_model_name"}, "ModelNotFound"),
+        ({"input": [[1.0, 2.0, 3.0]]}, "InvalidInput"),
+        ({"input": [[1.0, "2"]]}, "InvalidInput"),
+        ({"input": [POINT, POINT]}, "InvalidInput"),
+        ({"outWrt": 1, "inWrt": 1, "inWrt1": 1}, "InvalidInput"),
+        ({"sens": [1.0], "vec": [1.0]}, "InvalidInput"),
+        ({"config": {"lewel": 1}}, "InvalidInput"),
+        ({"config": {"level": -1}}, "InvalidInput"),
+    ],
+)
+def test_what_is_wrong_is_refused(beam, what, change, kind):
+    asked = {"name": "forward", "input": [POINT], "config": {}, "outWrt": 0, "inWrt": 0, "inWrt1": 0, "inWrt2": 0}
+    asked |= {"sens": [1.0, 0.0], "vec": [1.0, 0.0]}
+    status, answer = ask(beam, what, asked | change)
+    if what == "Evaluate" and ("outWrt" in change or "sens" in change):
+        assert status == 200
+        return
+    jsonschema.validate(answer, ERROR)
+    assert (status, answer["error"]["type"]) == (400, kind)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes"])
+def test_models_that_are_not_there(beam, what):
+    status, answer = ask(beam, what, {"name": "wrong_model_name"})
+    jsonschema.validate(answer, ERROR)
+    assert (status, answer["error"]["type"]) == (400, "ModelNotFound")
+
+
+def test_derivatives_that_are_not_there():
+    service = Service(parse(tomllib.loads(FUNCTION.format("beam").replace("jacobian", "# jacobian"))))
+    support = service.answer("ModelInfo", {"name": "forward"})["support"]
+    assert support == {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False}
+    for what in ("Gradient", "ApplyJacobian", "ApplyHessian"):
+        with pytest.raises(RefusalError) as caught:
+            service.answer(what, {"name": "forward"})
+        assert (caught.value.kind, caught.value.status) == ("UnsupportedFeature", 400)
+
+
+@pytest.mark.fem
+def test_requests_that_are_none(beam):
+    assert ask(beam, "Fly", {"name": "forward"})[0] == 404
+    with pytest.raises(HTTPError, match="400"):
+        urlopen(Request(f"{beam}/Evaluate", b"{not json"))
+
+
+@pytest.mark.fem
+def test_a_solve_without_answer_says_why(beam):
+    status, answer = ask(beam, "Evaluate", {"name": "forward", "input": [[750.0, -1.0]]})
+    jsonschema.validate(answer, ERROR)
+    assert (status, answer["error"]["type"]) == (500, "SolveError")
+    assert "material.D1 = -1 is not admissible" in answer["error"]["message"]
+    model = um_bridge(beam).build(None, ("density", "D1"))
+    with pytest.raises(SolveError, match=r"material\.D1 = -1 is not admissible"):
+        model.solve(np.array([750.0, -1.0]))
+
+
+@pytest.mark.fem
+def test_derivatives_by_the_package_of_the_protocol(beam):
+    model = umbridge.HTTPModel(beam, "forward")
+    sens, vec, h = [1.0, 2.0], np.array([30.0, 2e4]), 1e-3
+    ahead, behind = (np.array(model([list(POINT + s * h * vec)])[0]) for s in (1, -1))
+    jacobian = np.array(model.apply_jacobian(0, 0, [POINT], list(vec)))
+    np.testing.assert_allclose(jacobian, (ahead - behind) / (2 * h), rtol=1e-5)
+    gradient = np.array(model.gradient(0, 0, [POINT], sens))
+    assert gradient @ vec == pytest.approx(np.array(sens) @ jacobian, rel=1e-5)
+    hessian = np.array(model.apply_hessian(0, 0, 0, [POINT], sens, list(vec)))
+    assert hessian[0] * vec[0] + hessian[1] * vec[1] == pytest.approx(vec @ hessian)
+    H = np.array([model.apply_hessian(0, 0, 0, [POINT], sens, list(unit)) for unit in np.diag(vec)]) * vec
+    np.testing.assert_allclose(H, H.T, rtol=1e-4)  # as second derivatives are
+    nominal = np.array(model([POINT])[0])
+    second = np.array(sens) @ (ahead - 2 * nominal + behind) / h**2
+    assert vec @ hessian == pytest.approx(second, rel=2e-2)  # whose digits have cancelled
+
+
+@pytest.mark.fem
+def test_options_select_mesh_and_tolerance(beam):
+    model = umbridge.HTTPModel(beam, "forward")
+    coarse = np.array(model([POINT])[0])
+    fine = np.array(model([POINT], {"level": 1})[0])
+    tight = np.array(model([POINT], {"tolerance": 1e-12})[0])
+    assert 1e-4 < np.abs(fine / coarse - 1).max() < 0.1
+    np.testing.assert_allclose(tight, coarse, rtol=1e-6)
+
+
+@pytest.mark.fem
+def test_inversion_with_gradients_of_the_server(beam):
+    """Density and stiffness from both deflections, by a program that knows nothing but the protocol."""
+    model = umbridge.HTTPModel(beam, "forward")
+    truth = np.array([820.0, 2.6e5])
+    scale, start = np.array(POINT), np.ones(2)
+    measured = np.array(model([list(truth)])[0])
+
+    def misfit(x):
+        residual = np.array(model([list(x * scale)])[0]) / measured - 1
+        slope = np.array(model.gradient(0, 0, [list(x * scale)], list(residual / measured)))
+        return 1e6 * residual @ residual / 2, 1e6 * slope * scale
+
+    found = minimize(misfit, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-15, "gtol": 1e-10, "maxiter": 200})
+    np.testing.assert_allclose(found.x * scale, truth, rtol=2e-3)
+    assert found.fun < 1e-3
+
+
+def um_bridge(url, **changes):
+    blocks = {"url": url, "parameters": {"density": 750.0, "D1": 3e5}, "outputs": ("uy_max", "ux_max")}
+    return UmBridgeModel.model_validate(blocks | changes)
+
+
+@pytest.mark.fem
+def test_a_study_of_the_server_gives_the_moments_of_the_study_served(beam):
+    served = load(ROOT / "configs" / "tiny.toml", ["method.samples=8"])
+    blocks = tomllib.loads((ROOT / "configs" / "tiny.toml").read_text())
+    blocks["model"] = um_bridge(beam).model_dump(exclude_none=True) | {"outputs": ["uy_max", "ux_max"]}
+    laws = blocks["parameters"]
+    blocks["parameters"] = {"density": laws["loads.gravity.density"], "D1": laws["material.D1"]}
+    client = parse(blocks, ["method.samples=8"])
+    from mpi4py import MPI
+
+    results = [
+        study.method.run(study.inputs, SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names)))
+        for study in (served, client)
+    ]
+    for name in ("mean", "std", "mean_error"):
+        np.testing.assert_allclose(results[1][name], results[0][name], rtol=1e-6)
+
+
+@contextmanager
+def other_server(tmp_path):
+    """A model served by the package of the protocol: two vectors of parameters, two of outputs."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    script = tmp_path / "server.py"
+    script.write_text(
+        "import sys, umbridge\n"
+        "class Model(umbridge.Model):\n"
+        "    def get_input_sizes(self, config={}): return [2, 1]\n"
+        "    def get_output_sizes(self, config={}): return [1, 2]\n"
+        "    def __call__(self, p, config={}):\n"
+        "        (a, b), (c,) = p\n"
+        "        f = config.get('factor', 1)\n"
+        "        return [[f * a * b], [b * c, c ** 2]]\n"
+        "    def gradient(self, o, i, p, sens, config={}):\n"
+        "        (a, b), (c,) = p\n"
+        "        f = config.get('factor', 1)\n"
+        "        J = [[[[f * b, f * a]], [[0.0]]], [[[0.0, c], [0.0, 0.0]], [[b], [2 * c]]]][o][i]\n"
+        "        return [sum(s * row[k] for s, row in zip(sens, J)) for k in range(len(J[0]))]\n"
+        "    def supports_evaluate(self): return True\n"
+        "    def supports_gradient(self): return True\n"
+        "print('http://127.0.0.1:' + sys.argv[1], flush=True)\n"
+        "umbridge.serve_models([Model('others')], int(sys.argv[1]))\n"
+    )
+    with command(sys.executable, script, port) as (url, _):
+        yield url
+
+
+def test_a_server_of_the_package_is_a_model(tmp_path):
+    with other_server(tmp_path) as url:
+        spec = UmBridgeModel(
+            url=url, parameters={"a": 1.0, "b": 2.0, "c": 3.0}, outputs=("ab", "bc", "cc"), config={"factor": 10}
+        )
+        model = _when_it_answers(spec, ("c", "a"))
+        point = np.array([5.0, 7.0])
+        np.testing.assert_allclose(model.solve(point).outputs, [10 * 7 * 2, 2 * 5, 25])
+        np.testing.assert_allclose(model.solve(point).tangent(np.eye(2)).T, [[0, 20], [2, 0], [10, 0]])
+        check_derivatives(model, point, np.ones(2)).require()
+        for changes, message in (
+            ({"name": "other"}, r"model.name: 'other' is not a model of .*; did you mean 'others'"),
+            ({"outputs": ("ab",)}, r"model.outputs: 1 are named, but .* has 3 \(in vectors of \[1, 2\]\)"),
+        ):
+            wrong = UmBridgeModel.model_validate(spec.model_dump(exclude_none=True) | changes)
+            with pytest.raises(ModelError, match=message):
+                wrong.build(None, ("a",))
+
+
+def _when_it_answers(spec, names):
+    import time
+
+    for _ in range(100):
+        try:
+            return spec.build(None, names)
+        except ModelError:
+            time.sleep(0.1)
+    return spec.build(None, names)
+
+
+def test_a_server_that_is_down_is_one_line(tmp_path, capsys):
+    from workflows.__main__ import main
+
+    path = tmp_path / "study.toml"
+    path.write_text(
+        '[model]\nkind = "um-bridge"\nurl = "http://127.0.0.1:9"\nparameters = { a = 1.0 }\noutputs = ["f"]\n'
+        '[parameters]\na = { kind = "uniform", lower = 0, upper = 1 }\n[method]\nkind = "monte-carlo"\nsamples = 8\n'
+    )
+    assert main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("model.url: http://127.0.0.1:9 does not answer (")
+    assert said.count("\n") == 1
+
+
+def test_the_server_of_a_function(function):
+    model = umbridge.HTTPModel(function, "forward")
+    assert model([[1.0, 1.0]])[0] == pytest.approx([1 / (8 * 0.02 * 0.01**3 / 12), 1.0])
+    with pytest.raises(Exception, match="has no options"):
+        model([[1.0, 1.0]], {"level": 1})
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_the_server(tmp_path, number):
+    path = tmp_path / "study.toml"
+    path.write_text(FUNCTION.format("beam"))
+    with command(TISSUQ, "serve", path, "--port", 0) as (url, process):
+        assert ask(url, "Info")[0] == 200
+        taken = subprocess.run(
+            [TISSUQ, "serve", path, "--port", url.split(":")[-1]],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment(),
+            cwd=ROOT,
+        )
+        assert taken.returncode == 2
+        assert taken.stderr == f"--port {url.split(':')[-1]}: cannot be used on 127.0.0.1: Address already in use\n"
+        process.send_signal(number)
+        assert process.wait(timeout=10) == 0
+        assert "interrupted after 1 requests" in process.stdout.read()
+        assert process.stderr.read() == ""
+
+
+def test_a_comparison_of_models_is_not_served(capsys):
+    from workflows.__main__ import main
+
+    assert main(["serve", str(ROOT / "configs" / "treloar.toml")]) == 2
+    assert "compares models" in capsys.readouterr().err

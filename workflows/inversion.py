@@ -1,0 +1,606 @@
+"""Studies of what is inside: a specimen in several load cases with measured displacements, and synthetic ones."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter, model_validator
+
+from forward.hyperelastic import Mistake
+from forward.inclusions import Inclusion, derived
+from forward.settings import Settings
+from forward.specimen import Specimen
+from inverse.inversion import Invert, Synthesize, names_of, sentence, variables
+from inverse.observations import DataError, Observations, files, read
+from uq.distributions import Distribution, Normal
+from uq.inputs import Inputs
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import FloatArray
+    from forward.specimen import SpecimenModel
+    from inverse.inversion import Variables
+
+PRIOR_DRAWS = 1024
+
+
+class DataSet(Settings):
+    """A file of data, as a study that ran knows it.
+
+    Parameters
+    ----------
+    name
+        The name of the file without its ending.
+    file
+        The name of the file.
+    digest
+        Of its bytes.
+    refused
+        What is wrong with it, if anything.
+    """
+
+    name: str
+    file: str
+    digest: str = ""
+    refused: str = ""
+
+
+class DataFiles(Settings):
+    """Where measured displacements are.
+
+    Parameters
+    ----------
+    files
+        Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
+        directory. Each file is a data set, which is inverted by itself.
+    sigma
+        Standard deviation (m) of the errors where a file does not say.
+    unit
+        m per unit of the files.
+    tolerance
+        How far (m) points may lie outside the body; they are taken at the nearest place of it, and counted.
+    truth
+        By path: what is inside, where that is known beside what the files say of it.
+    sets
+        What the files were when the study ran; written by the run.
+    """
+
+    files: tuple[str, ...] = Field(min_length=1)
+    sigma: Annotated[float, Field(gt=0)] | None = None
+    unit: Annotated[float, Field(gt=0)] = 1.0
+    tolerance: Annotated[float, Field(ge=0)] = 0.0
+    truth: dict[str, float] = Field(default={})
+    sets: tuple[DataSet, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A data set that can be used.
+
+    Attributes
+    ----------
+    observations
+        On the body.
+    moved
+        How far (n,) its points were moved (m).
+    truth
+        Numbers that it was made of, by path.
+    inclusions
+        Those that were really there.
+    places, stiffness
+        Where (k, 3) ln of the true stiffness factor (k,) is known beside that.
+    """
+
+    observations: Observations
+    moved: FloatArray
+    truth: dict[str, float]
+    inclusions: tuple[Any, ...]
+    places: FloatArray
+    stiffness: FloatArray
+
+
+class Inversion(Settings):
+    """What to invert.
+
+    Parameters
+    ----------
+    model
+        The specimen: body, material, inclusions or a field, load cases.
+    parameters
+        Priors by the paths of the numbers of the specimen that are unknown; nothing for a field of nodal values.
+    correlations
+        Correlations between them.
+    data
+        What was measured.
+    method
+        How it is inverted.
+    parallel
+        Use of ranks.
+    """
+
+    model: Specimen
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    data: DataFiles
+    method: Invert = Invert()
+    parallel: Parallel = Parallel()
+    measurements: tuple[Any, ...] = Field(default=(), exclude=True, repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the same is asked of the same files."""
+        return isinstance(other, Inversion) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def field(self) -> bool:
+        """Whether values of a field at the vertices are what is unknown."""
+        return any(field.basis == "nodes" for field in self.model.fields)
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """The unknown parameters; nothing for a field of nodal values."""
+        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
+        return Inputs(self.parameters | standard, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in results: of a field, its mean."""
+        if self.field:
+            label = f"fields.{self.model.fields[0].label}.mean"
+            return names_of(Inputs({label: Normal(mean=0.0, std=1.0)}), self.method)
+        return names_of(self.inputs, self.method)
+
+    @property
+    def together(self) -> bool:
+        """Whether all groups of ranks work on one data set, point by point."""
+        return len(self.data.sets) == 1 and not self.model.fields and self.parallel.ranks_per_model == 1
+
+    @property
+    def planned(self) -> int:
+        """Number of evaluations: data sets, or solves where all groups work on one."""
+        if self.together:
+            return self.method.solves(field=False) + 12 * self.method.starts + 2 * len(self.parameters)
+        return len(self.data.sets) + 1
+
+    @property
+    def variables(self) -> Variables:
+        """What an inversion leaves."""
+        data = max(int(m.observations.measured.sum()) for m in self.measurements if m is not None)
+        nodes, cases = self.model.body.vertex_count, len(self.model.cases)
+        return variables(self.names, field=self.field, cases=cases, data=data, nodes=nodes, method=self.method)
+
+    def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
+        return _stiffness(self.model.inclusions, self.inputs.names, places, points)
+
+    def with_data(self, folder: Path) -> Inversion:
+        """Return the same with its files read.
+
+        Raises
+        ------
+        StudyError
+            If no file can be used.
+        """
+        if self.data.sets:
+            return self
+        try:
+            paths = files(self.data.files, [folder, Path()])
+        except DataError as error:
+            raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
+        sets, found, lines = [], [], []
+        names = [path.stem for path in paths]
+        for path, stem in zip(paths, names, strict=True):
+            name = stem if names.count(stem) == 1 else path.name
+            try:
+                measurement, wrong = self._read(path), ""
+            except DataError as error:
+                measurement, wrong = None, "; ".join(error.args)
+                lines += [f"data: {line}" for line in error.args]
+            digest = sha256(path.read_bytes()).hexdigest()[:16]
+            sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
+            found.append(measurement)
+        if all(measurement is None for measurement in found):
+            raise StudyError(*lines)
+        data = self.data.model_copy(update={"sets": tuple(sets)})
+        return self.model_copy(update={"data": data, "measurements": tuple(found)})
+
+    def _read(self, path: Path) -> Measurement:
+        cases = tuple(case.name for case in self.model.cases)
+        found = read(path, cases, self.data.unit).with_sigma(self.data.sigma)
+        body = self.model.body
+        extent = max(high - low for low, high in body.bounds)
+        found, moved = found.on(body.nearest, extent, self.data.tolerance)
+        truth, places, stiffness = dict(self.data.truth), np.zeros((0, 3)), np.zeros(0)
+        for name, text in found.truth.items():
+            if name not in {"stiffness", "inclusions"}:
+                truth.setdefault(name, _known(name, text, path))
+        inclusions = _true_inclusions(found.truth["inclusions"], path) if "inclusions" in found.truth else ()
+        if "stiffness" in found.truth:
+            places, stiffness = _true_stiffness(path.parent / found.truth["stiffness"])
+        return Measurement(found, moved, truth, inclusions, places, stiffness)
+
+    @model_validator(mode="after")
+    def _check(self) -> Inversion:
+        refused("Inversion", list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        nodal = [i for i, field in enumerate(self.model.fields) if field.basis == "nodes"]
+        if nodal and (len(self.model.fields) > 1 or self.parameters):
+            message = "a field of nodal values is inverted alone, expected no other fields and no parameters"
+            yield ("model", "fields", nodal[0], "basis"), message, "nodes"
+        if nodal and self.model.fields[nodal[0]].of != "stiffness":
+            yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
+        if nodal and self.method.chains == "emcee":
+            yield ("method", "chains"), "expected 'pcn', the chains for fields", "emcee"
+        if not self.parameters and not self.model.fields:
+            yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        try:
+            self.inputs  # noqa: B018 - checks the correlations
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+
+
+class Synthesis(Settings):
+    """What synthetic data to make.
+
+    Parameters
+    ----------
+    model
+        The specimen that is measured, with what is observed of it.
+    parameters
+        Distributions of numbers that are drawn for each data set; coefficients of random fields always are.
+    correlations
+        Correlations between them.
+    method
+        Errors, and the points that data sets have.
+    parallel
+        Use of ranks.
+    """
+
+    model: Specimen
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    method: Synthesize
+    parallel: Parallel = Parallel()
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """What is drawn for each data set."""
+        standard = dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+        return Inputs(self.parameters | standard, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def planned(self) -> int:
+        """Number of solves."""
+        return len(self.method.fraction) + 1
+
+    def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
+        return _stiffness(self.model.inclusions, self.inputs.names, places, points)
+
+    @model_validator(mode="after")
+    def _check(self) -> Synthesis:
+        refused("Synthesis", list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        if not self.model.observed:
+            yield ("model", "observed"), "nothing is observed, expected boundaries or points", ()
+        for i, field in enumerate(self.model.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        try:
+            self.inputs  # noqa: B018 - checks the correlations
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+
+
+def made(blocks: Mapping[str, Any], folder: Path) -> Inversion | Synthesis:
+    """Check the blocks of a study of one of these kinds; data files are beside the study, in a folder.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        For mistakes in the blocks.
+    StudyError
+        For mistakes in the data.
+    """
+    if blocks["method"].get("kind") == "synthesize":
+        return Synthesis.model_validate(blocks)
+    return Inversion.model_validate(blocks).with_data(folder)
+
+
+def _stiffness(
+    inclusions: tuple[Any, ...], names: tuple[str, ...], places: FloatArray, points: FloatArray
+) -> FloatArray:
+    found = derived(inclusions, names, points, places)
+    columns = [values for path, values in found.items() if path.startswith("stiffness.")]
+    return np.log(np.column_stack(columns)) if inclusions else np.zeros((len(points), len(places)))
+
+
+def _known(name: str, text: str, path: Path) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        message = f"{path.name}: truth.{name} is '{text}', expected a number"
+        raise DataError(message) from None
+
+
+def _true_inclusions(text: str, path: Path) -> tuple[Any, ...]:
+    try:
+        return TypeAdapter(tuple[Inclusion, ...]).validate_python(tuple(json.loads(text)))
+    except (ValueError, TypeError):
+        message = f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON"
+        raise DataError(message) from None
+
+
+def _true_stiffness(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Read ln of the true factor at places: a table x, y, z, factor."""
+    try:
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        return table[:, :3], np.log(table[:, 3])
+    except (OSError, ValueError, IndexError):
+        message = f"{path.name}: the true stiffness cannot be read, expected a table x, y, z, factor"
+        raise DataError(message) from None
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+
+def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vertices: Any) -> xr.Dataset:
+    """Put the records of all data sets, as vectors (n, S), into a dataset, with what is known beside them.
+
+    Parameters
+    ----------
+    study
+        What was asked.
+    rows
+        NaN where an inversion failed.
+    reasons
+        Why, by the number of the data set.
+    vertices
+        Places (N, 3) of the vertices, cells (n_cells, k), and VTK's number of their kind.
+    """
+    import xarray as xr
+
+    layout = study.variables
+    record = layout.unpack(rows)
+    places, cells, kind = vertices
+    held: dict[str, Any] = {name: (("data_set", *layout.dims[name]), record[name]) for name in layout.dims}
+    held["why"] = ("data_set", [reasons.get(k) or sentence(letters) for k, letters in enumerate(record["why"])])
+    held["ok"] = ("data_set", [k not in reasons for k in range(len(rows))])
+    found = list(study.measurements)
+    count = len(found)
+    held["points_moved"] = ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found])
+    held["largest_move"] = ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found])
+    mean, std, stiffness_std = prior_moments(study, places)
+    held["prior_mean"], held["prior_std"] = ("parameter", mean), ("parameter", std)
+    held["stiffness_prior_std"] = ("node", stiffness_std)
+    true = np.full((count, len(study.names)), np.nan)
+    for k, m in enumerate(found):
+        for name, value in ({} if m is None else m.truth).items():
+            if name in study.names:
+                true[k, study.names.index(name)] = value
+    held["true"] = (("data_set", "parameter"), true)
+    held["stiffness_true"] = (("data_set", "node"), np.array([_true_at(study, m, places) for m in found]))
+    held["node_position"] = (("node", "axis"), places)
+    held["cell_nodes"] = (("cell", "corner"), cells, {"vtk_cell_type": kind})
+    from inverse.inversion import COLUMNS
+
+    coordinates = {
+        "data_set": [item.name for item in study.data.sets],
+        "parameter": list(study.names),
+        "partner": list(study.names),
+        "case": [case.name for case in study.model.cases],
+        "axis": ["x", "y", "z"],
+        "column": list(COLUMNS["field" if study.field else "parameters"]),
+    }
+    return xr.Dataset(held, coordinates).drop_dims("letter", errors="ignore")
+
+
+def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean and standard deviation (c,) of the parameters before the data, and that of ln stiffness (N,) at places."""
+    if study.field:
+        field = study.model.fields[0]
+        prior = field.prior(study.model.body)
+        volumes = prior.matern.mass
+        g = volumes / volumes.sum()
+        width = float(np.linalg.norm(prior.root_transposed(g)))
+        moments = [(float(np.log(field.mean) - field.log_std**2 / 2), width)]
+        stiffness_std = np.sqrt(prior.variance)
+    else:
+        moments = list(zip(study.inputs.mean, study.inputs.std, strict=True))
+        stiffness_std = study.stiffness(places, prior_draws(study)).std(axis=0)
+    if study.method.noise is not None:
+        moments.append(study.method.noise.moments)
+    mean, std = np.array(moments).T
+    return mean, std, stiffness_std
+
+
+def prior_draws(study: Inversion) -> FloatArray:
+    """Draws (n, d) of the parameters before the data."""
+    rng = np.random.default_rng(study.method.seed)
+    return study.inputs.from_normals(rng.standard_normal((PRIOR_DRAWS, len(study.inputs.names))))[0]
+
+
+def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArray) -> FloatArray:
+    """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is not known."""
+    if measurement is None:
+        return np.full(len(places), np.nan)
+    if measurement.inclusions:
+        return np.asarray(_stiffness(measurement.inclusions, (), places, np.zeros((1, 0)))[0])
+    if len(measurement.places):
+        from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+        linear = LinearNDInterpolator(measurement.places, measurement.stiffness)(places)
+        nearest = NearestNDInterpolator(measurement.places, measurement.stiffness)(places)
+        return np.asarray(np.where(np.isfinite(linear), linear, nearest))  # beyond the hull, by rounding
+    return np.full(len(places), np.nan)
+
+
+def summary(found: xr.Dataset) -> dict[str, Any]:
+    """Return the part of summary.json that follows from the results; that of the only data set stands above it."""
+    sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
+    return {**(next(iter(sets.values())) if len(sets) == 1 else {}), "data_sets": sets}
+
+
+def _one(found: xr.Dataset) -> dict[str, Any]:
+    if not bool(found["ok"]):
+        return {"failed": str(found["why"].item())}
+    numbers = ("log_evidence", "log_evidence_error", "determined", "residual_probability")
+    return {
+        "posterior": {
+            str(name): {key: _number(found[key].sel(parameter=name)) for key in ("mode", "std", "lower", "upper")}
+            for name in found.parameter.values
+        },
+        **{key: _number(found[key]) for key in numbers},
+        "verdict": str(found["why"].item()),
+    }
+
+
+def _number(value: Any) -> float | None:
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def batch_table(found: xr.Dataset) -> str:
+    """Return a table of comma-separated values with a row for each data set."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    names = [str(name) for name in found.parameter.values]
+    statistics = ("mode", "mean", "std", "lower", "upper", "true")
+    numbers = ("log_evidence", "log_evidence_error", "determined", "residual_square", "residual_degrees")
+    cases = [str(name) for name in found.case.values]
+    writer.writerow(
+        [
+            "data_set",
+            "ok",
+            "data",
+            "points_moved",
+            *(f"{name} {key}" for name in names for key in statistics),
+            *numbers,
+            "residual_probability",
+            *(f"misfit {case}" for case in cases),
+            "why",
+        ]
+    )
+    for label in found.data_set.values:
+        one = found.sel(data_set=label)
+        values = [one[key].sel(parameter=name) for name in names for key in statistics]
+        values += [one[key] for key in (*numbers, "residual_probability")]
+        values += [one["misfit"].sel(case=case) for case in cases]
+        shown = [f"{float(value):.8g}" if np.isfinite(float(value)) else "" for value in values]
+        count = int(np.isfinite(one["measured"]).sum())
+        moved = int(one["points_moved"])
+        writer.writerow([str(label), "yes" if bool(one["ok"]) else "no", count, moved, *shown, str(one["why"].item())])
+    return file.getvalue()
+
+
+def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
+    import xarray as xr
+
+    of_set = found if found.sizes["data_set"] > 1 else found.isel(data_set=0, drop=True)
+
+    def draws(name: str) -> Any:
+        return of_set[name].expand_dims("chain").rename({"sample": "draw"}).transpose("chain", "draw", ...)
+
+    left: dict[str, xr.Dataset] = {}
+    observed = {"displacement": of_set["measured"]}
+    left["observed_data"] = xr.Dataset(observed).drop_vars("parameter", errors="ignore")
+    if study.field:
+        left["posterior"] = xr.Dataset({"stiffness": draws("stiffness_draw")})
+        return left
+    whole = draws("draw")
+    left["posterior"] = xr.Dataset({str(name): whole.sel(parameter=name, drop=True) for name in found.parameter.values})
+    before = prior_draws(study)
+    columns = {name: (("chain", "draw"), before[None, :, i]) for i, name in enumerate(study.inputs.names)}
+    left["prior"] = xr.Dataset(columns)
+    left["log_likelihood"] = xr.Dataset({"displacement": draws("draw_log_likelihood")})
+    return left
+
+
+# --- synthetic data --------------------------------------------------------------------------------------------------
+
+
+def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
+    """An inclusion with other numbers, by their paths."""
+    block: dict[str, Any] = inclusion.model_dump()
+    return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
+
+
+def points_of(model: SpecimenModel) -> NDArray[np.int64]:
+    """Number (m,) of the point that each output of a specimen is observed at, the same in all load cases."""
+    return np.asarray(np.unique(np.round(model.places, 12), axis=0, return_inverse=True)[1].ravel())
+
+
+def with_factor(study: Synthesis, found: xr.Dataset, places: FloatArray, fields: Any) -> xr.Dataset:
+    """Add the true factor on the stiffness at places (k, 3) of each data set, as rows x, y, z, factor.
+
+    Parameters
+    ----------
+    fields
+        Factors (n, k) of the random fields on the stiffness, all together.
+    """
+    points = found["truth"].to_numpy()
+    factor = fields * np.exp(study.stiffness(places, points))
+    table = np.concatenate([np.broadcast_to(places, (len(points), *places.shape)), factor[:, :, None]], axis=2)
+    return found.assign(factor=(("data_set", "place", "axis"), table))
+
+
+def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) -> dict[str, str]:
+    """Return the texts of the files of synthetic data, by their names."""
+    texts = {}
+    points, cases, axes, places = model
+    count = found.sizes["data_set"]
+    scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
+    varies = [path for path in scalars if path.startswith(("inclusions.", "material.")) or path in study.parameters]
+    for k in range(count):
+        one = found.isel(data_set=k)
+        truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
+        label = name if count == 1 else f"{name}-{k + 1}"
+        file = io.StringIO()
+        noise = study.method.noise.model_dump(exclude_none=True)
+        body = study.model.body
+        file.write(
+            f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), errors "
+            f"{', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}.\n"
+        )
+        file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
+        if study.model.inclusions and not study.model.fields:
+            inclusions = [_with_values(inclusion, truth) for inclusion in study.model.inclusions]
+            file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
+        if study.model.fields:
+            file.write(f"# truth.stiffness = truth/{label}.csv\n")
+            lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
+            texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
+        file.write("x,y,z,ux,uy,uz,sigma,case\n")
+        values, sigma = one["values"].values, one["sigma"].values
+        for case, case_name in enumerate(c.name for c in study.model.cases):
+            for point in np.unique(points[cases == case]):
+                rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
+                if len(rows) == 0:
+                    continue
+                motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
+                where = ",".join(f"{x:.8g}" for x in np.round(places[rows[0]], 12) + 0.0)
+                cells = ",".join(motion.get(axis, "") for axis in range(3))
+                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}\n")
+        texts[f"{label}.csv"] = file.getvalue()
+    return texts

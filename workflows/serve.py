@@ -1,0 +1,339 @@
+"""The model of a study as a server of the UM-Bridge protocol, version 1.0.
+
+Other programs ask for outputs and derivatives by HTTP. There is one model, `forward`, with one vector of parameters
+(the random parameters of the study, in their order) and one of outputs. Requests wait for each other: answers are
+computed one at a time, in the thread that made the model.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Future
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from queue import SimpleQueue
+from threading import Thread
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from forward.external import PROTOCOL
+from forward.hyperelastic import Hyperelastic
+from forward.model import FloatArray, Reference, Solution, SolveError
+from forward.settings import nearest
+from uq.evaluate import SerialEvaluate
+from uq.linearisation import linearise
+from workflows.config import Study, StudyError
+
+if TYPE_CHECKING:
+    from forward.model import ForwardModel
+
+NAME = "forward"
+OPTIONS = ("level", "tolerance")
+KEPT = 4  # models of different options
+STEP = 1e-3  # of differences of gradients, in standard deviations of the parameters
+
+
+class RefusalError(Exception):
+    """A request that cannot be answered: the kind of error in the words of the protocol, and what is wrong."""
+
+    def __init__(self, kind: str, message: str, status: int = 400) -> None:
+        super().__init__(message)
+        self.kind, self.status = kind, status
+
+
+class Service:
+    """What the server answers, to requests as the protocol has them.
+
+    Parameters
+    ----------
+    study
+        Whose model it is; its distributions say only where the solver starts from and how large a difference is.
+    """
+
+    def __init__(self, study: Study) -> None:
+        self._study = study
+        self._inputs = study.inputs
+        self._made: dict[str, _Solver] = {}
+        self.parameters = study.inputs.names
+        self.outputs = tuple(output.name for output in study.model.outputs)
+        self._differentiable = self._solver({}).model.differentiable
+
+    def answer(self, what: str, question: dict[str, Any]) -> dict[str, Any]:
+        """Answer a request, such as "Evaluate" with its fields.
+
+        Raises
+        ------
+        RefusalError
+            If it is not of the protocol, or the model has no answer.
+        """
+        if what == "Info":
+            return {"protocolVersion": PROTOCOL, "models": [NAME]}
+        answers: dict[str, Callable[[dict[str, Any]], Any]] = {
+            "Evaluate": self._evaluate,
+            "Gradient": self._gradient,
+            "ApplyJacobian": self._jacobian,
+            "ApplyHessian": self._hessian,
+        }
+        if what not in {*answers, "ModelInfo", "InputSizes", "OutputSizes"}:
+            message = f"'{what}' is not of the protocol"
+            raise RefusalError("UnsupportedFeature", message, 404)
+        if question.get("name") != NAME:
+            message = f"there is no model '{question.get('name')}', expected '{NAME}'"
+            raise RefusalError("ModelNotFound", message)
+        if what == "ModelInfo":
+            return {"support": {"Evaluate": True} | dict.fromkeys(list(answers)[1:], self._differentiable)}
+        if what == "InputSizes":
+            return {"inputSizes": [len(self.parameters)]}
+        if what == "OutputSizes":
+            return {"outputSizes": [len(self.outputs)]}
+        if what != "Evaluate" and not self._differentiable:
+            message = "the model has no derivatives"
+            raise RefusalError("UnsupportedFeature", message)
+        try:
+            return {"output": answers[what](question)}
+        except SolveError as error:
+            kind = "SolveError"
+            raise RefusalError(kind, str(error), 500) from error
+
+    def _evaluate(self, question: dict[str, Any]) -> list[list[float]]:
+        return [self._solver(question).at(self._point(question)).outputs.tolist()]
+
+    def _gradient(self, question: dict[str, Any]) -> list[float]:
+        point, weights = self._point(question), _vector(question, "sens", len(self.outputs))
+        _first(question, "inWrt", "outWrt")
+        return list(self._solver(question).at(point).adjoint(weights).tolist())
+
+    def _jacobian(self, question: dict[str, Any]) -> list[float]:
+        point, direction = self._point(question), _vector(question, "vec", len(self.parameters))
+        _first(question, "inWrt", "outWrt")
+        return list(self._solver(question).at(point).tangent(direction).tolist())
+
+    def _hessian(self, question: dict[str, Any]) -> list[float]:
+        """Central difference of gradients, each from the factor at its own solution."""
+        point, weights = self._point(question), _vector(question, "sens", len(self.outputs))
+        direction = _vector(question, "vec", len(self.parameters))
+        _first(question, "inWrt1", "inWrt2", "outWrt")
+        length = np.abs(direction / self._inputs.std).max()
+        if length == 0:
+            return [0.0] * len(point)
+        step = STEP / length * direction
+        solver = self._solver(question)
+        ahead, behind = (solver.exactly_at(point + sign * step).adjoint(weights) for sign in (1, -1))
+        return list(((ahead - behind) * length / (2 * STEP)).tolist())
+
+    def _point(self, question: dict[str, Any]) -> FloatArray:
+        given = question.get("input")
+        if not isinstance(given, list) or len(given) != 1:
+            message = f"input: expected one vector of {len(self.parameters)} numbers, in a list"
+            raise RefusalError("InvalidInput", message)
+        return _numbers(given[0], "input[0]", len(self.parameters))
+
+    def _solver(self, question: dict[str, Any]) -> _Solver:
+        """The model with the options of a request."""
+        options = question.get("config") or {}
+        if not isinstance(options, dict):
+            message = "config: expected options by name"
+            raise RefusalError("InvalidInput", message)
+        for option in options:
+            if option not in OPTIONS:
+                message = f"config.{option}: unknown option; {nearest(option, OPTIONS)}"
+                raise RefusalError("InvalidInput", message)
+        key = json.dumps(options, sort_keys=True)
+        if key not in self._made:
+            made = _Solver(self._study, self._specified(options))
+            while len(self._made) >= KEPT:
+                del self._made[next(iter(self._made))]
+            self._made[key] = made
+        return self._made[key]
+
+    def _specified(self, options: dict[str, Any]) -> Any:
+        """Return the specification of the model with options."""
+        model = self._study.model
+        if not options:
+            return model
+        if not isinstance(model, Hyperelastic):
+            message = f"config: a model of kind '{model.kind}' has no options"
+            raise RefusalError("InvalidInput", message)
+        level, tolerance = options.get("level", 0), options.get("tolerance", model.solver.tolerance)
+        if not isinstance(level, int) or level < 0 or (level > 0 and model.fields):
+            message = f"config.level: {level!r}, expected a number of refinements, and 0 where there are random fields"
+            raise RefusalError("InvalidInput", message)
+        try:
+            solver = type(model.solver).model_validate(model.solver.model_dump() | {"tolerance": tolerance})
+            return model.refined(level).model_copy(update={"solver": solver})
+        except ValidationError as error:
+            message = f"config: {error.errors()[0]['msg']}"
+            raise RefusalError("InvalidInput", message) from None
+
+
+class _Solver:
+    """A model, started at the tangent at the mean parameters where that is possible."""
+
+    def __init__(self, study: Study, spec: Any) -> None:
+        from mpi4py import MPI
+
+        inputs = study.inputs
+        self.model: ForwardModel = spec.build(MPI.COMM_SELF, inputs.names)
+        self._start: tuple[Callable[[FloatArray], FloatArray], Reference] | None = None
+        self._last: tuple[bytes, Solution] | None = None
+        if self.model.displacements:
+            try:
+                prediction = linearise(inputs, SerialEvaluate(self.model)).prediction
+            except SolveError:
+                prediction = None  # every solve starts from zero
+            self._start = None if prediction is None else prediction.on(self.model)
+
+    def at(self, point: FloatArray) -> Solution:
+        """Solve, unless that is where the last solution was."""
+        if self._last is None or self._last[0] != point.tobytes():
+            if self._start is None:
+                solution = self.model.solve(point)
+            else:
+                predict, reference = self._start
+                solution = self.model.solve(point, predict(point), reference)
+            self._last = point.tobytes(), solution
+        return self._last[1]
+
+    def exactly_at(self, point: FloatArray) -> Solution:
+        """Solve so that derivatives come from a factor of their own."""
+        start = None if self._start is None else self._start[0](point)
+        return self.model.solve(point, start)
+
+
+def _vector(question: dict[str, Any], key: str, length: int) -> FloatArray:
+    return _numbers(question.get(key), key, length)
+
+
+def _numbers(given: Any, key: str, length: int) -> FloatArray:
+    found = np.array([x for x in given if type(x) in {int, float}] if isinstance(given, list) else [], dtype=float)
+    if not isinstance(given, list) or not len(given) == len(found) == length:
+        message = f"{key}: expected {length} numbers"
+        raise RefusalError("InvalidInput", message)
+    return found
+
+
+def _first(question: dict[str, Any], *keys: str) -> None:
+    """Refuse other vectors than the first: there is only one of parameters, and one of outputs."""
+    for key in keys:
+        if question.get(key) != 0:
+            message = f"{key}: {question.get(key)!r}, expected 0"
+            raise RefusalError("InvalidInput", message)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Passes requests on to the thread that solves, and sends what it answers."""
+
+    ask: Callable[[str, dict[str, Any]], dict[str, Any]]
+
+    def do_GET(self) -> None:
+        self._reply({})
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        try:
+            question = json.loads(body or b"{}")
+        except ValueError:
+            question = None
+        self._reply(question)
+
+    def _reply(self, question: Any) -> None:
+        status = 200
+        try:
+            if not isinstance(question, dict):
+                message = "the request is not a JSON object"
+                raise RefusalError("InvalidInput", message)  # noqa: TRY301 - all refusals are sent alike
+            answer = type(self).ask(self.path.strip("/"), question)
+        except RefusalError as refusal:
+            answer, status = {"error": {"type": refusal.kind, "message": str(refusal)}}, refusal.status
+        body = json.dumps(answer).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of single requests."""
+
+
+def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
+    """Serve the model of a study until the process is interrupted.
+
+    Parameters
+    ----------
+    study
+        The study; its method takes no part.
+    port, host
+        Where requests are taken: port 0 is any free one, host 0.0.0.0 takes those of other machines too.
+    quiet
+        Print nothing.
+
+    Returns
+    -------
+    int
+        Number of answers that were computed.
+
+    Raises
+    ------
+    StudyError
+        If the port is taken.
+    ModelError
+        If the model cannot be made.
+    """
+    jobs: SimpleQueue[tuple[Future[dict[str, Any]], str, dict[str, Any]]] = SimpleQueue()
+
+    def ask(what: str, question: dict[str, Any]) -> dict[str, Any]:
+        future: Future[dict[str, Any]] = Future()
+        jobs.put((future, what, question))
+        return future.result()
+
+    handler = type("Handler", (_Handler,), {"ask": staticmethod(ask)})
+    try:
+        server = ThreadingHTTPServer((host, port), handler)
+    except (OSError, OverflowError) as error:
+        message = f"--port {port}: cannot be used on {host}: {getattr(error, 'strerror', None) or error}"
+        raise StudyError(message) from None
+    server.daemon_threads = True
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    answered, listening = 0, None
+    try:
+        service = Service(study)
+        if not quiet:
+            sys.stdout.write(
+                f"serving '{NAME}' at http://{host}:{server.server_port}, until interrupted\n"
+                f"input       {', '.join(service.parameters)}\noutput      {', '.join(service.outputs)}\n"
+            )
+            sys.stdout.flush()
+        listening = Thread(target=server.serve_forever, daemon=True)
+        listening.start()
+        while True:
+            future, what, question = jobs.get()
+            try:
+                future.set_result(service.answer(what, question))
+            except KeyboardInterrupt:
+                future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
+                raise
+            except RefusalError as refusal:
+                future.set_exception(refusal)
+            except Exception as error:  # the next request may do better
+                traceback.print_exc()
+                future.set_exception(RefusalError(type(error).__name__, str(error), 500))
+            answered += 1
+    except KeyboardInterrupt:
+        if not quiet:
+            sys.stdout.write(f"interrupted after {answered} requests\n")
+        if listening is not None:
+            server.shutdown()
+        return answered
+    finally:
+        server.server_close()
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
