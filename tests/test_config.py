@@ -275,7 +275,7 @@ def test_shipped_studies_fit_the_schema(validator, path):
     validator.validate(tomllib.loads(path.read_text()))
 
 
-@pytest.mark.parametrize("kind", [*_METHODS])
+@pytest.mark.parametrize("kind", [kind for kind in _METHODS if kind != "invert"])  # which needs a file
 def test_starters_and_dumps_fit_the_schema(validator, kind):
     validator.validate(tomllib.loads(starter(kind)))
     validator.validate(document(parse(tomllib.loads(starter(kind)))))
