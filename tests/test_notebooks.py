@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 
 
+@pytest.mark.fem
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_line_runs(path, monkeypatch, tmp_path):
     """As a script: without reports, and without drawing bodies, which other tests do."""
@@ -26,6 +27,7 @@ def test_every_line_runs(path, monkeypatch, tmp_path):
     assert runpy.run_path(str(path))
 
 
+@pytest.mark.fem
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_jupyter_executes_it_and_shows_pictures(path, monkeypatch, tmp_path):
