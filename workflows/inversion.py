@@ -572,7 +572,11 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
     points, cases, axes, places = model
     count = found.sizes["data_set"]
     scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
-    varies = [path for path in scalars if path.startswith(("inclusions.", "material.", "regions.")) or path in study.parameters]
+    varies = [
+        path
+        for path in scalars
+        if path.startswith(("inclusions.", "material.", "regions.")) or path in study.parameters
+    ]
     for k in range(count):
         one = found.isel(data_set=k)
         truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
