@@ -14,8 +14,6 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.error import HTTPError, URLError
-from urllib.request import Request, urlopen
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -326,6 +324,9 @@ class Client:
 
     def _ask(self, what: str, question: dict[str, Any] | None, timeout: float | None = SECONDS_TO_ANSWER) -> Any:
         """Send a question and return the answer."""
+        from urllib.error import HTTPError, URLError
+        from urllib.request import Request, urlopen
+
         data = None if question is None else json.dumps({"name": self._model} | question).encode()
         request = Request(f"{self._url}/{what}", data, {"Content-Type": "application/json"})
         try:

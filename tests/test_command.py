@@ -142,7 +142,17 @@ def test_same_bits_on_any_number_of_groups(finished, tmp_path, ranks):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_a_model_on_two_ranks_agrees(finished, tmp_path):
-    done = tissuq("run", TINY, "--out", tmp_path / "out", "--set", "parallel.ranks_per_model=2", ranks=2)
+    done = tissuq(
+        "run",
+        TINY,
+        "--out",
+        tmp_path / "out",
+        "--set",
+        "parallel.ranks_per_model=2",
+        "--set",
+        "parallel.blocks=5",
+        ranks=2,
+    )
     assert done.returncode == 0, done.stderr
     one, two = (xr.load_dataset(d / "results.nc") for d in (finished, tmp_path / "out"))
     for name in ("values", "mean", "std", "derivative", "field_mean", "field_std"):

@@ -60,6 +60,7 @@ def test_blocks_cover_all_points_in_order(n):
     blocks = Request(points).blocks()
     assert len(blocks) <= BLOCKS
     np.testing.assert_array_equal(np.concatenate([block.points for block in blocks]), points)
+    assert len(Request(points).blocks(n)) == n
 
 
 def test_checkpoint_returns_what_was_saved(tmp_path):

@@ -373,3 +373,11 @@ def test_the_organ(tmp_path):
     assert run(study, "organ", tmp_path / "organ", quiet=True) == 0
     data = xr.load_dataset(tmp_path / "organ" / "results.nc")
     assert -0.01 < float(data["mean"].sel(output="push")) < 0
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+def test_derivatives_by_the_numbers_of_regions_in_the_mixed_form(file):
+    model = spec(file, body={"degree": 2}, formulation="mixed", regions={"right": REGION}, outputs=FEW)
+    point = np.array([1e4, 2e4, 3e4, 1e6, 1.5])
+    check_derivatives(built(model, *NUMBERS), point, 0.1 * point, noise=1e-10).require()

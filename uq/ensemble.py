@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from forward.model import ForwardModel, ModelError
 from uq.checkpoint import Checkpoint
-from uq.evaluate import BlockSolver, Evaluations, Merger, Request
+from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
 T = TypeVar("T")
 _RESULT = 1
@@ -67,6 +67,7 @@ class Ensemble:
         others: Sequence[Callable[[], ForwardModel]] = (),
         checkpoint: Checkpoint | None = None,
         progress: Callable[[int, int], None] = lambda done, failed: None,
+        blocks: int = BLOCKS,
     ) -> T | None:
         """Run `task` on rank 0 with an evaluation that all groups work on; collective.
 
@@ -82,6 +83,8 @@ class Ensemble:
             Where finished blocks are kept and found.
         progress
             On rank 0: told the numbers of points that were done and that failed since it was last told.
+        blocks
+            Most blocks that an evaluation is cut into.
 
         Returns
         -------
@@ -95,16 +98,17 @@ class Ensemble:
                     worker.work(order)
                 return None
             try:
-                return task(EnsembleEvaluate(worker, 0, progress))
+                return task(EnsembleEvaluate(worker, 0, progress, blocks))
             finally:
                 self.world.bcast(None)
 
 
 @dataclass(frozen=True)
 class _Order:
-    """A request on its way to all ranks: the blocks that are still to be computed, and where each is kept."""
+    """A request on its way to all ranks: most blocks, those that are still to be computed, and where each is kept."""
 
     request: Request
+    blocks: int
     pending: tuple[int, ...]
     keys: tuple[str, ...]
 
@@ -129,6 +133,7 @@ class EnsembleEvaluate:
     worker: _Worker
     number: int
     progress: Callable[[int, int], None]
+    blocks: int = BLOCKS
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -158,7 +163,7 @@ class EnsembleEvaluate:
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request on all groups; blocks that are on disk are read."""
         request = replace(request, model=self.number)
-        blocks = request.blocks()
+        blocks = request.blocks(self.blocks)
         checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
         kept = {i: key for i, key in enumerate(keys) if checkpoint and checkpoint.has(key)}
@@ -180,7 +185,7 @@ class EnsembleEvaluate:
 
         add_in_order()
         if pending:
-            self.worker.dispatch(_Order(request, pending, keys), receive, self.progress)
+            self.worker.dispatch(_Order(request, self.blocks, pending, keys), receive, self.progress)
         assert merger.count == len(blocks)
         return merger.result()
 
@@ -255,7 +260,7 @@ class _Worker:
 
     def _blocks(self, order: _Order, progress: Callable[[int, int], None]) -> Iterator[tuple[int, Evaluations]]:
         group = self._ensemble.group
-        blocks = order.request.blocks()
+        blocks = order.request.blocks(order.blocks)
         solver: BlockSolver | None = None
         while True:
             turn = self._counter.take() if group.rank == 0 else 0

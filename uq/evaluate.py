@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from forward.model import WORK, FloatArray, ForwardModel, Reference, Solution, SolveError
 
 TOGETHER = 16  # realisations whose part of a compact sum is formed at once
-BLOCKS = 128  # an evaluation is cut into at most this many blocks
+BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
 
 @dataclass(frozen=True)
@@ -173,10 +173,10 @@ class Request:
     model: int = 0
     joint: JointSum | None = None
 
-    def blocks(self) -> list[Request]:
-        """Cut into blocks that depend on the number of points, and of those that belong together, only."""
+    def blocks(self, most: int | None = None) -> list[Request]:
+        """Cut into blocks that depend on the number of points, of those that belong together, and `most` only."""
         together = 1 if self.joint is None else self.joint.size
-        size = together * max(1, -(-len(self.points) // (together * BLOCKS)))
+        size = together * max(1, -(-len(self.points) // (together * (most or BLOCKS))))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 
 

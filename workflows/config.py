@@ -17,6 +17,7 @@ from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
 from uq.distributions import Distribution, Normal
+from uq.evaluate import BLOCKS
 from uq.inputs import Inputs, Restricted
 from uq.linearisation import LocalSensitivity
 from uq.multilevel import MultilevelMonteCarlo
@@ -56,15 +57,19 @@ class Correlation(Settings):
 
 
 class Parallel(Settings):
-    """How ranks are used; it does not change results (except by rounding, where ranks share a model).
+    """How ranks are used; it does not change results (except by rounding, where ranks share a model or blocks change).
 
     Parameters
     ----------
     ranks_per_model
         Ranks that share one model; the others work on other samples.
+    blocks
+        Most blocks that an evaluation is cut into: more groups of ranks than these have nothing to do, and a block
+        that is interrupted is begun again.
     """
 
     ranks_per_model: Annotated[int, Field(ge=1)] = 1
+    blocks: Annotated[int, Field(ge=1, le=1_000_000)] = BLOCKS
 
 
 class Study(Settings):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.external import PythonModel
-from uq.evaluate import BLOCKS, Evaluate, Evaluations, Recorder, merge
+from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
@@ -110,7 +110,9 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     job = _job(study, ensemble, name)
     kept = checkpoint if job.costly else None
-    dataset = ensemble.run(job.model, job.task, others=job.others, checkpoint=kept, progress=progress)
+    dataset = ensemble.run(
+        job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
+    )
     if dataset is None:
         return DONE
     progress.close()
@@ -351,11 +353,11 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     if ranks % share:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
-    groups, blocks = ranks // share, min(max(study.planned - 1, 1), BLOCKS)
+    groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
     if groups > blocks:
         message = (
             f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
-            f"start mpirun -n {blocks * share}, or set parallel.ranks_per_model"
+            f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
         )
         raise StudyError(message)
     kept = directory / "study.toml"
