@@ -23,13 +23,15 @@ from inverse.inversion import (
     variables,
 )
 from inverse.observations import Components
-from tests.launch import run
+from tests.launch import run, run_script
 from uq.distributions import LogNormal, LogUniform, Normal
 from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
+from workflows import study as study_runs
 from workflows.config import StudyError, document, load, parse, schema
 from workflows.plan import plan
 from workflows.starter import starter
+from workflows.study import run as run_study
 
 TISSUQ = Path(sys.executable).parent / "tissuq"
 ROOT = Path(__file__).parent.parent
@@ -202,14 +204,28 @@ draws = 20
 )
 
 
+def here(path, out, *changes):
+    """Run a study in this process."""
+    return run_study(load(path, changes), path.stem, out, quiet=True)
+
+
+WITHOUT_REPORT = """
+import sys
+import workflows.study
+from workflows.__main__ import main
+
+workflows.study._report = lambda directory: None
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Studies with two synthetic data sets, one that has the wrong columns, and one of other units."""
     place = tmp_path_factory.mktemp("inversion")
     for name, text in (("made", MADE), ("few", FEW), ("field", FIELD)):
         (place / f"{name}.toml").write_text(text)
-    done = run(None, TISSUQ, "run", place / "made.toml", "--out", place / "made")
-    assert done.returncode == 0, done.stderr
+    assert here(place / "made.toml", place / "made") == 0
     (place / "made" / "data").rename(place / "data")
     (place / "data" / "wrong.csv").write_text("x,y,z,vx\n0,0,0,1\n")
     return place
@@ -227,11 +243,8 @@ def test_synthetic_data_say_what_they_are_of(folder):
     assert "2 data sets" in page
 
 
-def test_a_batch_from_the_command_line(folder):
-    """One bad file does not stop the others; one rank or two: the same bytes."""
-    done = run(None, TISSUQ, "run", folder / "few.toml", "--out", folder / "one")
-    assert done.returncode == 3, done.stderr
-    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
+def test_one_bad_file_does_not_stop_the_others(folder):
+    assert here(folder / "few.toml", folder / "one") == 3
     rows = list(csv.DictReader((folder / "one" / "batch.csv").read_text().splitlines()))
     assert [(row["data_set"], row["ok"]) for row in rows] == [("made-1", "yes"), ("made-2", "yes"), ("wrong", "no")]
     assert "unknown column" in rows[2]["why"]
@@ -241,9 +254,6 @@ def test_a_batch_from_the_command_line(folder):
     assert summary["failed"] == 1
     assert summary["data_sets"]["wrong"] == {"failed": rows[2]["why"]}
     assert set(summary["data_sets"]["made-1"]["posterior"]["material.mu"]) == {"mode", "std", "lower", "upper"}
-    done = run(2, TISSUQ, "run", folder / "few.toml", "--out", folder / "two")
-    assert done.returncode == 3, done.stderr
-    assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
     page = (folder / "one" / "report.html").read_text()
     for words in ("All data sets", "could not be inverted", "Load cases", "data:image/png", "log-uniform"):
         assert words in page
@@ -253,10 +263,17 @@ def test_a_batch_from_the_command_line(folder):
     assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
 
 
-def test_one_data_set_and_what_others_read_of_it(folder):
-    alone = ["--set", "data.files=['data/made-1.csv']"]
-    done = run(None, TISSUQ, "run", folder / "few.toml", *alone, "--out", folder / "single")
-    assert done.returncode == 0, done.stderr
+def test_two_ranks_give_the_same_bytes(folder):
+    assert (folder / "one").exists()  # of the test before
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "two")
+    assert done.returncode == 3, done.stderr
+    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
+    assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
+
+
+def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']") == 0
     summary = json.loads((folder / "single" / "summary.json").read_text())
     assert summary["evaluations"] > 32
     assert set(summary["posterior"]) == {"inclusions.lump.contrast", "material.mu"}
@@ -265,13 +282,10 @@ def test_one_data_set_and_what_others_read_of_it(folder):
     kept = arviz.from_netcdf(folder / "single" / "results.nc")
     assert kept.posterior["material.mu"].shape == (1, 50)
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
-    again = run(None, TISSUQ, "run", folder / "few.toml", *alone, "--out", folder / "single")
-    assert "nothing to do" in again.stdout
 
 
-def test_a_field_from_the_command_line(folder):
-    done = run(None, TISSUQ, "run", folder / "field.toml", "--out", folder / "field")
-    assert done.returncode == 0, done.stderr
+def test_a_field_and_its_report(folder):
+    assert here(folder / "field.toml", folder / "field") == 0
     found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
     assert found.sizes["node"] == 27
     assert (found["stiffness_std"] < found["stiffness_prior_std"]).all()

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 10  # of few parameters that a table lists
 RESOLUTION = 80  # points along the edge of a slice
+DRAWN = 8  # data sets that have more than a row of the table
 SEEN = 1.0  # λ above which the data say more of a direction than the prior
 
 
@@ -35,12 +36,8 @@ def context(dataset: xr.Dataset, study: AnyStudy) -> dict[str, Any]:
         "lines": list(findings(dataset)),
         "batch": batch(dataset) if several else None,
         "priors": priors(dataset, study),
-        "sets": [_of_set(dataset.sel(data_set=name)) for name in dataset.data_set.values if bool(_ok(dataset, name))],
+        "sets": [_of_set(dataset.sel(data_set=name)) for name in dataset.data_set.values[dataset["ok"]][:DRAWN]],
     }
-
-
-def _ok(dataset: xr.Dataset, name: Any) -> Any:
-    return dataset["ok"].sel(data_set=name)
 
 
 def _of_set(one: xr.Dataset) -> dict[str, Any]:
