@@ -130,6 +130,7 @@ def test_one_line_for_a_mistake(study, old, new, told):
 
 
 @pytest.mark.mpi
+@pytest.mark.slow
 def test_a_study_from_the_command_line(study):
     """One rank or two: the same bytes; the report shows what is left of the data."""
     for name, ranks in (("one", None), ("two", 2)):
