@@ -11,9 +11,11 @@ WHEEL_PYTHON = $(shell for python in python3.12 python3.13 python3.14 $$(ls -d $
     do $$python -c 'import venv, ensurepip' 2>/dev/null && echo $$python && break; done)
 WHEEL_VENV := .venv-wheel
 WHEEL_READY := $(WHEEL_VENV)/ready
-WHEEL_TESTS := tests/test_references.py tests/test_chaos.py tests/test_config.py tests/test_derivative_based.py \
+WHEEL_TESTS := tests/test_references.py tests/test_compilation.py tests/test_chaos.py tests/test_config.py \
     tests/test_inputs.py tests/test_low_rank.py tests/test_monte_carlo.py tests/test_posterior.py tests/test_sobol.py
 DEMO := beam
+# Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.
+WORKERS := --numprocesses auto --dist loadfile
 ARGS :=
 
 # Open MPI refuses root without these two; one BLAS thread per rank.
@@ -38,10 +40,10 @@ demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
 
 test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
-	@$(PYTHON) -m pytest $(ARGS)
+	@$(PYTHON) -m pytest $(WORKERS) $(ARGS)
 
 test-all: $(READY) ## run the test suite with the slow tests
-	@$(PYTHON) -m pytest -m "not benchmark" $(ARGS)
+	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)
 
 test-wheel: $(WHEEL_READY) ## run the tests that say that DOLFINx 0.11 gives the same results
 	@$(WHEEL_VENV)/bin/python -m pytest -m "not slow and not benchmark and (wheel or not fem and not mpi)" $(WHEEL_TESTS) $(ARGS)

@@ -12,8 +12,10 @@ from benchmarks import (
     inversion,
     levels,
     realisation,
+    scaling,
     selection,
     stability,
+    startup,
     streaming,
     throughput,
     variance,
@@ -32,6 +34,8 @@ ALL = {
     "streaming": streaming.main,
     "stability": stability.main,
     "chaos": chaos.main,
+    "scaling": scaling.main,
+    "startup": startup.main,
 }
 
 

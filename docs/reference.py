@@ -71,7 +71,8 @@ def pages() -> Iterator[tuple[str, str]]:
 def overview(readme: str) -> str:
     """Return the README with its links as of the site."""
     text = readme.replace("](docs/", "](")
-    return re.sub(r"\]\(configs/([\w-]+)\.toml\)", r"](studies.md#\1)", text)
+    text = re.sub(r"\]\(configs/([\w-]+)\.toml\)", r"](studies.md#\1)", text)
+    return re.sub(r"\[(`[^`]+`)\]\((?:configs|notebooks)\b[^)]*\)", r"\1", text)  # other files are not on the site
 
 
 def shipped() -> str:

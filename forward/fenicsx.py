@@ -170,15 +170,20 @@ def _own_mesh(comm: Any, body: OwnMesh) -> tuple[Any, dict[str, NDArray[np.int32
         points, boundaries = loaded.points, loaded.boundaries
         # From VTK's order of the corners.
         cells = loaded.cells if corners == 4 else np.ascontiguousarray(loaded.cells[:, [0, 1, 3, 2, 4, 5, 7, 6]])
-    msh = _distributed(comm, cells, points, body.cell)
+    if _FIVE:
+        element = ufl.FiniteElement("Lagrange", body.cell, 1, variant="equispaced")
+        msh = mesh.create_mesh(comm, cells, points, ufl.Mesh(ufl.VectorElement(element)))
+    else:
+        msh = mesh.create_mesh(comm, cells, basix.ufl.element("Lagrange", body.cell, 1, shape=(3,)), points)
     boundaries = comm.bcast(boundaries)
     msh.topology.create_entities(2)
     msh.topology.create_connectivity(2, 3)
     facet_map = msh.topology.index_map(2)
     every = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)
-    nodes = np.asarray(
-        cpp.mesh.entities_to_geometry(msh._mesh, 2, every, False) if _FIVE else mesh.entities_to_geometry(msh, 2, every)
-    )
+    if _FIVE:
+        nodes = np.asarray(cpp.mesh.entities_to_geometry(msh._mesh, 2, every, False))
+    else:
+        nodes = np.asarray(mesh.entities_to_geometry(msh, 2, every))
     originals = np.sort(np.asarray(msh.geometry.input_global_indices)[nodes.reshape(len(every), -1)], axis=1)
     numbers = {tuple(row): k for k, row in enumerate(originals.tolist())}
     facets = {}
@@ -186,15 +191,6 @@ def _own_mesh(comm: Any, body: OwnMesh) -> tuple[Any, dict[str, NDArray[np.int32
         here = [numbers[row] for row in map(tuple, np.sort(wanted, axis=1).tolist()) if row in numbers]
         facets[name] = np.array(sorted(here), dtype=np.int32)
     return msh, facets
-
-
-def _distributed(comm: Any, cells: NDArray[np.int64], points: FloatArray, cell: str) -> Any:
-    """Make a mesh of linear cells that are on the first rank."""
-    if _FIVE:
-        element = ufl.VectorElement(ufl.FiniteElement("Lagrange", cell, 1, variant="equispaced"))
-        return mesh.create_mesh(comm, cells, points, ufl.Mesh(element))
-    partitioner = mesh.create_cell_partitioner(mesh.GhostMode.shared_facet, 2)
-    return mesh.create_mesh(comm, cells, basix.ufl.element("Lagrange", cell, 1, shape=(3,)), points, partitioner)
 
 
 def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
@@ -222,7 +218,8 @@ def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
     """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
     of_cells = region_numbers(comm, body, msh)
     cell = msh.ufl_cell()
-    space = _space(msh, ufl.FiniteElement("DG", cell, 0) if _FIVE else basix.ufl.element("DG", cell.cellname, 0))
+    constants = ufl.FiniteElement("DG", cell, 0) if _FIVE else basix.ufl.element("DG", cell.cellname, 0)
+    space = _space(msh, constants)
     dofs = np.array([space.dofmap.cell_dofs(cell)[0] for cell in range(len(of_cells))])
     found = {}
     for number, name in enumerate(body.regions):

@@ -64,7 +64,7 @@ class Invert(Settings):
     Parameters
     ----------
     samples
-        Solves that correct Laplace's Gaussian; by default 256 for few parameters and 32 for a field, where 0 is none.
+        Solves that correct Laplace's Gaussian: by default 256 for few parameters, and none for a field.
     noise
         Prior of the factor on all standard deviations of the errors; without it they are what they are said to be.
     chains
@@ -98,7 +98,7 @@ class Invert(Settings):
 
     def solves(self, *, field: bool) -> int:
         """Number of solves of a data set that correct the Gaussian."""
-        return (32 if field else 256) if self.samples is None else self.samples
+        return (0 if field else 256) if self.samples is None else self.samples
 
 
 class SyntheticNoise(Settings):

@@ -78,11 +78,10 @@ table.drop(columns=["output", "unit"], errors="ignore")
 # %% [markdown]
 # ## What a method is worth
 #
-# Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number over what the method
-# costs.
+# Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number over the solves of the
+# method.
 
 # %%
-worth = gains(one, "mean")
-for i, name in enumerate(one["row_method"].values):
-    listed = ", ".join(f"{float(gain[i]):.3g} in {word.replace('_', ' ')}" for word, gain in worth.items())
-    print(f"{name:28} {int(one['budget'][i]):4} samples: {listed}")
+worth = gains(one, "mean")["solves"].values
+for name, budget, gain in zip(one["row_method"].values, one["budget"].values, worth, strict=True):
+    print(f"{name:28} {int(budget):4} samples: {gain:.3g}")

@@ -196,7 +196,9 @@ def test_all_mistakes_are_reported_together():
 
 def test_the_plan_says_the_form():
     studies = {path.stem: load(path) for path in CONFIGS}
-    assert {name for name, study in studies.items() if isinstance(study, Study) and study.model.mixed} == {"cook"}
+    assert {
+        name for name, study in studies.items() if isinstance(study, Study) and study.body and study.body.mixed
+    } == {"cook"}
     plain, mixed = (plan(parse(blocks(), [f"model.material.D1={bulk}"])) for bulk in (3e5, 3e8))
     assert "displacement form" in plain[1]
     assert "mixed form: displacements and pressures" in mixed[1]
@@ -275,7 +277,7 @@ def test_shipped_studies_fit_the_schema(validator, path):
     validator.validate(tomllib.loads(path.read_text()))
 
 
-@pytest.mark.parametrize("kind", [*_METHODS])
+@pytest.mark.parametrize("kind", [kind for kind in _METHODS if kind != "invert"])  # which needs a file
 def test_starters_and_dumps_fit_the_schema(validator, kind):
     validator.validate(tomllib.loads(starter(kind)))
     validator.validate(document(parse(tomllib.loads(starter(kind)))))

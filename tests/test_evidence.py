@@ -9,12 +9,14 @@ from inverse.evidence import evidence, tail_shape
 from inverse.laplace import laplace
 from inverse.nested import nested
 from inverse.posterior import Posterior
+from inverse.selection import posterior as assemble
 from inverse.surrogate import fit
-from tests.rubber import CURVED, FACTOR, LINEAR, on_treloar, treloar
+from tests.rubber import CONFIGS, CURVED, FACTOR, LINEAR, on_treloar, treloar
 from uq.distributions import LogNormal, Normal, Uniform
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
 from uq.sampling import sobol_points
+from workflows.config import load
 
 NAMES = ("a", "b", "c", "d")
 TRUTH = np.array([1.4, 0.8, 1.1, 1.3])
@@ -178,4 +180,16 @@ def test_nested_sampling_agrees_on_treloar():
         posterior = on_treloar(kind, priors, FACTOR)
         found = evidence(posterior, laplace(posterior), 256)
         value, error = nested(posterior)
+        assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind
+
+
+@pytest.mark.slow
+def test_nested_sampling_agrees_on_brain():
+    pytest.importorskip("dynesty")
+    study = load(CONFIGS / "brain.toml")
+    for kind in study.candidates:
+        it = SerialEvaluate(study.build(kind, "cortex"))
+        whole = assemble(study.models[kind], study.groups["cortex"], study.method.noise, it)
+        found = evidence(whole, laplace(whole), 256)
+        value, error = nested(whole)
         assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind

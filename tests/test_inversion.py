@@ -6,6 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
@@ -26,7 +27,7 @@ from tests.launch import run
 from uq.distributions import LogNormal, LogUniform, Normal
 from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
-from workflows.config import StudyError, load, parse
+from workflows.config import StudyError, document, load, parse, schema
 from workflows.plan import plan
 from workflows.starter import starter
 
@@ -324,7 +325,11 @@ def test_points_outside_the_body_are_told(folder):
 
 def test_starters(tmp_path):
     (tmp_path / "measured.csv").write_text("x,y,z,uz\n0.025,0.025,0.05,0.002\n")
-    assert parse(tomllib.loads(starter("invert")), folder=tmp_path).method.kind == "invert"
+    study = parse(tomllib.loads(starter("invert")), folder=tmp_path)
+    assert study.method.kind == "invert"
+    for blocks in (tomllib.loads(starter("invert")), document(study)):
+        jsonschema.validate(blocks, schema())
+    assert parse(document(study)) == study
     assert parse(tomllib.loads(starter("synthesize"))).method.kind == "synthesize"
 
 

@@ -287,6 +287,23 @@ def test_the_starter_is_valid():
     assert study.method.kind == "select"
 
 
+def test_candidates_with_fibres(small):
+    """Fibres along the stretch stiffen it; those that a test would shear are a mistake."""
+    fibres = "material = { kind = 'holzapfel-gasser-ogden', k1 = 200, k2 = 1, fibres = [[1, 0, 0]] }\nparameters.c"
+    old = 'material = { kind = "neo-hookean" }\nparameters.C1'
+    small.write_text(SMALL.replace(old, fibres, 1))
+    study = load(small)
+    assert parse(tomllib.loads(dump(study))) == study
+    tension = study.build("neo-hookean", "all").stresses(np.array([[500.0]]))[0, :2]
+    x = np.array([1.1, 1.2])
+    I4 = x**2
+    expected = 500 * (x - x**-2) + 400 * (I4 - 1) * np.exp((I4 - 1) ** 2) * x
+    np.testing.assert_allclose(tension, expected, rtol=1e-12)
+    small.write_text(SMALL.replace(old, fibres.replace("[1, 0, 0]", "[1, 1, 0]"), 1))
+    with pytest.raises(StudyError, match=r"candidates.neo-hookean.material: fibres that a test 'uniaxial' would shear"):
+        load(small)
+
+
 def test_other_studies_do_not_import_inversion():
     script = "import sys, workflows.study, workflows.report; print('inverse' in sys.modules)"
     assert run_script(None, script).stdout.strip() == "False"

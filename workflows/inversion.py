@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
@@ -136,7 +137,7 @@ class Inversion(Settings):
     data: DataFiles
     method: Invert = Invert()
     parallel: Parallel = Parallel()
-    measurements: tuple[Any, ...] = Field(default=(), exclude=True, repr=False)
+    measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     def __eq__(self, other: object) -> bool:
         """Whether the same is asked of the same files."""
@@ -571,7 +572,11 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
     points, cases, axes, places = model
     count = found.sizes["data_set"]
     scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
-    varies = [path for path in scalars if path.startswith(("inclusions.", "material.")) or path in study.parameters]
+    varies = [
+        path
+        for path in scalars
+        if path.startswith(("inclusions.", "material.", "regions.")) or path in study.parameters
+    ]
     for k in range(count):
         one = found.isel(data_set=k)
         truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))

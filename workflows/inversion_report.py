@@ -246,7 +246,8 @@ def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
     """Draw what was found for one data set, each with what it shows."""
     cut = Cut.of(one)
     where = f"the plane {'xyz'[cut.axis]} = {cut.level:.4g} m"
-    yield slices(one, cut), f"ln of the stiffness factor on {where}: {', '.join(_panels(one))}."
+    if float(one["stiffness_prior_std"].max()) > 0:
+        yield slices(one, cut), f"ln of the stiffness factor on {where}: {', '.join(_panels(one))}."
     yield spectrum(one), "λ of all load cases together and of each alone; above 1 the data say more than the prior."
     if "draw" in one:
         yield (

@@ -247,7 +247,7 @@ on = "z-max"
 
 _METHODS["invert"] = """\
 kind = "invert"
-samples = 64          # solves that correct Laplace's Gaussian; of a field, 0 is none
+samples = 64          # solves that correct Laplace's Gaussian; of a field, 192 check it and 0 is none
 starts = 2            # of the search for the mode
 # noise = { kind = "log-uniform", lower = 0.2, upper = 5 }   # of a factor on all sigma, if their size is unknown
 # chains = "pcn"      # Markov chains beside it; or "emcee"

@@ -1,0 +1,111 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Exploring a posterior
+#
+# A cube was sheared, compressed and extended; displacements of four faces were measured. What do they say of the
+# stiffness inside? The study is `configs/stiffness-field.toml`, here on a mesh of 4³ cells, for speed;
+# `TISSUQ_INVERSION=results/stiffness-field` shows the whole one.
+#
+# So coarse a mesh errs by more than the data do. The size of the errors is therefore inferred too, by
+# `method.noise`; the sentence below, which also stands at the head of the report, says whether that was enough.
+
+# %%
+# %matplotlib inline
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from workflows import inversion_report, plots
+from workflows.config import load
+from workflows.results import read_dataset
+from workflows.study import run
+
+CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
+directory = Path(os.environ.get("TISSUQ_INVERSION") or tempfile.mkdtemp())
+if not (directory / "results.nc").exists():
+    coarse = ["model.body.cells=[4, 4, 4]", "method.noise={kind='log-uniform', lower=0.5, upper=20}"]
+    run(load(CONFIGS / "stiffness-field.toml", coarse), "field", directory, quiet=True)
+data = read_dataset(directory)
+one = data.isel(data_set=0)
+print(*inversion_report.findings(data), sep="\n")
+
+# %% [markdown]
+# ## What was found
+#
+# The logarithm of the stiffness factor on a plane: truth (these data were made by a finer mesh), mean of the
+# posterior, and its standard deviation beside that of the prior.
+
+# %%
+axis, level = inversion_report.plane(one)
+inversion_report.slices(one, axis, level).figure
+
+# %% [markdown]
+# ## How much is from the data: the spectrum
+#
+# λ compares the data with the prior, direction by direction. Above 1 the data say more; below, what the picture
+# shows is the prior. The posterior width of a direction is the prior's over √(1 + λ).
+
+# %%
+inversion_report.spectrum(one).figure
+
+# %%
+eigenvalues = one["eigenvalue"].values
+eigenvalues = eigenvalues[np.isfinite(eigenvalues)]
+seen = int((eigenvalues > 1).sum())
+print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all: {float(one['determined']):.1f}")
+
+# %% [markdown]
+# ## Which directions
+#
+# The first ones are what the data know best, the last ones what they hardly see: fine variations, and those far
+# from the faces that were measured.
+
+# %%
+inversion_report.direction_slices(one, axis, level).figure
+
+# %% [markdown]
+# Each load case alone would have said less:
+
+# %%
+inversion_report.alone_slices(one, axis, level).figure
+
+# %% [markdown]
+# ## Draws, and what they predict
+#
+# Draws of the posterior are fields as likely as the data allow; whatever is computed from each of them has the
+# spread of a prediction. Here the mean stiffness factor of the upper and of the lower half:
+
+# %%
+draws = np.exp(one["stiffness_draw"].values)  # ln of the factor: (sample, node)
+upper = one["node_position"].sel(axis="z").values > 0.5 * float(one["node_position"].sel(axis="z").max())
+ax = plots.axes()
+for name, nodes in (("upper half", upper), ("lower half", ~upper)):
+    ax.hist(draws[:, nodes].mean(axis=1), bins=12, alpha=0.6, label=name)
+ax.set_xlabel("mean stiffness factor of the nodes")
+ax.set_ylabel("draws")
+ax.legend()
+ax.figure
+
+# %% [markdown]
+# ## Does the model explain the data?
+#
+# |r|² of each load case beside what is expected: a bar far above its mark says that mesh, material or stated
+# errors are wrong. The coarse mesh fails here although the size of the errors was inferred: it errs more in one
+# load case than in another, and smoothly, so that residuals of neighbours agree. The mesh of the whole study does
+# not. No posterior should be read further before this test is passed.
+
+# %%
+inversion_report.misfits(one).figure
