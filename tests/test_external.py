@@ -1,6 +1,5 @@
 """Models of other programs: Python functions in every method that needs no field."""
 
-import json
 import shutil
 import sys
 import tomllib
@@ -14,8 +13,8 @@ from forward.external import PythonModel
 from forward.model import ModelError, SolveError
 from tests import functions
 from tests.launch import ROOT
-from uq.evaluate import SerialEvaluate
-from workflows.config import StudyError, parse
+from uq.evaluate import Request, SerialEvaluate
+from workflows.config import StudyError, load, parse
 from workflows.plan import plan
 from workflows.study import run
 
@@ -98,13 +97,11 @@ def test_a_run_leaves_results_and_a_report_without_a_body(tmp_path):
     assert not (tmp_path / "out" / "fields").exists()
 
 
-def test_a_function_that_raises_is_a_failed_solve(tmp_path):
-    case = study("model.function=tests.functions.brittle", "method.samples=32")
-    assert run(case, "beam", tmp_path / "out", quiet=True) == 3
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert 0 < summary["failed"] < 32
-    assert summary["failures"][0]["reason"] == "tests.functions.brittle raised RuntimeError: the beam broke"
-    assert summary["failures"][0]["parameters"]["load"] > 1
+def test_a_function_that_raises_is_a_failed_solve():
+    built = model(function="tests.functions.brittle").build(None, ("load",))
+    found = SerialEvaluate(built)(Request(np.array([[0.9], [1.1]])))
+    assert found.ok.tolist() == [True, False]
+    assert found.failures[0].reason == "tests.functions.brittle raised RuntimeError: the beam broke"
 
 
 @pytest.mark.parametrize(
@@ -182,11 +179,12 @@ def test_modules_are_found_beside_the_study(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err == "model.function: 'own_beam' has no 'bem'; did you mean 'beam'?\n"
 
 
-def test_the_shipped_example(tmp_path, monkeypatch):
+def test_the_shipped_example(monkeypatch):
     from workflows.__main__ import main
 
     monkeypatch.setattr(sys, "path", [*sys.path])
     study = ROOT / "configs" / "own-model.toml"
-    assert main(["run", str(study), "--quiet", "--out", str(tmp_path / "out")]) == 0
-    data = xr.load_dataset(tmp_path / "out" / "results.nc")
+    assert main(["check", str(study)]) == 0
+    case = load(study)
+    data = case.method.run(case.inputs, SerialEvaluate(case.model.build(None, case.inputs.names)))
     assert float(data["mean"].sel(output="tip")) == pytest.approx(MEAN, rel=1e-5)

@@ -347,21 +347,16 @@ def test_the_server_of_a_function(function):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_ends_the_server(tmp_path, number):
+def test_an_interrupt_ends_the_server(tmp_path, number, capsys):
+    from workflows.__main__ import main
+
     path = tmp_path / "study.toml"
     path.write_text(FUNCTION.format("beam"))
     with command(TISSUQ, "serve", path, "--port", 0) as (url, process):
         assert ask(url, "Info")[0] == 200
-        taken = subprocess.run(
-            [TISSUQ, "serve", path, "--port", url.split(":")[-1]],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment(),
-            cwd=ROOT,
-        )
-        assert taken.returncode == 2
-        assert taken.stderr == f"--port {url.split(':')[-1]}: cannot be used on 127.0.0.1: Address already in use\n"
+        port = url.split(":")[-1]
+        assert main(["serve", str(path), "--port", port]) == 2
+        assert capsys.readouterr().err == f"--port {port}: cannot be used on 127.0.0.1: Address already in use\n"
         process.send_signal(number)
         assert process.wait(timeout=10) == 0
         assert "interrupted after 1 requests" in process.stdout.read()
