@@ -46,6 +46,7 @@ T = TypeVar("T")
 _FIVE = dolfinx.__version__.startswith("0.5.")  # else 0.11
 if not _FIVE:
     import basix.ufl
+atan2 = ufl.atan_2 if _FIVE else ufl.atan2
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
 
 
