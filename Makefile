@@ -11,7 +11,7 @@ WHEEL_PYTHON = $(shell for python in python3.12 python3.13 python3.14 $$(ls -d $
     do $$python -c 'import venv, ensurepip' 2>/dev/null && echo $$python && break; done)
 WHEEL_VENV := .venv-wheel
 WHEEL_READY := $(WHEEL_VENV)/ready
-WHEEL_TESTS := tests/test_references.py tests/test_compilation.py tests/test_chaos.py tests/test_config.py \
+WHEEL_TESTS := tests/test_references.py tests/test_compilation.py tests/test_own_mesh.py tests/test_chaos.py tests/test_config.py \
     tests/test_inputs.py tests/test_low_rank.py tests/test_monte_carlo.py tests/test_posterior.py tests/test_sobol.py
 DEMO := beam
 # Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.

@@ -179,17 +179,16 @@ def simulated(durations: FloatArray, groups: int, blocks: int, constants: Consta
     """
     size = -(-len(durations) // blocks)
     edges = np.arange(0, len(durations), size)
-    work = np.add.reduceat(durations, edges)
-    wait = np.random.default_rng(0).random(len(edges) + groups) * latency
-    free = [(constants.key * len(edges) + constants.reference * durations.mean(), group) for group in range(groups)]
-    counter, ends = 0.0, np.empty(len(edges))
-    for i, seconds in enumerate(work):
-        now, group = heapq.heappop(free)
-        counter = max(counter, now) + constants.take
-        ends[i] = counter + wait[i] + seconds + constants.file
-        heapq.heappush(free, (ends[i], group))
+    work = (np.add.reduceat(durations, edges) + constants.file).tolist()
+    wait = (np.random.default_rng(0).random(len(edges)) * latency).tolist()
+    free = [constants.key * len(edges) + constants.reference * float(durations.mean())] * groups
+    counter, ends = 0.0, []
+    for seconds, unheard in zip(work, wait, strict=True):
+        counter = max(counter, free[0]) + constants.take
+        ends.append(counter + unheard + seconds)
+        heapq.heapreplace(free, ends[-1])
     added = 0.0
-    for end in np.sort(ends):
+    for end in sorted(ends):
         added = max(added, end) + constants.merge
     return added
 

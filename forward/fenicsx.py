@@ -47,6 +47,7 @@ _FIVE = dolfinx.__version__.startswith("0.5.")  # else 0.11
 atan2 = ufl.atan_2 if _FIVE else ufl.atan2
 if not _FIVE:
     import basix.ufl
+atan2 = ufl.atan_2 if _FIVE else ufl.atan2
 _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.tetrahedron}
 
 
