@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from difflib import get_close_matches
 from typing import Any, Self
 
@@ -27,6 +28,10 @@ class Settings(BaseModel):
             raise ValidationError.from_exception_data(
                 cls.__name__, [_explain(cls, line) for line in error.errors(include_url=False)]
             ) from None
+
+    def __hash__(self) -> int:
+        """Hash what the block says: tables within it are dictionaries, which have no hash of their own."""
+        return hash(json.dumps(self.model_dump(mode="json"), sort_keys=True))
 
 
 class Named(Settings):

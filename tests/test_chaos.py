@@ -355,7 +355,7 @@ def test_blocks_change_no_bit_and_keep_states_only(beam, tmp_path, monkeypatch):
     ensemble = Ensemble.split(MPI.COMM_SELF)
     for _ in range(2):  # the second finds the blocks of the first
         kept = Checkpoint(tmp_path, "beam")
-        data = ensemble.run(evaluate.model, lambda each: method.run(inputs, each), checkpoint=kept)
+        data = ensemble.run(evaluate.model, lambda each: method.run(inputs, each), checkpoint=kept, blocks=3)
         assert data.identical(expected)
     rows = [load_block(path).fields.shape[0] for path in (tmp_path / "evaluations").glob("*.h5")]
     assert sorted(rows) == [3, 3 * 1, 3 * 3, 3 * 3]
