@@ -210,7 +210,7 @@ class Inversion(Settings):
             except DataError as error:
                 measurement, wrong = None, "; ".join(error.args)
                 lines += [f"data: {line}" for line in error.args]
-            digest = sha256(path.read_bytes()).hexdigest()[:16]
+            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
             sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
             found.append(measurement)
         if all(measurement is None for measurement in found):
