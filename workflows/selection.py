@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -305,6 +306,9 @@ class Comparison(Settings):
 
     def mistakes_of_method(self) -> Iterator[Mistake]:
         """Find what does not fit the candidates and the data."""
+        if self.method.check is not None and find_spec(self.method.check) is None:
+            message = f"needs {self.method.check}, which is not installed: pip install {self.method.check}"
+            yield ("method", "check"), message, self.method.check
         known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
         for name, tests in self.method.subsets.items():
             for test in tests:
