@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
-from forward.settings import Settings
+from forward.settings import Settings, nearest
 from forward.specimen import Specimen
 from inverse.inversion import ENDS, Invert, Synthesize, names_of, sentence, variables
 from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
-from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -67,7 +67,7 @@ class DataFiles(Settings):
     ----------
     files
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
-        directory. Each file is a data set, which is inverted by itself.
+        directory; one alone may be given as a word. Each file is a data set, which is inverted by itself.
     sigma
         Standard deviation (m) of the errors where a file does not say.
     unit
@@ -86,6 +86,11 @@ class DataFiles(Settings):
     tolerance: Annotated[float, Field(ge=0)] = 0.0
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
+
+    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
+    @classmethod
+    def _one_alone(cls, given: Any) -> Any:
+        return (given,) if isinstance(given, str) else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +263,11 @@ class Inversion(Settings):
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        yield from mistakes_of_factor(self.method.noise, "method", "noise")
+        for name, value in self.data.truth.items():
+            if name not in self.model.scalars:
+                message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
+                yield ("data", "truth", name), message, value
         try:
             self.inputs  # noqa: B018 - checks the correlations
         except ValueError as error:
