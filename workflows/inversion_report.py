@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from workflows import plots
 from workflows.tables import Table
-from workflows.words import number, settings, unit_of, with_error, with_unit
+from workflows.words import number, settings, unit_of, with_error
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 DIRECTIONS = 10  # of few parameters that a table lists
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
+SMALL = 1e-3  # volume (m³) that is rather written in cm³
+TRUSTED = ("Laplace's", "corrected", "not to be trusted")
 DRAWN = 8  # data sets that have more than a row of the table
 Density = tuple[FloatArray, FloatArray]
 SEEN = 1.0  # λ above which the data say more of a direction than the prior
@@ -121,23 +123,23 @@ def batch(dataset: xr.Dataset) -> Table:
     for label in dataset.data_set.values:
         one = dataset.sel(data_set=label)
         if not bool(one["ok"]):
-            rows.append((str(label), "failed", *[""] * (len(names) + 3), str(one["why"].item())))
+            rows.append((str(label), "", "failed", *[""] * (len(names) + 3)))
             continue
         values = [_estimate(one.sel(parameter=name)) for name in names]
         rows.append(
             (
                 str(label),
                 f"{int(np.isfinite(one['measured']).sum()):,}",
+                TRUSTED[int(one["trust"])],
                 *values,
                 number(float(one["determined"]), 3),
                 number(float(one["residual_probability"]), 2),
                 number(float(one["log_evidence"]), 6),
-                str(one["why"].item()),
             )
         )
-    head = ("data set", "data", *names, "directions determined", "p of larger residuals", "ln Z", "verdict")
-    last = len(head) - 1
-    return Table(head, rows, text=frozenset({0, last}), long=frozenset({last}))
+    units = map(_with_unit, names)
+    head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
+    return Table(head, rows, text=frozenset({0, 2}))
 
 
 def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
@@ -189,17 +191,18 @@ def posterior(one: xr.Dataset) -> Table:
     ]
     for label in one["inclusion"].values if "inclusion" in one else ():
         of = one.sel(inclusion=label)
-        numbers = {str(key).removeprefix("volume_"): of[key] for key in of.data_vars if str(key).startswith("volume_")}
-        rows.append(_row(numbers, f"inclusions.{label}.volume", "m³", laplace=laplace, known=known))
+        unit, per_unit = ("cm³", 1e6) if float(of["volume_mean"]) < SMALL else ("m³", 1.0)
+        volumes = [str(key) for key in of.data_vars if str(key).startswith("volume_")]
+        numbers = {key.removeprefix("volume_"): per_unit * of[key] for key in volumes}
+        rows.append(_row(numbers, f"inclusions.{label}.volume", unit, laplace=laplace, known=known))
     head = ["", "prior", "mode", "posterior", "95 %", *(["± by Laplace"] if laplace else [])]
     return Table([*head, *(["truth", "inside"] if known else [])], rows)
 
 
 def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[str]:
     """Name, prior, mode, posterior, interval; width by Laplace where there is one, truth where it is known."""
-    row = [name, with_unit(with_error(float(of["prior_mean"]), float(of["prior_std"])), unit)]
-    row += [with_unit(_shown(of["mode"]), unit), with_unit(_estimate(of), unit)]
-    row += [f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
+    row = [name if unit == "1" else f"{name} ({unit})", with_error(float(of["prior_mean"]), float(of["prior_std"]))]
+    row += [_shown(of["mode"]), _estimate(of), f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
     if laplace:
         row.append(_shown(of["laplace_std"], 2) if "laplace_std" in of else "")
     if known:
