@@ -290,6 +290,7 @@ def test_given_data_must_fit(tmp_path):
     written.attrs["config"] = '[parameters]\na = { kind = "uniform", lower = 0.0, upper = 1.0 }\n'
     with pytest.raises(FileNotFoundError, match="other distributions"):
         run(given(tmp_path, written), Inputs(normal), product)
+    run(given(tmp_path, written), CUBE, product)  # b and c as coefficients of random fields: not written
 
 
 # --- the finite-element beam ---------------------------------------------------------------------------------------
