@@ -362,11 +362,11 @@ def _read(directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
     if not ("multi_index" in source or "values" in source):
         message = f"{directory}: holds neither samples nor an expansion, expected results of chaos or of sampling"
         raise FileNotFoundError(message)
-    ours, theirs = _as_written(inputs), _distributions(source.attrs.get("config"))
+    ours, written = _as_written(inputs), _distributions(source.attrs.get("config"))
     if not (
         np.allclose(source["parameter_mean"], inputs.mean, rtol=1e-10, atol=0)
         and np.allclose(source["parameter_std"], inputs.std, rtol=1e-10, atol=0)
-        and all(ours[name] == written for name, written in theirs.items())  # coefficients of fields are not written
+        and all(ours[name] == value for name, value in written.items())  # coefficients of fields are not written
     ):
         message = f"{directory}: holds results of other distributions, expected those of this study"
         raise FileNotFoundError(message)
