@@ -67,19 +67,22 @@ def linear():
     return FunctionModel(lambda p: MATRIX @ p, ("a", "b", "c"), tuple(map(str, range(12))), lambda p: MATRIX)
 
 
+def exactly(rows):
+    """Mean and covariance of the posterior by some of the data."""
+    A = MATRIX[rows] / 0.1
+    mean, std = np.array([(p.mean, p.std) for p in PRIORS.values()]).T
+    precision = A.T @ A + np.diag(std**-2.0)
+    right = A.T @ DATA.values[rows] / 0.1 + mean / std**2
+    return np.linalg.solve(precision, right), np.linalg.inv(precision)
+
+
 def test_linear_models_have_the_exact_posterior():
     method = Invert(samples=64, starts=2)
     record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
     prior_std = np.array([p.std for p in PRIORS.values()])
     mean = np.array([p.mean for p in PRIORS.values()])
 
-    def posterior(rows):
-        A = MATRIX[rows] / 0.1
-        precision = A.T @ A + np.diag(prior_std**-2.0)
-        right = A.T @ DATA.values[rows] / 0.1 + mean / prior_std**2
-        return np.linalg.solve(precision, right), np.linalg.inv(precision)
-
-    exact, covariance = posterior(np.arange(12))
+    exact, covariance = exactly(np.arange(12))
     np.testing.assert_allclose(record["mode"], exact, rtol=1e-8)
     np.testing.assert_allclose(record["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
     np.testing.assert_allclose(record["std"], np.sqrt(np.diag(covariance)), rtol=0.3)
@@ -90,7 +93,7 @@ def test_linear_models_have_the_exact_posterior():
     assert record["log_evidence"] == pytest.approx(log_evidence, abs=1e-8)
     for k in range(2):
         rows = np.flatnonzero(DATA.cases == k)
-        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(posterior(rows)[1])), rtol=1e-8)
+        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(exactly(rows)[1])), rtol=1e-8)
         A = MATRIX[rows] * prior_std / 0.1
         np.testing.assert_allclose(record["alone_eigenvalue"][k], np.linalg.eigvalsh(A.T @ A)[::-1], rtol=1e-8)
         assert record["misfit"][k] == pytest.approx((record["residual"][rows] ** 2).sum())
@@ -106,6 +109,30 @@ def test_the_noise_can_be_unknown():
     assert record["lower"][3] < 1 < record["upper"][3]
     assert np.isnan(record["alone_std"][:, 3]).all()
     np.testing.assert_array_equal(record["direction_parameter"][:, 3], 0)
+
+
+@pytest.mark.parametrize("kind", ["pcn", pytest.param("emcee", marks=pytest.mark.slow)])
+def test_what_is_left_is_of_chains_that_have_mixed(kind):
+    """Moments, intervals and draws: those of the exact posterior, closer than so few weighted points come."""
+    method = Invert(samples=32, starts=1, chains=kind)
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    exact, covariance = exactly(np.arange(12))
+    std = np.sqrt(np.diag(covariance))
+    assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
+    assert record["chain_rhat"] < 1.01
+    assert record["chain_effective"] > 400
+    np.testing.assert_allclose(record["mean"], exact, atol=0.15 * std.min())
+    np.testing.assert_allclose(record["std"], std, rtol=0.1)
+    np.testing.assert_allclose((record["upper"] - record["lower"]) / std, 2 * 1.96, rtol=0.1)
+    assert len(np.unique(record["draw"], axis=0)) > 200  # of 32 points there would be no more
+    r = (record["draw"][0] @ MATRIX.T - DATA.values) / 0.1
+    np.testing.assert_allclose(record["draw_log_likelihood"][0], -(r**2) / 2 - np.log(0.1 * np.sqrt(2 * np.pi)))
+
+
+def test_what_is_predicted_is_as_sure_as_the_parameters():
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, Invert(samples=32, starts=1), lambda points: points[:, :1])
+    _, covariance = exactly(np.arange(12))
+    np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
 
 
 def test_inversions_are_evaluations():

@@ -263,9 +263,10 @@ def test_one_line_for_a_mistake(small, old, new, told):
     [
         ("torsion,1.1,2", "line 6: unknown mode 'torsion'"),
         ("uniaxial,1.1,much", "line 6, stress: 'much', expected a number"),
-        ("uniaxial,1.1", "line 6, stress: None, expected a number"),
+        ("uniaxial,1.1", "table.csv: line 6: 2 cells, expected 3"),
+        ("uniaxial,1.1,2,3", "table.csv: line 6: 4 cells, expected 3"),
         ("uniaxial,nan,1", "line 6, stretch: 'nan', expected a number"),
-        ("uniaxial,-1,1", "data.tests.0.: at: stretch -1"),
+        ("uniaxial,-1,1", "line 6, stretch: -1, expected more than 0"),
     ],
 )
 def test_one_line_for_a_bad_row(small, row, told):
@@ -273,6 +274,18 @@ def test_one_line_for_a_bad_row(small, row, told):
     with pytest.raises(StudyError, match=told) as caught:
         load(small)
     assert len(caught.value.args) == 1
+
+
+def test_second_stretches_and_errors_in_a_table(small):
+    """The column of second stretches is of biaxial tests alone; errors of the data are more than nothing."""
+    rows = ["mode,stretch,other,stress,error", "uniaxial,1.1,,0.3,0.1", "biaxial,1.1,1.2,0.4,0.1"]
+    columns = ["data.across='other'", "data.sigma='error'"]
+    (small.parent / "table.csv").write_text("\ufeff" + "\n".join(rows))
+    tests = load(small, columns).data.tests
+    assert [test.across for test in tests] == [None, (1.2,)]
+    (small.parent / "table.csv").write_text("\n".join([*rows, "biaxial,1.2,1.2,0.4,0"]))
+    with pytest.raises(StudyError, match="line 4, error: 0, expected more than 0"):
+        load(small, columns)
 
 
 def test_subsets_are_of_known_tests(small):

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -173,7 +174,9 @@ class Inversion(Settings):
     def planned(self) -> int:
         """Number of evaluations: data sets, or solves where all groups work on one."""
         if self.together:
-            return self.method.solves(field=False) + 12 * self.method.starts + 2 * len(self.parameters)
+            method = self.method
+            corrections = method.solves(field=False) + method.chain_solves(len(self.names), field=False)
+            return corrections + 12 * method.starts + 2 * len(self.parameters)
         return len(self.data.sets) + 1
 
     @property
@@ -210,7 +213,7 @@ class Inversion(Settings):
             except DataError as error:
                 measurement, wrong = None, "; ".join(error.args)
                 lines += [f"data: {line}" for line in error.args]
-            digest = sha256(path.read_bytes()).hexdigest()[:16]
+            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
             sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
             found.append(measurement)
         if all(measurement is None for measurement in found):
@@ -247,6 +250,10 @@ class Inversion(Settings):
             yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
         if nodal and self.method.chains == "emcee":
             yield ("method", "chains"), "expected 'pcn', the chains for fields", "emcee"
+        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
+            if find_spec(package) is None:
+                message = f"needs {package}, which is not installed: pip install {package}"
+                yield ("method", "chains"), message, self.method.chains
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         yield from mistakes_of_parameters(self.model.scalars, self.parameters)
@@ -520,8 +527,17 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
 
     of_set = found if found.sizes["data_set"] > 1 else found.isel(data_set=0, drop=True)
 
+    # Draws of chains stand one after the other, as many of each.
+    counts = set(found["chains"].to_numpy()[found["ok"].to_numpy()].astype(int).tolist())
+    chains = max(counts.pop() if len(counts) == 1 else 1, 1)
+    each = found.sizes["sample"] // chains
+
     def draws(name: str) -> Any:
-        return of_set[name].expand_dims("chain").rename({"sample": "draw"}).transpose("chain", "draw", ...)
+        values = of_set[name].isel(sample=slice(chains * each)).transpose("sample", ...)
+        shape = (chains, each, *values.shape[1:])
+        dims = ("chain", "draw", *values.dims[1:])
+        here = {key: value for key, value in values.coords.items() if "sample" not in value.dims}
+        return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
 
     left: dict[str, xr.Dataset] = {}
     observed = {"displacement": of_set["measured"]}

@@ -276,7 +276,10 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         data = study.measurements[number].observations.components()
-        observed = model.observing(data.places, data.axes, data.cases)
+        try:
+            observed = model.observing(data.places, data.axes, data.cases)
+        except ValueError as error:  # a place that no cell has, by rounding: the other data sets go on
+            raise SolveError(str(error)) from None
         if prior is None:
             return layout.pack(invert_by_group(study.inputs, observed, data, method, look))
         posterior = FieldPosterior(observed, data.values, data.sigma, prior)
