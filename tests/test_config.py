@@ -134,7 +134,7 @@ def put(*way):
         (put("modle", {}), "modle: unknown key; did you mean 'model'?"),
         (put("method", "samples", 0), "method.samples: input should be greater than or equal to 2; given 0"),
         (put("method", "samples", "many"), "method.samples: input should be a valid integer; given 'many'"),
-        (put("method", "kind", "mote-carlo"), "method.kind: unknown kind; did you mean 'monte-carlo'?; given 'mote-carlo'"),
+        (put("method", "kind", "mote-carlo"), "kind: unknown kind; did you mean 'monte-carlo'?; given 'mote-carlo'"),
         (put("method", "kind", "inverted"), "method.kind: unknown kind; did you mean 'invert'?"),
         (lambda d: d["method"].pop("kind"), "method.kind: missing"),
         (put("model", "body", "liver.msh"), "model.body: expected a table, { key = value }; given 'liver.msh'"),

@@ -91,7 +91,7 @@ def test_a_run_leaves_results_and_a_report_without_a_body(tmp_path):
     data = xr.load_dataset(tmp_path / "out" / "results.nc")
     assert dict(zip(data.output.values, data.unit.values, strict=True)) == {"tip": "m", "weight": "1"}
     assert "node" not in data.dims
-    report = (tmp_path / "out" / "report.html").read_text()
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "tests.functions.beam" in report
     assert "displacement" not in report
     assert not (tmp_path / "out" / "fields").exists()
@@ -167,7 +167,7 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
     path.write_text("def f(p):\n    return 2 * p[0]\n")
     assert before != changing.model.source
-    with pytest.raises(StudyError, match="the file of the function has changed; choose another --out"):
+    with pytest.raises(StudyError, match="the function's file has changed; choose another --out"):
         run(changing, "changing", tmp_path / "out", quiet=True)
     sys.modules.pop("changing_model")
 

@@ -402,13 +402,13 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     if summary is None:
         return None
     if summary["provenance"].get("source") != _source(study):
-        message = f"{directory}: holds results of other code: the file of the function has changed; choose another --out"
+        message = f"{directory}: holds results of other code: the function's file has changed; choose another --out"
         raise StudyError(message)
     return PARTIAL if summary["failed"] else DONE
 
 
 def _withdraw(directory: Path) -> None:
-    """Remove what `_prepare` has made, if nothing else is there: a study that was corrected may go to the same place."""
+    """Remove what `_prepare` has made, if nothing else is there: the study, corrected, may go to the same place."""
     if [path.name for path in directory.iterdir()] == ["study.toml"]:
         (directory / "study.toml").unlink()
         directory.rmdir()
