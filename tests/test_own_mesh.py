@@ -1,6 +1,7 @@
 """Bodies from files: the same as a box where the mesh is the same; names, regions, units, mistakes."""
 
 import json
+import locale
 import shutil
 import tomllib
 from itertools import product
@@ -237,6 +238,7 @@ def test_fields_on_a_mesh_of_tetrahedra(tmp_path):
 
 def test_groups_of_gmsh(tmp_path):
     gmsh = pytest.importorskip("gmsh")
+    before = locale.setlocale(locale.LC_ALL)
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.occ.addBox(0, 0, 0, 2, 1, 1)
@@ -256,6 +258,7 @@ def test_groups_of_gmsh(tmp_path):
     gmsh.option.setNumber("Mesh.SaveAll", 1)
     gmsh.write(str(tmp_path / "all.msh"))
     gmsh.finalize()
+    locale.setlocale(locale.LC_ALL, before)  # which gmsh has changed
     for form in (2.2, 4.1):
         own = OwnMesh(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
         assert set(own.boundaries) == {"held", "pulled", "whole-liver", "skin"}
