@@ -238,7 +238,6 @@ def test_fields_on_a_mesh_of_tetrahedra(tmp_path):
 
 def test_groups_of_gmsh(tmp_path):
     gmsh = pytest.importorskip("gmsh")
-    before = locale.setlocale(locale.LC_ALL)
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.occ.addBox(0, 0, 0, 2, 1, 1)
@@ -258,7 +257,6 @@ def test_groups_of_gmsh(tmp_path):
     gmsh.option.setNumber("Mesh.SaveAll", 1)
     gmsh.write(str(tmp_path / "all.msh"))
     gmsh.finalize()
-    locale.setlocale(locale.LC_ALL, before)  # which gmsh has changed
     for form in (2.2, 4.1):
         own = OwnMesh(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
         assert set(own.boundaries) == {"held", "pulled", "whole-liver", "skin"}
@@ -364,7 +362,9 @@ def test_files_of_pyvista(tmp_path):
     assert (bare.boundaries, bare.regions) == (("surface",), ("body",))
     grid.cell_data["part"] = np.concatenate(mesh.cell_data["gmsh:physical"]).astype(np.int64)
     for form in ("vtu", "vtk"):
+        before = locale.setlocale(locale.LC_ALL)
         grid.save(tmp_path / f"box.{form}")
+        locale.setlocale(locale.LC_ALL, before)  # which VTK changes
         own = OwnMesh(file=str(tmp_path / f"box.{form}"))
         assert set(own.boundaries) == {f"{10 + k}" for k in range(6)}
         assert own.regions == ("1", "2")
