@@ -363,8 +363,9 @@ def test_an_interrupt_ends_the_server(tmp_path, number, capsys):
         assert process.stderr.read() == ""
 
 
-def test_a_comparison_of_models_is_not_served(capsys):
+@pytest.mark.parametrize(("name", "kind"), [("treloar", "select"), ("inclusion", "invert")])
+def test_studies_of_other_kinds_are_not_served(capsys, name, kind):
     from workflows.__main__ import main
 
-    assert main(["serve", str(ROOT / "configs" / "treloar.toml")]) == 2
-    assert "compares models" in capsys.readouterr().err
+    assert main(["serve", str(ROOT / "configs" / f"{name}.toml")]) == 2
+    assert f"is of kind '{kind}', expected a study of one model" in capsys.readouterr().err
