@@ -143,7 +143,9 @@ def test_answers_are_those_of_the_protocol(beam):
         ({"input": [[1.0, 2.0, 3.0]]}, "InvalidInput"),
         ({"input": [[1.0, "2"]]}, "InvalidInput"),
         ({"input": [POINT, POINT]}, "InvalidInput"),
-        ({"outWrt": 1, "inWrt": 1, "inWrt1": 1}, "InvalidInput"),
+        ({"outWrt": 1}, "InvalidInput"),
+        ({"inWrt": 1, "inWrt1": 1}, "InvalidInput"),
+        ({"inWrt": -1, "inWrt2": -1}, "InvalidInput"),
         ({"sens": [1.0], "vec": [1.0]}, "InvalidInput"),
         ({"config": {"lewel": 1}}, "InvalidInput"),
         ({"config": {"level": -1}}, "InvalidInput"),
@@ -153,7 +155,7 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
     asked = {"name": "forward", "input": [POINT], "config": {}, "outWrt": 0, "inWrt": 0, "inWrt1": 0, "inWrt2": 0}
     asked |= {"sens": [1.0, 0.0], "vec": [1.0, 0.0]}
     status, answer = ask(beam, what, asked | change)
-    if what == "Evaluate" and ("outWrt" in change or "sens" in change):
+    if what == "Evaluate" and change.keys() & {"outWrt", "inWrt", "sens"}:
         assert status == 200
         return
     jsonschema.validate(answer, ERROR)
@@ -161,7 +163,7 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes"])
+@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes", "Evaluate"])
 def test_models_that_are_not_there(beam, what):
     status, answer = ask(beam, what, {"name": "wrong_model_name"})
     jsonschema.validate(answer, ERROR)
@@ -176,6 +178,24 @@ def test_derivatives_that_are_not_there():
         with pytest.raises(RefusalError) as caught:
             service.answer(what, {"name": "forward"})
         assert (caught.value.kind, caught.value.status) == ("UnsupportedFeature", 400)
+
+
+@pytest.mark.fem
+def test_vectors_of_one_number_as_the_conformance_suite_sends_them(beam):
+    """UM-Bridge's testing/protocol_conformity_1.0 asks for no other point; ``--input_value=1000`` is one for a beam."""
+    with urlopen(Request(beam, method="HEAD")) as answer:
+        assert (answer.status, answer.read()) == (200, b"")
+    asked = {"name": "forward", "config": {}, "input": [[1000.0, 1000.0]], "outWrt": 0}
+    sens, vec = {"sens": [0, 0]}, {"vec": [1000.0, 1000.0]}
+    for what, more in (
+        ("Evaluate", {}),
+        ("Gradient", {"inWrt": 0} | sens),
+        ("ApplyJacobian", {"inWrt": 0} | vec),
+        ("ApplyHessian", {"inWrt1": 0, "inWrt2": 0, "vec": [0, 0]} | sens),
+    ):
+        status, answer = ask(beam, what, asked | more)
+        jsonschema.validate(answer, schema("output", {"type": "array"}))
+        assert (status, np.size(answer["output"])) == (200, 2)
 
 
 @pytest.mark.fem
