@@ -89,7 +89,12 @@ def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], AnyStudy]:
     if summary is None:
         message = f"{directory}: holds no summary.json, expected the directory of a finished study"
         raise FileNotFoundError(message)
-    return dataset, summary, parse(tomllib.loads(dataset.attrs["config"]))
+    try:
+        return dataset, summary, parse(tomllib.loads(dataset.attrs["config"]))
+    except StudyError as error:
+        made = dataset.attrs.get("tissuq", "unknown")
+        message = f"{directory}: is no study of this version of tissuq, it was made by version {made} ({error.args[0]})"
+        raise StudyError(message) from None
 
 
 def _render(template: str, context: dict[str, Any]) -> str:

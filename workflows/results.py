@@ -56,7 +56,7 @@ def read_dataset(directory: Path) -> xr.Dataset:
     Raises
     ------
     FileNotFoundError
-        If the directory holds no results.
+        If the directory holds no results of a study.
     """
     import xarray as xr
 
@@ -64,7 +64,14 @@ def read_dataset(directory: Path) -> xr.Dataset:
     if not path.exists():
         message = f"{directory}: holds no results.nc, expected the directory of a finished study"
         raise FileNotFoundError(message)
-    return xr.load_dataset(path, engine="h5netcdf")
+    try:
+        found = xr.load_dataset(path, engine="h5netcdf")
+    except OSError:
+        found = xr.Dataset()
+    if "config" not in found.attrs:
+        message = f"{path}: holds no results of a study, expected a file that `tissuq run` has written"
+        raise FileNotFoundError(message)
+    return found
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
