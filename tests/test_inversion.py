@@ -29,6 +29,7 @@ from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
 from workflows import study as study_runs
 from workflows.config import StudyError, document, load, parse, schema
+from workflows.inversion import _volumes, groups
 from workflows.plan import plan
 from workflows.starter import starter
 from workflows.study import run as run_study
@@ -311,6 +312,48 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
 
 
+def test_volumes_of_inclusions(folder):
+    """Those of the draws; nothing where no radius is unknown, or nothing was found."""
+    radius = "parameters.inclusions.lump.radius={kind = 'uniform', lower = 0.2, upper = 0.4}"
+    study = load(folder / "few.toml", [radius])
+    draws = np.full((3, 50, 3), [2.0, 9e3, 0.3])
+    draws[0, :, 2] = np.linspace(0.25, 0.35, 50)
+    draws[2] = np.nan
+    found = _volumes(study, {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+    ball = 4 / 3 * np.pi * np.linspace(0.25, 0.35, 50) ** 3
+    for name, expected in (
+        ("mean", ball.mean()),
+        ("std", ball.std()),
+        ("mode", ball[0]),
+        ("true", 4 / 3 * np.pi * 0.027),
+    ):
+        np.testing.assert_allclose(found[f"volume_{name}"][1][0], [expected])
+    assert found["volume_std"][1][1] == pytest.approx([0], abs=1e-12)
+    assert np.isnan(found["volume_mean"][1][2])
+    assert found["inclusion"][1] == ["lump"]
+    assert not _volumes(load(folder / "few.toml"), {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+
+
+def test_chains_are_those_of_arviz(folder):
+    """Draws that stand chain after chain become chains, where all data sets have as many."""
+    study = load(folder / "few.toml", ["data.files=['data/made-1.csv']"])
+    draws = np.arange(100.0).reshape(1, 50, 2)
+    found = xr.Dataset(
+        {
+            "draw": (("data_set", "sample", "parameter"), draws),
+            "draw_log_likelihood": (("data_set", "sample", "datum"), draws),
+            "measured": (("data_set", "datum"), np.zeros((1, 2))),
+            "chains": ("data_set", [4.0]),
+            "ok": ("data_set", [True]),
+        },
+        {"data_set": ["made-1"], "parameter": list(study.names)},
+    )
+    kept = groups(study, found)
+    assert kept["log_likelihood"]["displacement"].shape == (4, 12, 2)
+    np.testing.assert_array_equal(kept["posterior"]["material.mu"], 1 + 2 * np.arange(48).reshape(4, 12))
+    assert groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
+
+
 def test_a_field_and_its_report(folder):
     assert here(folder / "field.toml", folder / "field") == 0
     found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
@@ -332,6 +375,9 @@ def test_a_field_and_its_report(folder):
         (FEW, 'files = ["data"]', 'files = ["nothing"]', r"data.files: nothing: no such file"),
         (FEW, 'files = ["data"]', 'files = ["data/wrong.csv"]', r"data: wrong.csv: unknown column 'vx'"),
         (FEW, 'files = ["data"]', 'files = ["data/made-1.csv"]\nunit = 1e3', r"expected a smaller one: is data\.unit"),
+        (FEW, 'files = ["data"]', 'files = "data/made-1.csv"\ntruth = { "material.nu" = 1 }',
+         "data.truth.material.nu: not a number of the model; did you mean 'material.mu'"),
+        (FEW, "draws = 50", 'noise = { kind = "normal", mean = 1, std = 1 }', "method.noise: reaches -.*is positive"),
         (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
         (FEW, "lower = 1,", "lower = -1,", "lower"),
         (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',

@@ -249,6 +249,12 @@ def small(tmp_path):
         ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
         ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
         ("weight = 2", "weight = 0", "candidates.mooney-rivlin.weight"),
+        ("samples = 32", "samples = 32\nsubsets = { none = [] }", "method.subsets.none: .* at least 1 item"),
+        (
+            "absolute = 20 }",
+            'absolute = 20, factor = { kind = "uniform", lower = -1, upper = 2 } }',
+            "method.noise.factor: reaches -1, expected a factor on standard deviations",
+        ),
     ],
 )
 def test_one_line_for_a_mistake(small, old, new, told):

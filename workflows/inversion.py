@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,18 +16,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
-from forward.settings import Settings
+from forward.settings import Settings, nearest
 from forward.specimen import Specimen
-from inverse.inversion import Invert, Synthesize, names_of, sentence, variables
+from inverse.inversion import ENDS, Invert, Synthesize, names_of, sentence, variables
 from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
-from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,7 +67,7 @@ class DataFiles(Settings):
     ----------
     files
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
-        directory. Each file is a data set, which is inverted by itself.
+        directory; one alone may be given as a word. Each file is a data set, which is inverted by itself.
     sigma
         Standard deviation (m) of the errors where a file does not say.
     unit
@@ -85,6 +86,11 @@ class DataFiles(Settings):
     tolerance: Annotated[float, Field(ge=0)] = 0.0
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
+
+    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
+    @classmethod
+    def _one_alone(cls, given: Any) -> Any:
+        return (given,) if isinstance(given, str) else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,6 +263,11 @@ class Inversion(Settings):
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        yield from mistakes_of_factor(self.method.noise, "method", "noise")
+        for name, value in self.data.truth.items():
+            if name not in self.model.scalars:
+                message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
+                yield ("data", "truth", name), message, value
         try:
             self.inputs  # noqa: B018 - checks the correlations
         except ValueError as error:
@@ -407,6 +418,7 @@ def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vert
             if name in study.names:
                 true[k, study.names.index(name)] = value
     held["true"] = (("data_set", "parameter"), true)
+    held |= _volumes(study, record, found)
     held["stiffness_true"] = (("data_set", "node"), np.array([_true_at(study, m, places) for m in found]))
     held["node_position"] = (("node", "axis"), places)
     held["cell_nodes"] = (("cell", "corner"), cells, {"vtk_cell_type": kind})
@@ -421,6 +433,35 @@ def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vert
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
     return xr.Dataset(held, coordinates).drop_dims("letter", errors="ignore")
+
+
+def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
+    """Posterior of the volumes (m³) of inclusions whose radii are unknown, by the draws that are kept."""
+    names = study.inputs.names
+    before = derived(study.model.inclusions, names, prior_draws(study)) if not study.field else {}
+    labels = [label for label, values in before.items() if np.ptp(values) > 0]
+    if not labels:
+        return {}
+
+    def of(points: FloatArray, inclusions: tuple[Any, ...] = study.model.inclusions) -> FloatArray:
+        values = derived(inclusions, names if points.shape[1] else (), points)
+        return np.column_stack([values.get(label, np.full(len(points), np.nan)) for label in labels])
+
+    draws = np.array([of(rows[:, : len(names)]) for rows in record["draw"]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of data sets that could not be inverted there are none
+        lower, upper = np.nanquantile(draws, ENDS, axis=1)
+        mean, std = np.nanmean(draws, axis=1), np.nanstd(draws, axis=1)
+    true = np.array([of(np.zeros((1, 0)), m.inclusions if m is not None else ())[0] for m in found])
+    here = {"mode": of(record["mode"][:, : len(names)]), "mean": mean, "std": std, "lower": lower, "upper": upper}
+    prior = np.column_stack([before[label] for label in labels])
+    return {
+        **{f"volume_{name}": (("data_set", "inclusion"), values) for name, values in here.items()},
+        "volume_true": (("data_set", "inclusion"), true),
+        "volume_prior_mean": ("inclusion", prior.mean(axis=0)),
+        "volume_prior_std": ("inclusion", prior.std(axis=0)),
+        "inclusion": ("inclusion", [label.split(".")[1] for label in labels]),
+    }
 
 
 def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -466,7 +507,8 @@ def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArr
 def summary(found: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results; that of the only data set stands above it."""
     sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
-    return {**(next(iter(sets.values())) if len(sets) == 1 else {}), "data_sets": sets}
+    only = next(iter(sets.values())) if len(sets) == 1 else {}
+    return {**only, "solves": int(np.nansum(found["solves"])), "data_sets": sets}
 
 
 def _one(found: xr.Dataset) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from inverse.observations import DataError, read_table
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
-from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, refused
+from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mistakes_of_factor, refused
 
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
@@ -323,6 +323,7 @@ class Comparison(Settings):
             (("noise",), self.method.noise),
             *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
         ):
+            yield from mistakes_of_factor(noise.factor, "method", *place, "factor")
             for data in self.groups.values():
                 try:
                     noise.sigma(data.values, data.sigma)

@@ -561,7 +561,10 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
             lines.append(f"{output}: derivative × range of the parameter: {shown}")
-    lines.append(f"{summary['evaluations']} solves in {summary['wall_seconds']:.1f} s, {summary['failed']} failed")
+    from workflows.tables import solves
+
+    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
+    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
     if "note" in summary:
         lines.append(summary["note"])
     lines.append(f"report: {directory / 'report.html'}")

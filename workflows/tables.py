@@ -400,12 +400,13 @@ def failures_line(summary: dict[str, Any]) -> str:
 
 def times(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """What the study took."""
-    count = max(summary["evaluations"], 1)
+    count = max(_count(summary), 1)
     yield "wall time", f"{duration(summary['wall_seconds'])} (of the run that finished the study)"
     cpu = summary["cpu_seconds"]
     yield "processor time of the solves", f"{duration(cpu)}; {duration(cpu / count)} a solve"
-    for name, amount in summary["work"].items():
-        yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
+    if any(summary["work"].values()):  # of inversions side by side it is not known
+        for name, amount in summary["work"].items():
+            yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
 
 
 def provenance(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -513,4 +514,10 @@ def estimates(studies: dict[str, Results], output: str) -> Table:
 
 def solves(summary: dict[str, Any]) -> str:
     """The number of solves."""
-    return "1 solve" if summary["evaluations"] == 1 else f"{summary['evaluations']:,} solves"
+    count = _count(summary)
+    return "1 solve" if count == 1 else f"{count:,} solves"
+
+
+def _count(summary: dict[str, Any]) -> int:
+    """Number of solves; a data set of several that are inverted side by side is one evaluation of many solves."""
+    return int(max(summary["evaluations"], summary.get("solves", 0)))
