@@ -216,7 +216,7 @@ def _sobol(results: Results) -> dict[str, Any]:
         shown = [tables.sobol(results, output)]
         if "sobol_second" in dataset:
             shown.append(tables.second_order(results, output))
-        caption = f"Indices of {output} with 95 % confidence intervals."
+        caption = f"Indices of {output} with 95 % confidence intervals{_largest_of(dataset)}."
         pictures = [_picture(plots.index_bars(dataset, output), caption)]
         if dataset.sizes.get("index_round", 0) > 1:
             caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
@@ -270,7 +270,13 @@ def _errors(results: Results, output: str) -> list[tuple[str, tables.Table, list
 
 
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:
-    return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order.")
+    return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order{_largest_of(dataset)}.")
+
+
+def _largest_of(dataset: xr.Dataset) -> str:
+    """Say that bars are not drawn of all parameters."""
+    count = dataset.sizes["parameter"]
+    return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
 
 
 def _bodies(dataset: xr.Dataset) -> tuple[list[str], list[Picture]]:
