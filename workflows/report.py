@@ -30,12 +30,16 @@ MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
 
+MANY = 10  # panels of a picture that are legible side by side with other pictures
+
+
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in base64 with what it shows."""
+    """A PNG in base64 with what it shows; `wide` is one of many panels, which needs all of the page."""
 
     data: str
     caption: str
+    wide: bool = False
 
 
 def write_report(directory: Path) -> Path:
@@ -191,7 +195,8 @@ def _of_all(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> di
 
 
 def _picture(ax: Axes, caption: str) -> Picture:
-    return Picture(base64.b64encode(plots.png(ax)).decode(), caption)
+    panels = len(ax.figure.axes)
+    return Picture(base64.b64encode(plots.png(ax)).decode(), caption, wide=panels > MANY)
 
 
 def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
