@@ -229,7 +229,11 @@ def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.
 
 
 def body_grid(dataset: xr.Dataset) -> Any:
-    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
+    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes.
+
+    What is not known is NaN, and left out where nothing is: VTK cannot read vectors again of which all lengths are
+    infinite or NaN.
+    """
     import pyvista
 
     cells = dataset["cell_nodes"].to_numpy()
@@ -237,7 +241,9 @@ def body_grid(dataset: xr.Dataset) -> Any:
     kinds = np.full(len(cells), dataset["cell_nodes"].attrs["vtk_cell_type"])
     grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
     for name, values in node_fields(dataset).items():
-        grid.point_data[name] = values
+        known = np.isfinite(values)
+        if known.any():
+            grid.point_data[name] = np.where(known, values, np.nan)
     if "cell_region" in dataset:
         grid.cell_data["region"] = dataset["cell_region"].to_numpy()
     return grid
