@@ -22,7 +22,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import nearest
-from uq.chaos import LARGEST, Chaos, Regression, expansion_dataset
+from uq.chaos import LARGEST, Chaos, expansion_dataset
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import (
     Analysis,
@@ -42,6 +42,7 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, by_node
+from uq.regression import Regression
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 
