@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import importlib.util
 import json
-import sys
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable
@@ -132,6 +132,9 @@ class _External(Settings):
         return self
 
 
+Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
+
+
 class PythonModel(_External):
     """A Python function of a vector of parameters (d,) that returns the outputs (m,).
 
@@ -149,8 +152,8 @@ class PythonModel(_External):
     """
 
     kind: Literal["python"] = "python"
-    function: Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
-    jacobian: Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")] | None = None
+    function: Dotted
+    jacobian: Dotted | None = None
 
     @property
     def description(self) -> str:
@@ -159,10 +162,16 @@ class PythonModel(_External):
 
     @property
     def source(self) -> str:
-        """Hash of the file that holds the function: what was solved before it changed is solved again."""
-        module = sys.modules.get(self.function.rpartition(".")[0])
-        path = getattr(module, "__file__", None)
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else ""
+        """Hash of the files that hold function and Jacobian: what was solved before they changed is solved again."""
+        found = hashlib.sha256()
+        for path in filter(None, (self.function, self.jacobian)):
+            try:
+                spec = importlib.util.find_spec(path.rpartition(".")[0])
+            except (ImportError, ValueError):  # whoever imports it says why
+                continue
+            if spec is not None and spec.has_location and spec.origin is not None:
+                found.update(Path(spec.origin).read_bytes())
+        return found.hexdigest()
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Import function and Jacobian."""

@@ -26,7 +26,7 @@ class MaxDisplacement(_Output):
     """
 
     kind: Literal["max-displacement"] = "max-displacement"
-    component: Axis | Literal["magnitude"] = "magnitude"
+    component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
 
 class PointDisplacement(_Output):

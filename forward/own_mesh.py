@@ -7,8 +7,9 @@ the file is not; a hash says whether it is the same file.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import lru_cache
 from io import StringIO
@@ -29,10 +30,10 @@ if TYPE_CHECKING:
 
 Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
-LARGE, SMALL = 10.0, 1e-4  # m: bodies of tissue are between these
+LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
 FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
 CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
-ALL = "body"  # the name of the only region, where the file names none
+ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
 _MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write
@@ -106,6 +107,8 @@ class Contents(Settings):
         Of all cells (m).
     boundaries
         Names of the boundaries, each with up to four points (m) that span it.
+    areas
+        Names of the boundaries, each with its area (m²).
     regions
         Names of the regions, each with its volume (m³).
     """
@@ -119,6 +122,7 @@ class Contents(Settings):
     bounds: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
     longest_edge: float
     boundaries: dict[str, tuple[Point, ...]]
+    areas: dict[str, float]
     regions: dict[str, float]
 
 
@@ -127,6 +131,7 @@ class OwnMesh(Settings):
 
     Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
     the numbers that an array of the cells gives to triangles or quadrilaterals (boundaries) and to cells (regions).
+    A triangle may be in several groups, a cell in one only.
 
     Parameters
     ----------
@@ -249,9 +254,17 @@ class OwnMesh(Settings):
     @property
     def description(self) -> str:
         """The body in words."""
+        return "; ".join(f"{what}: {found}" if what != "body" else found for what, found in self.listed.items())
+
+    @property
+    def listed(self) -> dict[str, str]:
+        """What the file holds, in words: the body, its boundaries, its regions."""
         extents = " × ".join(f"{high - low:.3g}" for low, high in self.bounds)
-        regions = ", ".join(f"{name} ({volume:.3g} m³)" for name, volume in self.found.regions.items())
-        return f"mesh {Path(self.file).name} of {extents} m; regions: {regions}"
+        return {
+            "body": f"mesh {Path(self.file).name} of {extents} m",
+            "boundaries": ", ".join(f"{name} ({area:.3g} m²)" for name, area in self.found.areas.items()),
+            "regions": ", ".join(f"{name} ({volume:.3g} m³)" for name, volume in self.found.regions.items()),
+        }
 
     @property
     def warnings(self) -> Iterator[str]:
@@ -303,10 +316,15 @@ class OwnMesh(Settings):
 
 
 def _digest(file: str) -> str:
+    """Return the hash of a file, and of those that an XDMF file keeps its numbers in."""
     try:
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+        whole = Path(file).read_bytes()
+        if file.endswith(".xdmf"):
+            others = sorted(set(re.findall(rb"([^\s<>\"]+\.h5):", whole)))
+            whole += b"".join(path.read_bytes() for path in (Path(file).parent / other.decode() for other in others))
+        return hashlib.sha256(whole).hexdigest()
     except OSError as error:
-        message = f"file: {file}: cannot be read: {error.strerror}"
+        message = f"file: {error.filename or file}: cannot be read: {error.strerror}"
         raise ModelError(message) from None
 
 
@@ -319,20 +337,28 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
         message = f"file: {file}: {problem}"
         raise ModelError(message)
 
+    printed = StringIO()
     try:
-        with redirect_stdout(StringIO()):  # meshio prints empty lines
+        with redirect_stdout(printed), redirect_stderr(StringIO()):  # meshio prints empty lines, and what is wrong
             mesh = meshio.read(file)
-    except (Exception, SystemExit) as error:  # readers fail in many ways, some of them by exiting
+    except SystemExit:
+        said = (printed.getvalue().strip().splitlines() or [f"it is no {Path(file).suffix} file that meshio reads"])[0]
+        refuse(f"cannot be read as a mesh: {said}{', try .vtu' if file.endswith('.vtk') else ''}")
+    except Exception as error:  # readers fail in many ways
         said = (str(error).splitlines() or [""])[0]
+        if "gmsh:physical" in said:
+            refuse("has cells in no physical group, expected what belongs to one (gmsh: Mesh.SaveAll = 0)")
         refuse(f"cannot be read as a mesh: {said or type(error).__name__}")
     kinds = [_MESHIO[block.type] for block in mesh.cells if block.type in _MESHIO]
     others = {block.type for block in mesh.cells if block.dim == 3 and block.type not in _MESHIO}
     if others or len(set(kinds)) != 1:
         have = ", ".join(sorted(others | set(kinds))) or "no solid cells"
-        refuse(f"holds {have}, expected linear tetrahedra or linear hexahedra alone")
+        linear = " (gmsh: Mesh.ElementOrder = 1; `degree` is that of the displacement)" if others else ""
+        refuse(f"holds {have}, expected linear tetrahedra or linear hexahedra alone{linear}")
     cell: Literal["tetrahedron", "hexahedron"] = "tetrahedron" if kinds[0] == "tetrahedron" else "hexahedron"
     numbers = _numbers(mesh, tags, refuse)
-    words = _words(mesh, names, numbers, refuse)
+    words = _words(mesh, file, names, numbers, refuse)
+    _check_groups(mesh, refuse)
     cells, region_numbers = _gathered(mesh, numbers, next(k for k, v in _MESHIO.items() if v == cell))
     facets, facet_numbers = _gathered(mesh, numbers, _SURFACES[cell])
     used, cells = np.unique(cells, return_inverse=True)
@@ -341,9 +367,15 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     if points.shape[1] != 3 or not np.isfinite(points).all():
         refuse("its points are not finite ones in three dimensions")
     _check_geometry(points, cells, cell, refuse)
+    _check_joints(points, cells, cell, refuse)
     new = np.full(len(mesh.points), -1)
     new[used] = np.arange(len(used))
-    boundaries = _outer(new[facets], facet_numbers, cells, cell, lambda n: words.get((2, n), f"{n}"))
+    present = np.unique(facet_numbers)
+    groups = _sets(mesh, _SURFACES[cell])
+    for n in present.tolist():
+        word = words.get((2, n), SURFACE if len(present) == 1 and not n else f"{n}")
+        groups[word] = groups.get(word, False) | (facet_numbers == n)
+    boundaries = _outer(new[facets], groups, cells, cell)
     if not boundaries:
         refuse(f"names no boundary, expected {_SURFACES[cell]}s of the surface with numbers (gmsh: physical surfaces)")
     present = np.unique(region_numbers)
@@ -354,7 +386,7 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
 def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]:
     """Return the numbers that the file gives to the cells of each block; zeros where it gives none."""
     arrays = {
-        name: values
+        name: [v[:, 0] if v.ndim == 2 and v.shape[1] == 1 else v for v in values]  # as VTK's old format has them
         for name, values in mesh.cell_data.items()
         if all(np.issubdtype(v.dtype, np.number) for v in values)
     }
@@ -375,16 +407,47 @@ def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]
 
 
 def _words(
-    mesh: meshio.Mesh, names: tuple[tuple[str, int], ...], numbers: list[IntArray], refuse: Any
+    mesh: meshio.Mesh, file: str, names: tuple[tuple[str, int], ...], numbers: list[IntArray], refuse: Any
 ) -> dict[tuple[int, int], str]:
     """Return names by dimension and number: those of the file, and those that are given."""
-    words = {(int(dim), int(number)): name.replace(" ", "-") for name, (number, dim) in _named_groups(mesh)}
+    words = {(int(dim), int(number)): _word(name) for name, (number, dim) in _named_groups(mesh)}
+    if file.endswith(".msh"):  # where a name stands twice, as of a volume and of its surface, meshio keeps one
+        section = Path(file).read_bytes().partition(b"$PhysicalNames")[2].partition(b"$EndPhysicalNames")[0]
+        for dim, number, name in re.findall(r'^\s*(\d) (\d+) "(.*)"', section.decode(errors="replace"), re.MULTILINE):
+            words[int(dim), int(number)] = _word(name)
     present = {int(n) for part in numbers for n in np.unique(part)}
     for name, number in names:
         if number not in present:
             refuse(f"has no number {number} (names.{name}), expected one of: {', '.join(map(str, sorted(present)))}")
         words |= {(dim, number): name for dim in (2, 3)}
     return words
+
+
+def _word(name: str) -> str:
+    """Return the name of a group as paths can have it."""
+    return name.strip().replace(" ", "-").replace(".", "-")
+
+
+def _sets(mesh: meshio.Mesh, kind: str) -> dict[str, NDArray[np.bool_]]:
+    """Return which cells of a kind are in each named group of gmsh, of which one cell may have several."""
+    dim = 2 if kind in _SURFACES.values() else 3
+    found = {}
+    for name, (_, of) in _named_groups(mesh):
+        if int(of) == dim and name in mesh.cell_sets:
+            blocks = zip(mesh.cells, mesh.cell_sets[name], strict=True)
+            parts = [np.isin(np.arange(len(block.data)), part) for block, part in blocks if block.type == kind]
+            found[_word(name)] = np.concatenate(parts) if parts else np.zeros(0, dtype=bool)
+    return found
+
+
+def _check_groups(mesh: meshio.Mesh, refuse: Any) -> None:
+    """Refuse cells in several groups: no one could say which constants they have."""
+    for kind in _MESHIO:
+        groups = _sets(mesh, kind)
+        shared = sum((member.astype(int) for member in groups.values()), np.zeros(1, dtype=int)) > 1
+        if shared.any():
+            names = ", ".join(name for name, member in groups.items() if (member & shared).any())
+            refuse(f"{shared.sum()} cells are in several groups of volumes ({names}), expected one region for each")
 
 
 def _named_groups(mesh: meshio.Mesh) -> list[tuple[str, Any]]:
@@ -416,15 +479,42 @@ def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any)
         refuse(f"{twins} points lie where others lie: its parts are not joined, expected a mesh without double points")
 
 
-def _outer(facets: IntArray, numbers: IntArray, cells: IntArray, cell: str, name: Any) -> dict[str, IntArray]:
-    """Return the facets by name that belong to one cell only: those on the surface of the body."""
+def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
+    """Refuse cells that lie over each other, and bodies in several parts: only faces that are shared join cells."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    shapes = np.array(_FACES[cell])
+    faces = np.sort(cells[:, shapes].reshape(-1, shapes.shape[1]), axis=1)
+    owners = np.repeat(np.arange(len(cells)), len(shapes))
+    _, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    if (count > 2).any():
+        refuse(f"{(count > 2).sum()} faces belong to more than two cells: some cells are there twice")
+    inner = np.argsort(which, kind="stable")
+    inner = inner[count[which[inner]] == 2].reshape(-1, 2)  # places of both cells in the list of faces
+    a, b = owners[inner].T
+    parts, part = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(len(cells),) * 2), directed=False)
+    if parts > 1:
+        sizes = ", ".join(f"{n:,}" for n in sorted(np.bincount(part).tolist(), reverse=True)[:5])
+        refuse(f"its cells are {parts} parts that share no face (of {sizes} cells), expected one body")
+    corners = points[faces[inner[:, 0]]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sides = [((points[cells[k]].mean(axis=1) - corners.mean(axis=1)) * normal).sum(axis=1) for k in (a, b)]
+    wrong = int((sides[0] * sides[1] > 0).sum())
+    if wrong:
+        refuse(f"{wrong} pairs of neighbouring cells lie on the same side of their common face: some are inside out")
+
+
+def _outer(facets: IntArray, groups: dict[str, NDArray[np.bool_]], cells: IntArray, cell: str) -> dict[str, IntArray]:
+    """Return the facets of each group that belong to one cell only: those on the surface of the body."""
     faces = np.sort(cells[:, _FACES[cell]].reshape(-1, facets.shape[1]), axis=1)
     sorted_facets = np.sort(facets, axis=1)
     unique, which = np.unique(np.concatenate([faces, sorted_facets]), axis=0, return_inverse=True)
     which = which.ravel()
     of_cells = np.bincount(which[: len(faces)], minlength=len(unique))
     outside = of_cells[which[len(faces) :]] == 1
-    found = {name(int(n)): facets[outside & (numbers == n)] for n in np.unique(numbers)}
+    found = {word: facets[outside & member] for word, member in groups.items()}
     return {word: part for word, part in found.items() if len(part)}
 
 
@@ -452,8 +542,16 @@ def contents(mesh: Loaded, digest: str) -> Contents:
         bounds=((low[0], high[0]), (low[1], high[1]), (low[2], high[2])),
         longest_edge=float(np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max()),
         boundaries={name: _spanning(points[np.unique(facets)]) for name, facets in mesh.boundaries.items()},
+        areas={name: float(f"{_area(points[facets]):.6g}") for name, facets in mesh.boundaries.items()},
         regions={name: float(f"{volume:.6g}") for name, volume in zip(mesh.regions, sums, strict=True)},
     )
+
+
+def _area(corners: FloatArray) -> float:
+    """Return the area of facets (n, 3 or 4, 3) together."""
+    around = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
+    a, b, c = np.moveaxis(corners[:, around], 2, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
 
 
 def _nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:

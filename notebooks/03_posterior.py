@@ -104,8 +104,9 @@ ax.figure
 #
 # |r|² of each load case beside what is expected: a bar far above its mark says that mesh, material or stated
 # errors are wrong. The coarse mesh fails here although the size of the errors was inferred: it errs more in one
-# load case than in another, and smoothly, so that residuals of neighbours agree. The mesh of the whole study does
-# not. No posterior should be read further before this test is passed.
+# load case than in another, and smoothly, so that residuals of neighbours agree. The whole study, on 12³ cells and
+# with the errors as stated, passes: probability 0.26 of larger residuals, 0.08 of neighbours that agree more. No
+# posterior should be read further before this test is passed.
 
 # %%
 inversion_report.misfits(one).figure

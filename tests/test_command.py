@@ -80,6 +80,12 @@ def test_usage_errors_exit_with_2():
     assert "expected one of: monte-carlo" in done.stderr or "did you mean 'monte-carlo'" in done.stderr
 
 
+def test_init_lists_all_kinds():
+    done = tissuq("init", "list")
+    assert done.returncode == 0
+    assert {"monte-carlo", "sobol", "select", "invert"} <= set(done.stdout.split())
+
+
 def test_init_prints_a_study(tmp_path):
     path = tmp_path / "new.toml"
     path.write_text(tissuq("init", "monte-carlo").stdout)

@@ -277,7 +277,7 @@ def test_a_study_survives_its_own_dump():
             "method.methods[0]: budget 48: samples = 48, expected scrambles = 16 times a power of two",
         ),
         ({"methods": [{"kind": "chaos", "budgets": [16], "ordr": 3}]}, "method.methods[0].ordr: unknown key"),
-        ({"methods": [{"kind": "chas", "budgets": [16]}]}, "method.methods[0]: input tag 'chas'"),
+        ({"methods": [{"kind": "chas", "budgets": [16]}]}, "method.methods[0].kind: unknown kind; did you mean"),
         ({"methods": [{"kind": "chaos", "fit": "projection", "budgets": [9]}]}, "expected none: a projection takes"),
         (
             {"methods": [{"kind": "multilevel-chaos", "order": 4, "budgets": [8, 32]}]},
@@ -289,7 +289,7 @@ def test_a_study_survives_its_own_dump():
             {"reference": {"kind": "given", "values": {"uy_max": {"mean": 1.0, "std": 1.0}}}},
             "method.reference.values: expected values of every output: uy_max, ux_max",
         ),
-        ({"reference": {"kind": "local-sensitivity"}}, "method.reference: input tag 'local-sensitivity'"),
+        ({"reference": {"kind": "local-sensitivity"}}, "method.reference.kind: unknown kind; did you mean"),
     ],
 )
 def test_one_line_for_a_mistake(settings, expected):

@@ -134,7 +134,14 @@ def put(*way):
         (put("modle", {}), "modle: unknown key; did you mean 'model'?"),
         (put("method", "samples", 0), "method.samples: input should be greater than or equal to 2; given 0"),
         (put("method", "samples", "many"), "method.samples: input should be a valid integer; given 'many'"),
-        (put("method", "kind", "mote-carlo"), "method: "),
+        (put("method", "kind", "mote-carlo"), "kind: unknown kind; did you mean 'monte-carlo'?; given 'mote-carlo'"),
+        (put("method", "kind", "inverted"), "method.kind: unknown kind; did you mean 'invert'?"),
+        (lambda d: d["method"].pop("kind"), "method.kind: missing"),
+        (put("model", "body", "liver.msh"), "model.body: expected a table, { key = value }; given 'liver.msh'"),
+        (put("model", "loads", 0, {"kind": "gravty"}), "model.loads[0].kind: unknown kind; did you mean 'gravity'?"),
+        (put("model", "clamp", "x-min"), "model.clamp: expected a list; given 'x-min'"),
+        (put("model", "outputs", []), "model.outputs: list should have at least 1 item, not 0; given []"),
+        (put("model", "outputs", 0, "component", "w"), "model.outputs[0].component: input should be 'x', 'y', 'z' or"),
         (put("model", "clamp", ["x-mim"]), "model.clamp[0]: unknown boundary; did you mean 'x-min'?; given 'x-mim'"),
         (
             put("parameters", "inclusions.tumour.x", {"kind": "normal", "mean": 0.1, "std": 0.1}),
@@ -189,7 +196,7 @@ def test_all_mistakes_are_reported_together():
     assert [line.split(":")[0] for line in mistakes(change)] == [
         "model.body.cell",
         "model.material.C1",
-        "parameters.material.D1",
+        "parameters.material.D1.kind",
         "method.sampels",
     ]
 

@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import re
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from workflows.__main__ import _parser
 from workflows.config import load, parse
 from workflows.starter import starter
+from workflows.study import run
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -90,11 +92,84 @@ def test_targets_and_benchmarks_are_there():
         assert name in known, (page, name)
 
 
-@pytest.mark.parametrize(("page", "text"), fences("toml"), ids=lambda given: getattr(given, "stem", ""))
-def test_study_files_parse(page, text):
+def whole(text, folder):
+    """Return the blocks of a study that a page shows; candidates alone stand in for those of a shipped study."""
     blocks = tomllib.loads(text)
-    if "method" in blocks and ("model" in blocks or "candidates" in blocks):
-        parse(blocks, folder=ROOT / "configs")
+    (folder / "data").symlink_to(ROOT / "configs" / "data")
+    if "method" in blocks:
+        return blocks
+    return tomllib.loads((ROOT / "configs" / "inclusion-material.toml").read_text(encoding="utf-8")) | blocks
+
+
+def run_page(page, folder, monkeypatch):
+    """Run what a page says that it runs, in a folder, and leave functions there as it says."""
+    monkeypatch.chdir(folder)
+    for code in (code for at, code in fences("python", runs=True) if at == page):
+        if "import gmsh" in code:
+            pytest.importorskip("gmsh")
+        exec(compile(code, str(page), "exec"), {})
+        if "def beam" in code:
+            (folder / "cantilever.py").write_text(code, encoding="utf-8")
+
+
+@pytest.mark.parametrize(("page", "text"), fences("toml"), ids=lambda given: getattr(given, "stem", ""))
+def test_study_files_parse(page, text, tmp_path, monkeypatch):
+    if 'kind = "mesh"' in text:
+        run_page(page, tmp_path, monkeypatch)
+    parse(whole(text, tmp_path), folder=tmp_path)
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "text"), fences("toml"), ids=lambda given: getattr(given, "stem", ""))
+def test_study_files_run(page, text, tmp_path, monkeypatch):
+    run_page(page, tmp_path, monkeypatch)
+    monkeypatch.setattr("sys.path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr("workflows.study._report", lambda directory: None)
+    assert run(parse(whole(text, tmp_path), folder=tmp_path), "study", tmp_path / "results", quiet=True) == 0
+
+
+READING = [
+    *fences("python", runs=False),
+    *each(
+        lambda text: [
+            re.sub(r"^    ", "", found, flags=re.MULTILINE)
+            for found in INDENTED.findall(FENCE.sub("", text))
+            if re.match(r"\s+(import|from) ", found) and "umbridge" not in found  # which needs a server, and has tests
+        ]
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """Directories by the names that pages give them: the coarse beam by the methods they have."""
+    folder = tmp_path_factory.mktemp("pages")
+    methods = {
+        "tiny": "{kind='sensitivity-monte-carlo', samples=8}",
+        "beam-chaos": "{kind='chaos', samples=8}",
+        "beam-sobol": "{kind='sobol', design='chaos', samples=8}",
+        "to-tolerance": "{kind='quasi-monte-carlo', samples=32}",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("workflows.study._report", lambda directory: None)
+        for name, method in methods.items():
+            study = load(ROOT / "configs" / "tiny.toml", [f"method={method}"])
+            assert run(study, name, folder / "results" / name, quiet=True) == 0
+    for name in ("beam", "length-0.1"):
+        (folder / "results" / name).symlink_to("tiny")
+    return folder
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "code"), READING, ids=lambda given: getattr(given, "stem", ""))
+def test_python_that_reads_results_runs(page, code, results, monkeypatch):
+    import pyvista
+
+    monkeypatch.chdir(results)
+    monkeypatch.setattr(pyvista, "OFF_SCREEN", True)
+    exec(compile(code, str(page), "exec"), {"points": [[750.0, 3e5]]})
 
 
 def test_python_compiles():
@@ -110,7 +185,10 @@ def test_python_compiles():
 
 
 @pytest.mark.parametrize(("page", "code"), fences("python", runs=True), ids=lambda given: getattr(given, "stem", ""))
-def test_complete_python_runs(page, code, capsys):
+def test_complete_python_runs(page, code, capsys, tmp_path, monkeypatch):
+    if "import gmsh" in code:
+        pytest.importorskip("gmsh")
+    monkeypatch.chdir(tmp_path)
     exec(compile(code, str(page), "exec"), {})
 
 

@@ -91,7 +91,7 @@ def test_a_run_leaves_results_and_a_report_without_a_body(tmp_path):
     data = xr.load_dataset(tmp_path / "out" / "results.nc")
     assert dict(zip(data.output.values, data.unit.values, strict=True)) == {"tip": "m", "weight": "1"}
     assert "node" not in data.dims
-    report = (tmp_path / "out" / "report.html").read_text()
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "tests.functions.beam" in report
     assert "displacement" not in report
     assert not (tmp_path / "out" / "fields").exists()
@@ -138,9 +138,9 @@ def test_a_value_that_is_not_finite_is_no_answer():
         ("method={kind='multilevel-monte-carlo', samples=8}", "method.kind: a model of kind 'python' has no meshes"),
         ("parallel.ranks_per_model=2", "parallel.ranks_per_model: a model of kind 'python' is not shared by ranks"),
         ("parameters.lod={kind='uniform', lower=0, upper=1}", "parameters: not a number of the model; did you mean"),
-        ("model.function=beam", "model.function: string should match pattern"),
+        ("model.function=beam", "model.function: expected MODULE.FUNCTION; given 'beam'"),
         ("model.outputs=['a', 'a']", "model: 2 outputs are called 'a'"),
-        ("model.kind=pyton", "model: "),
+        ("model.kind=pyton", "model.kind: unknown kind; did you mean 'python'?; given 'pyton'"),
     ],
 )
 def test_mistakes(change, message):
@@ -160,12 +160,27 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     path = tmp_path / "changing_model.py"
     path.write_text("def f(p):\n    return p[0]\n")
-    spec = PythonModel(function="changing_model.f", parameters={"a": 1.0}, outputs=("f",))
-    spec.build(None, ("a",))
-    before = spec.source
+    blocks = 'parameters={a={kind="uniform", lower=0, upper=1}}', 'model.outputs=["f"]', "model.parameters={a=1.0}"
+    changing = parse(tomllib.loads(STUDY.replace("jacobian", "# ")), ["model.function=changing_model.f", *blocks])
+    before = changing.model.source
+    assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
+    assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
     path.write_text("def f(p):\n    return 2 * p[0]\n")
-    assert before != spec.source != ""
+    assert before != changing.model.source
+    with pytest.raises(StudyError, match="the function's file has changed; choose another --out"):
+        run(changing, "changing", tmp_path / "out", quiet=True)
     sys.modules.pop("changing_model")
+
+
+def test_a_study_that_could_not_begin_leaves_no_directory(tmp_path):
+    for changes in (["model.function=tests.functions.beem"], []):
+        case = study("method.samples=8", *changes)
+        if changes:
+            with pytest.raises(ModelError):
+                run(case, "beam", tmp_path / "out", quiet=True)
+            assert not (tmp_path / "out").exists()
+        else:
+            assert run(case, "beam", tmp_path / "out", quiet=True) == 0
 
 
 def test_modules_are_found_beside_the_study(tmp_path, monkeypatch, capsys):

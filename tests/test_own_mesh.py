@@ -1,6 +1,7 @@
 """Bodies from files: the same as a box where the mesh is the same; names, regions, units, mistakes."""
 
 import json
+import locale
 import shutil
 import tomllib
 from itertools import product
@@ -273,12 +274,29 @@ def test_groups_of_gmsh(tmp_path):
     gmsh.model.addPhysicalGroup(3, [1], name="whole liver")
     gmsh.model.addPhysicalGroup(2, [1], name="held")
     gmsh.model.addPhysicalGroup(2, [2], tag=7)
+    gmsh.model.addPhysicalGroup(2, [3, 4], name="whole liver")  # as the volume
+    gmsh.model.addPhysicalGroup(2, [1, 2, 3], name="skin")  # which others share
     gmsh.option.setNumber("Mesh.MeshSizeMax", 0.7)
     gmsh.model.mesh.generate(3)
-    gmsh.write(str(tmp_path / "box.msh"))
+    for form in (2.2, 4.1):
+        gmsh.option.setNumber("Mesh.MshFileVersion", form)
+        gmsh.write(str(tmp_path / f"box{form}.msh"))
+    gmsh.model.addPhysicalGroup(3, [1], name="again")
+    gmsh.write(str(tmp_path / "twice.msh"))
+    gmsh.option.setNumber("Mesh.SaveAll", 1)
+    gmsh.write(str(tmp_path / "all.msh"))
     gmsh.finalize()
-    own = OwnMesh(file=str(tmp_path / "box.msh"), unit=0.1, names={"pulled": 7})
-    assert (own.boundaries, own.regions) == (("held", "pulled"), ("whole-liver",))
+    for form in (2.2, 4.1):
+        own = OwnMesh(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
+        assert set(own.boundaries) == {"held", "pulled", "whole-liver", "skin"}
+        assert own.found.areas == pytest.approx({"held": 0.01, "pulled": 0.01, "whole-liver": 0.04, "skin": 0.04})
+        assert own.regions == ("whole-liver",)
+    for name, message in (
+        ("twice", r"cells are in several groups of volumes \(whole-liver, again\), expected one region for each"),
+        ("all", "has cells in no physical group"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            OwnMesh(file=str(tmp_path / f"{name}.msh"))
     assert own.found.regions["whole-liver"] == pytest.approx(2e-3)
     np.testing.assert_allclose(np.array(own.corners_of("held"))[:, 0], 0, atol=1e-12)
     np.testing.assert_allclose(np.array(own.corners_of("pulled"))[:, 0], 0.2)
@@ -305,6 +323,22 @@ def flat(mesh):
     return mesh
 
 
+def apart(mesh):
+    mesh = doubled(mesh)
+    mesh.points[len(mesh.points) // 2 :] += 5
+    return mesh
+
+
+def folded(mesh):
+    mesh.points[mesh.points[:, 0] == 1, 0] = 0.2  # the right cell reaches into the left one
+    return mesh
+
+
+def repeated(mesh):
+    cells = [(mesh.cells[0].type, mesh.cells[0].data[[0, 1, 1]]), mesh.cells[1]]
+    return meshio.Mesh(mesh.points, cells, cell_data={"part": [np.array([1, 2, 2]), mesh.cell_data["part"][1]]})
+
+
 def mixed(mesh):
     other = box("tetra")
     cells = [*mesh.cells, *other.cells]
@@ -319,6 +353,9 @@ def mixed(mesh):
         (lacking, {}, "names no boundary, expected quads of the surface"),
         (doubled, {}, "4 points lie where others lie: its parts are not joined"),
         (flat, {}, "2 of 2 cells have no volume"),
+        (apart, {}, r"its cells are 2 parts that share no face \(of 1, 1 cells\), expected one body"),
+        (folded, {}, "1 pairs of neighbouring cells lie on the same side of their common face: some are inside out"),
+        (repeated, {}, "1 faces belong to more than two cells: some cells are there twice"),
         (mixed, {}, "holds hexahedron, tetrahedron, expected linear tetrahedra or linear hexahedra alone"),
         (lambda mesh: mesh, {"names": {"tool": 99}}, r"has no number 99 \(names.tool\), expected one of: 1, 2, 10"),
         (lambda mesh: mesh, {"tags": "prt"}, r"has no array 'prt'; did you mean 'part'"),
@@ -328,6 +365,38 @@ def test_one_line_for_a_file_that_will_not_do(tmp_path, change, settings, messag
     path = write(tmp_path / "bad.vtu", change(numbered(box())))
     with pytest.raises(ValueError, match=message):
         OwnMesh(file=str(path), **settings)
+
+
+def test_files_that_are_no_meshes(tmp_path, capsys):
+    (tmp_path / "text.msh").write_text("hello\n")
+    with pytest.raises(ValueError, match=r"cannot be read as a mesh: it is no \.msh file"):
+        OwnMesh(file=str(tmp_path / "text.msh"))
+    assert capsys.readouterr() == ("", "")
+
+
+def test_numbers_of_an_xdmf_file_count(tmp_path):
+    meshio.write(tmp_path / "box.xdmf", numbered(box()))
+    before = OwnMesh(file=str(tmp_path / "box.xdmf")).found.digest
+    meshio.write(tmp_path / "box.xdmf", numbered(box(scale=2.0)))  # the same text, other numbers beside it
+    assert OwnMesh(file=str(tmp_path / "box.xdmf")).found.digest != before
+
+
+def test_files_of_pyvista(tmp_path):
+    mesh = box("tetra")
+    grid = pyvista.UnstructuredGrid(
+        {pyvista.CellType.TETRA: mesh.cells[0].data, pyvista.CellType.TRIANGLE: mesh.cells[1].data}, mesh.points
+    )
+    grid.save(tmp_path / "bare.vtu")
+    bare = OwnMesh(file=str(tmp_path / "bare.vtu"))
+    assert (bare.boundaries, bare.regions) == (("surface",), ("body",))
+    grid.cell_data["part"] = np.concatenate(mesh.cell_data["gmsh:physical"]).astype(np.int64)
+    for form in ("vtu", "vtk"):
+        before = locale.setlocale(locale.LC_ALL)
+        grid.save(tmp_path / f"box.{form}")
+        locale.setlocale(locale.LC_ALL, before)  # which VTK changes
+        own = OwnMesh(file=str(tmp_path / f"box.{form}"))
+        assert set(own.boundaries) == {f"{10 + k}" for k in range(6)}
+        assert own.regions == ("1", "2")
 
 
 STUDY = """
@@ -370,6 +439,13 @@ def test_mistakes_in_a_study(file, changes, message):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(StudyError, match=r"model\.body: file: .*box\.msh: cannot be read: No such file"):
         parse(tomllib.loads(text()), folder=tmp_path)
+
+
+def test_what_was_found_is_listed(file):
+    lines = plan(parse(tomllib.loads(text()), folder=file.parent))
+    assert "body        mesh box.msh of 1 × 0.7 × 0.8 m" in lines
+    assert any(line.startswith("boundaries  x-min (0.56 m²), x-max (0.56 m²), y-min (0.8 m²)") for line in lines)
+    assert "regions     left (0.28 m³), right (0.28 m³)" in lines
 
 
 def test_units_are_checked(file):

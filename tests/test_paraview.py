@@ -1,5 +1,7 @@
 """Files for ParaView, read again by VTK: names, values, and cells of high order that interpolate as the elements do."""
 
+import warnings
+
 import numpy as np
 import pytest
 import pyvista
@@ -43,6 +45,20 @@ def results(where, degree):
     )
     dataset = label(dataset, {"u": "m"}, nodes, *where.cells())
     return with_random_fields(dataset, {"stiffness": nodes[None, :, 0]}, {"stiffness": 0.9})
+
+
+def test_errors_that_are_not_known_do_not_spoil_the_file(tmp_path):
+    where = layout("tetrahedron", 1)
+    dataset = results(where, 1)
+    unknown = xr.full_like(dataset["field_mean"], np.inf)
+    half = unknown.copy()
+    half[0] = 0.0
+    path = write_fields(tmp_path, dataset.assign(field_mean_error=unknown, field_std_error=half))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = pyvista.read(path)
+    assert "mean_error" not in grid.point_data
+    assert np.isnan(grid["std_error"][1:]).all()
 
 
 @pytest.mark.parametrize(

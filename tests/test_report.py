@@ -375,6 +375,39 @@ def test_missing_results_are_named(tmp_path, sampled, missing):
         write_report(out)
 
 
+@pytest.mark.parametrize("content", [b"hello", None])
+def test_foreign_results_are_refused(tmp_path, sampled, content):
+    out = write(tmp_path / "out", sampled)
+    if content is None:
+        xr.Dataset({"x": 1.0}).to_netcdf(out / "results.nc", engine="h5netcdf")
+    else:
+        (out / "results.nc").write_bytes(content)
+    with pytest.raises(FileNotFoundError, match=r"results\.nc: holds no results of a study"):
+        write_report(out)
+
+
+def test_what_cannot_be_reported_is_one_line(tmp_path, sampled, undrawn, capsys):
+    from workflows.__main__ import main
+
+    one, other = (str(write(tmp_path / name, sampled)) for name in ("one", "other"))
+    for arguments, message in (
+        ([one, "--out", str(tmp_path / "x.html")], "x.html: is the file of a comparison, expected several directories"),
+        (
+            [one, other, "--out", str(tmp_path / "no" / "x.html")],
+            "x.html: cannot be written: No such file or directory",
+        ),
+    ):
+        assert main(["report", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
+    old = sampled.assign_attrs(config=sampled.attrs["config"].replace("samples", "draws"), tissuq="0.0.1")
+    assert main(["report", str(write(tmp_path / "old", old))]) == 2
+    assert (
+        "is no study of this version of tissuq, it was made by version 0.0.1 (method.draws" in capsys.readouterr().err
+    )
+
+
 def test_comparison_puts_studies_side_by_side(tmp_path, sampled, undrawn):
     plain = solve(study(kind="monte-carlo"))
     places = [write(tmp_path / "controlled", sampled), write(tmp_path / "plain", plain)]

@@ -48,7 +48,8 @@ samples = 8
 def command(*arguments):
     """A server as a process of its own, that says on its first line where it listens."""
     process = subprocess.Popen(
-        list(map(str, arguments)),
+        # Where the tests run in the background, children ignore interrupts unless told otherwise.
+        ["env", "--default-signal=INT", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -61,7 +62,7 @@ def command(*arguments):
         yield "http://" + first.split("http://")[1].split(",")[0].strip(), process
     finally:
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)
+            process.terminate()
         process.wait(timeout=20)
         process.stdout.close()
         process.stderr.close()
@@ -143,7 +144,9 @@ def test_answers_are_those_of_the_protocol(beam):
         ({"input": [[1.0, 2.0, 3.0]]}, "InvalidInput"),
         ({"input": [[1.0, "2"]]}, "InvalidInput"),
         ({"input": [POINT, POINT]}, "InvalidInput"),
-        ({"outWrt": 1, "inWrt": 1, "inWrt1": 1}, "InvalidInput"),
+        ({"outWrt": 1}, "InvalidInput"),
+        ({"inWrt": 1, "inWrt1": 1}, "InvalidInput"),
+        ({"inWrt": -1, "inWrt2": -1}, "InvalidInput"),
         ({"sens": [1.0], "vec": [1.0]}, "InvalidInput"),
         ({"config": {"lewel": 1}}, "InvalidInput"),
         ({"config": {"level": -1}}, "InvalidInput"),
@@ -153,7 +156,7 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
     asked = {"name": "forward", "input": [POINT], "config": {}, "outWrt": 0, "inWrt": 0, "inWrt1": 0, "inWrt2": 0}
     asked |= {"sens": [1.0, 0.0], "vec": [1.0, 0.0]}
     status, answer = ask(beam, what, asked | change)
-    if what == "Evaluate" and ("outWrt" in change or "sens" in change):
+    if what == "Evaluate" and change.keys() & {"outWrt", "inWrt", "sens"}:
         assert status == 200
         return
     jsonschema.validate(answer, ERROR)
@@ -161,7 +164,7 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes"])
+@pytest.mark.parametrize("what", ["ModelInfo", "InputSizes", "OutputSizes", "Evaluate"])
 def test_models_that_are_not_there(beam, what):
     status, answer = ask(beam, what, {"name": "wrong_model_name"})
     jsonschema.validate(answer, ERROR)
@@ -176,6 +179,24 @@ def test_derivatives_that_are_not_there():
         with pytest.raises(RefusalError) as caught:
             service.answer(what, {"name": "forward"})
         assert (caught.value.kind, caught.value.status) == ("UnsupportedFeature", 400)
+
+
+@pytest.mark.fem
+def test_vectors_of_one_number_as_the_conformance_suite_sends_them(beam):
+    """UM-Bridge's testing/protocol_conformity_1.0 asks for no other point; ``--input_value=1000`` is one for a beam."""
+    with urlopen(Request(beam, method="HEAD")) as answer:
+        assert (answer.status, answer.read()) == (200, b"")
+    asked = {"name": "forward", "config": {}, "input": [[1000.0, 1000.0]], "outWrt": 0}
+    sens, vec = {"sens": [0, 0]}, {"vec": [1000.0, 1000.0]}
+    for what, more in (
+        ("Evaluate", {}),
+        ("Gradient", {"inWrt": 0} | sens),
+        ("ApplyJacobian", {"inWrt": 0} | vec),
+        ("ApplyHessian", {"inWrt1": 0, "inWrt2": 0, "vec": [0, 0]} | sens),
+    ):
+        status, answer = ask(beam, what, asked | more)
+        jsonschema.validate(answer, schema("output", {"type": "array"}))
+        assert (status, np.size(answer["output"])) == (200, 2)
 
 
 @pytest.mark.fem
@@ -363,8 +384,9 @@ def test_an_interrupt_ends_the_server(tmp_path, number, capsys):
         assert process.stderr.read() == ""
 
 
-def test_a_comparison_of_models_is_not_served(capsys):
+@pytest.mark.parametrize(("name", "kind"), [("treloar", "select"), ("inclusion", "invert")])
+def test_studies_of_other_kinds_are_not_served(capsys, name, kind):
     from workflows.__main__ import main
 
-    assert main(["serve", str(ROOT / "configs" / "treloar.toml")]) == 2
-    assert "compares models" in capsys.readouterr().err
+    assert main(["serve", str(ROOT / "configs" / f"{name}.toml")]) == 2
+    assert f"is of kind '{kind}', expected a study of one model" in capsys.readouterr().err

@@ -126,12 +126,23 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
+    from workflows.config import StudyError
     from workflows.report import compare, write_report
 
+    if options.out is not None and len(options.directories) == 1:
+        message = f"--out {options.out}: is the file of a comparison, expected several directories"
+        raise StudyError(message)
     for directory in options.directories:
         sys.stdout.write(f"{write_report(directory)}\n")
     if len(options.directories) > 1:
-        sys.stdout.write(f"{compare(options.directories, options.out or Path('comparison.html'))}\n")
+        out = options.out or Path("comparison.html")
+        try:
+            sys.stdout.write(f"{compare(options.directories, out)}\n")
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and error.filename is None:  # one of the directories, in words
+                raise
+            message = f"--out {out}: cannot be written: {error.strerror}"
+            raise StudyError(message) from None
     return DONE
 
 
@@ -141,7 +152,7 @@ def _serve(options: argparse.Namespace) -> int:
 
     study = _load(options)
     if not isinstance(study, Study):
-        message = f"{options.study}: compares models, expected a study of one model to serve"
+        message = f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve"
         raise StudyError(message)
     serve(study, options.port, options.host, quiet=options.quiet)
     return DONE

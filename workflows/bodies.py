@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 SUBDIVISION = 3  # times that a face of high order is halved
 DRAWING_SECONDS = 600  # what the drawing of all bodies may take
 FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
+COLUMNS, ROWS = 3, 3  # of names of colours
 STILL = "#c9ced4"  # of nodes that do not move
 BY_NUMBER = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
 
@@ -80,7 +81,7 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         ends = (0.0, 1.0)
     elif shown == "dominating":
         surface.point_data["magnitude"] = np.round(np.clip(colour, -1, len(names) - 1))
-        colours, ends = [STILL, *(BY_NUMBER[i % len(BY_NUMBER)] for i in range(len(names)))], (-1.0, len(names) - 1.0)
+        colours, ends = [STILL, *(_colour_of(i) for i in range(len(names)))], (-1.0, len(names) - 1.0)
     coloured = plotter.add_mesh(
         surface,
         scalars="magnitude",
@@ -94,11 +95,13 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         show_scalar_bar=False,
     )
     plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
-    _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]))
+    _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]), _up(dataset))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)
-    labels = len(names) + 1 if shown == "dominating" else 5
-    _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter, names), labels)
+    if shown == "dominating":
+        _name_colours(plotter, [(i, names[i]) for i in np.unique(dataset["dominating"].astype(int)) if i >= 0])
+    else:
+        _show_colours(plotter, coloured.mapper, _colour_title(shown, parameter))
     plotter.subplot(0, 0)
     return plotter
 
@@ -159,10 +162,15 @@ def _up(dataset: xr.Dataset) -> FloatArray:
     return up
 
 
+def _sides(up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the directions (3,) to the right and to the front."""
+    right = np.eye(3)[1 if up[0] else 0]
+    return right, np.cross(right, up)
+
+
 def _look(plotter: Any, up: FloatArray) -> None:
     """Look from the front, a little from the right and from above."""
-    right = np.eye(3)[1 if up[0] else 0]
-    front = np.cross(right, up)
+    right, front = _sides(up)
     plotter.show_axes()
     plotter.view_vector(front + 0.6 * right + 0.4 * up, viewup=up)
     plotter.reset_camera()
@@ -170,13 +178,26 @@ def _look(plotter: Any, up: FloatArray) -> None:
     plotter.camera.SetWindowCenter(0, -0.06)  # the numbers of the axes are below the body
 
 
-def _show_colours(plotter: Any, mapper: Any, title: str, labels: int) -> None:
+def _colour_of(parameter: int) -> str:
+    return BY_NUMBER[parameter % len(BY_NUMBER)]
+
+
+def _name_colours(plotter: Any, present: list[tuple[int, str]]) -> None:
+    """Write the parameters that dominate somewhere, each in its colour, in three columns."""
+    plotter.add_text("the parameter that dominates:", position=(0.1, 0.75), viewport=True, font_size=14, color="black")
+    for k, (i, name) in enumerate(present[: COLUMNS * ROWS]):
+        place = (0.1 + 0.28 * (k % COLUMNS), 0.48 - 0.22 * (k // COLUMNS))
+        text = name.replace("$", "")
+        plotter.add_text(text, position=place, viewport=True, font_size=14, color=_colour_of(i), name=f"parameter {i}")
+
+
+def _show_colours(plotter: Any, mapper: Any, title: str) -> None:
     """Draw the scale of the colours with what they show below it."""
     plotter.add_scalar_bar(
         mapper=mapper,
         title="",
         fmt="%.3g",
-        n_labels=labels,
+        n_labels=5,
         label_font_size=26,
         color="black",
         width=0.8,
@@ -187,15 +208,18 @@ def _show_colours(plotter: Any, mapper: Any, title: str, labels: int) -> None:
     plotter.add_text(title, position=(0.1, 0.14), viewport=True, font_size=14, color="black")
 
 
-def _show_lengths(plotter: Any, points: FloatArray) -> None:
-    """Draw axes around the points (n, 3) that begin, end and have their numbers at multiples of a round length."""
+def _show_lengths(plotter: Any, points: FloatArray, up: FloatArray) -> None:
+    """Draw axes around the points (n, 3) that begin, end and have their numbers at multiples of a round length.
+
+    Two axes meet in the corners at the lower left and at the lower right: one of them leaves its number out.
+    """
     extent = float(np.ptp(points, axis=0).max())
     power = 10 ** np.floor(np.log10(extent / 4))
     step = power * max(factor for factor in (1, 2, 5) if factor * power <= extent / 4)
     first = np.floor(points.min(axis=0) / step + 0.1)
     last = np.maximum(np.ceil(points.max(axis=0) / step - 0.1), first + 1)
     counts = (last - first + 1).astype(int)
-    plotter.show_bounds(
+    actor = plotter.show_bounds(
         bounds=np.column_stack([first, last]).ravel() * step,
         location="outer",
         xtitle="x (m)",
@@ -205,18 +229,19 @@ def _show_lengths(plotter: Any, points: FloatArray) -> None:
         n_ylabels=counts[1],
         n_zlabels=counts[2],
         fmt=f"%.{max(0, -int(np.floor(np.log10(step))))}f",
-        font_size=14,
+        font_size=18,
         color="#5b6875",
     )
+    for direction in (-up, _sides(up)[1]):
+        axis = int(np.abs(direction).argmax())
+        written = actor.GetAxisLabels(axis)
+        written.SetValue(written.GetNumberOfValues() - 1 if direction[axis] > 0 else 0, "")
 
 
-def _colour_title(shown: str, parameter: str | None, names: list[str]) -> str:
+def _colour_title(shown: str, parameter: str | None) -> str:
     # A dollar would begin a formula of VTK.
     if parameter is not None:
         return f"displacement by one standard deviation of {parameter} (m)".replace("$", "")
-    if shown == "dominating":
-        listed = ", ".join(f"{i}: {name}" for i, name in enumerate(names))
-        return f"parameter that dominates (-1: none, {listed})".replace("$", "")
     if shown.startswith("sobol_"):
         which, _, name = shown.partition(" ")
         kind = "first-order" if which == "sobol_first" else "total"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -417,6 +418,21 @@ def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
     raise StudyError(message)
 
 
+_APART = ["select", "invert", "synthesize"]  # kinds of studies whose files have other blocks
+_PLAIN = {  # in words of TOML
+    "tuple_type": "expected a list",
+    "dict_type": "expected a table, { key = value }",
+    "model_type": "expected a table, { key = value }",
+    "model_attributes_type": "expected a table, { key = value }",
+}
+_PATTERNS = {  # of texts, by how they begin
+    r"'^[^.\s]": "expected a name without dots and blanks",
+    r"'^\S+$": "expected a name without blanks",
+    r"'^[^\W\d]": "expected MODULE.FUNCTION",
+    "'^https?": "expected an address, http://HOST:PORT",
+}
+
+
 def line(item: Any, place: str = "") -> str:
     """Say one mistake in a block at a place: where, what was given, what was expected."""
     for step in item["loc"]:
@@ -424,14 +440,25 @@ def line(item: Any, place: str = "") -> str:
             place += f"[{step}]"
         elif step not in _TAGS or place == "candidates":
             place += f".{step}" if place else step
-    message = item["msg"]
+    message, given = item["msg"], item["input"]
     if item["type"] == "missing":
         return f"{place}: missing"
     if item["type"] == "unknown_key":
         return f"{place}: {message}"
-    given = repr(item["input"])
-    shown = given if len(given) <= 80 else given[:77] + "..."
-    return f"{place}: {message[0].lower()}{message[1:]}; given {shown}"
+    if item["type"] == "union_tag_not_found":
+        return f"{place}.kind: missing"
+    if item["type"] == "union_tag_invalid":
+        found, *known = re.findall(r"'([\w-]+)'", message.replace("'kind'", ""))
+        known += _APART if place == "method" else []
+        return f"{place}.kind: unknown kind; {nearest(found, known)}; given '{found}'"
+    if item["type"] == "string_pattern_mismatch":
+        message = next((words for start, words in _PATTERNS.items() if start in message), message)
+    message = _PLAIN.get(item["type"], message.replace("Tuple", "List").replace(" after validation", ""))
+    message = f"{place}: {message[0].lower()}{message[1:]}"
+    if isinstance(given, Mapping) and item["type"] not in _PLAIN:  # a whole block, of which the message names the part
+        return message
+    shown = repr(list(given) if isinstance(given, tuple) else given)
+    return f"{message}; given {shown if len(shown) <= 80 else shown[:77] + '...'}"
 
 
 def _kinds() -> set[str]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from forward.hyperelastic import Hyperelastic
+from forward.own_mesh import OwnMesh
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
 from workflows.config import Study
 
 if TYPE_CHECKING:
+    from forward.geometry import Body
     from workflows.config import AnyStudy
     from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Comparison
@@ -49,6 +51,7 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
         names.append(f"{paths[0]} to {len(paths) - 1}")
     return [
         f"method      {method.kind}",
+        *_found(body),
         f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
         *(
             f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
@@ -68,6 +71,11 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
         ),
         *(f"warning     {warning}" for warning in body.warnings),
     ]
+
+
+def _found(body: Body) -> list[str]:
+    """Say what was found in the file of a mesh, a line each."""
+    return [f"{what:10}  {found}" for what, found in body.listed.items()] if isinstance(body, OwnMesh) else []
 
 
 def _external(study: Study) -> list[str]:
@@ -116,6 +124,7 @@ def _inversion(study: Inversion) -> list[str]:
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
+        *_found(spec.body),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
         *([f"            {sum(moved)} points outside the body are moved to its surface"] if sum(moved) else []),
@@ -129,6 +138,7 @@ def _synthesis(study: Synthesis) -> list[str]:
     seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
     return [
         f"method      {study.method.kind}",
+        *_found(spec.body),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
         f"data sets   {sets}",
         f"time        about {_duration(seconds)} on 1 core (rough)",

@@ -362,7 +362,7 @@ def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     ax.set_yscale("log")
     ax.set_xlabel(f"standard error of {_quantity(dataset, output)}")
     ax.set_ylabel("predicted time (s)")
-    ax.legend()
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, fontsize="small")
     return ax
 
 

@@ -30,12 +30,16 @@ MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
 
+MANY = 10  # panels of a picture that are legible side by side with other pictures
+
+
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in base64 with what it shows."""
+    """A PNG in base64 with what it shows; `wide` is one of many panels, which needs all of the page."""
 
     data: str
     caption: str
+    wide: bool = False
 
 
 def write_report(directory: Path) -> Path:
@@ -89,7 +93,12 @@ def _read(directory: Path) -> tuple[xr.Dataset, dict[str, Any], AnyStudy]:
     if summary is None:
         message = f"{directory}: holds no summary.json, expected the directory of a finished study"
         raise FileNotFoundError(message)
-    return dataset, summary, parse(tomllib.loads(dataset.attrs["config"]))
+    try:
+        return dataset, summary, parse(tomllib.loads(dataset.attrs["config"]))
+    except StudyError as error:
+        made = dataset.attrs.get("tissuq", "unknown")
+        message = f"{directory}: is no study of this version of tissuq, it was made by version {made} ({error.args[0]})"
+        raise StudyError(message) from None
 
 
 def _render(template: str, context: dict[str, Any]) -> str:
@@ -190,7 +199,8 @@ def _of_all(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> di
 
 
 def _picture(ax: Axes, caption: str) -> Picture:
-    return Picture(base64.b64encode(plots.png(ax)).decode(), caption)
+    panels = len(ax.figure.axes)
+    return Picture(base64.b64encode(plots.png(ax)).decode(), caption, wide=panels > MANY)
 
 
 def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:
@@ -215,7 +225,7 @@ def _sobol(results: Results) -> dict[str, Any]:
         shown = [tables.sobol(results, output)]
         if "sobol_second" in dataset:
             shown.append(tables.second_order(results, output))
-        caption = f"Indices of {output} with 95 % confidence intervals."
+        caption = f"Indices of {output} with 95 % confidence intervals{_largest_of(dataset)}."
         pictures = [_picture(plots.index_bars(dataset, output), caption)]
         if dataset.sizes.get("index_round", 0) > 1:
             caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."
@@ -269,7 +279,13 @@ def _errors(results: Results, output: str) -> list[tuple[str, tables.Table, list
 
 
 def _tornado(dataset: xr.Dataset, output: str) -> Picture:
-    return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order.")
+    return _picture(plots.tornado(dataset, output), f"Change of {output}, to first order{_largest_of(dataset)}.")
+
+
+def _largest_of(dataset: xr.Dataset) -> str:
+    """Say that bars are not drawn of all parameters."""
+    count = dataset.sizes["parameter"]
+    return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
 
 
 def _bodies(dataset: xr.Dataset) -> tuple[list[str], list[Picture]]:

@@ -56,7 +56,7 @@ def read_dataset(directory: Path) -> xr.Dataset:
     Raises
     ------
     FileNotFoundError
-        If the directory holds no results.
+        If the directory holds no results of a study.
     """
     import xarray as xr
 
@@ -64,7 +64,14 @@ def read_dataset(directory: Path) -> xr.Dataset:
     if not path.exists():
         message = f"{directory}: holds no results.nc, expected the directory of a finished study"
         raise FileNotFoundError(message)
-    return xr.load_dataset(path, engine="h5netcdf")
+    try:
+        found = xr.load_dataset(path, engine="h5netcdf")
+    except OSError:
+        found = xr.Dataset()
+    if "config" not in found.attrs:
+        message = f"{path}: holds no results of a study, expected a file that `tissuq run` has written"
+        raise FileNotFoundError(message)
+    return found
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
@@ -222,7 +229,11 @@ def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.
 
 
 def body_grid(dataset: xr.Dataset) -> Any:
-    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes."""
+    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes.
+
+    What is not known is NaN, and left out where nothing is: VTK cannot read vectors again of which all lengths are
+    infinite or NaN.
+    """
     import pyvista
 
     cells = dataset["cell_nodes"].to_numpy()
@@ -230,7 +241,9 @@ def body_grid(dataset: xr.Dataset) -> Any:
     kinds = np.full(len(cells), dataset["cell_nodes"].attrs["vtk_cell_type"])
     grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
     for name, values in node_fields(dataset).items():
-        grid.point_data[name] = values
+        known = np.isfinite(values)
+        if known.any():
+            grid.point_data[name] = np.where(known, values, np.nan)
     if "cell_region" in dataset:
         grid.cell_data["region"] = dataset["cell_region"].to_numpy()
     return grid

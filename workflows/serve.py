@@ -233,6 +233,11 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self._reply({})
 
+    def do_HEAD(self) -> None:
+        """Say that the server is there."""
+        self.send_response(200)
+        self.end_headers()
+
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         try:

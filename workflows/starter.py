@@ -265,13 +265,15 @@ _HEADS = {"select": _SELECTION, "invert": _SPECIMEN + _INVERT, "synthesize": _SP
 
 
 def starter(kind: str) -> str:
-    """Return a commented study that runs as it is.
+    """Return a commented study that runs as it is; for the kind "list", the names of all kinds, one a line.
 
     Raises
     ------
     StudyError
         If there is no method of that kind.
     """
+    if kind == "list":
+        return "".join(f"{name}\n" for name in _METHODS)
     if kind not in _METHODS:
         message = f"init {kind}: unknown kind of study; {nearest(kind, tuple(_METHODS))}"
         raise StudyError(message)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.external import PythonModel
+from forward.model import ModelError
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
@@ -78,6 +79,8 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     ------
     StudyError
         If the directory holds another study or cannot be written, or if there is less work than groups of ranks.
+    ModelError
+        If the model cannot be made; the directory is then left as it was.
     SolveError
         If the study cannot be finished because the model has no answer.
     """
@@ -108,7 +111,12 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
-    job = _job(study, ensemble, name)
+    try:
+        job = _job(study, ensemble, name)
+    except ModelError:
+        if world.rank == 0:
+            _withdraw(directory)
+        raise
     kept = checkpoint if job.costly else None
     dataset = ensemble.run(
         job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
@@ -343,11 +351,17 @@ def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
 def _identity(study: AnyStudy) -> dict[str, Any]:
     """Return what decides on evaluations."""
     blocks = {key: value for key, value in document(study).items() if key != "parallel"}
-    if isinstance(study, Study) and isinstance(study.model, PythonModel):
-        blocks["source"] = study.model.source
+    source = _source(study)
+    if source is not None:
+        blocks["source"] = source
     if isinstance(study, Study) and study.body is not None:
         blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
     return blocks
+
+
+def _source(study: AnyStudy) -> str | None:
+    """Return the hash of the files of a Python model."""
+    return study.model.source if isinstance(study, Study) and isinstance(study.model, PythonModel) else None
 
 
 def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
@@ -390,7 +404,17 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     summary = read_summary(directory)
     if summary is None:
         return None
+    if summary["provenance"].get("source") != _source(study):
+        message = f"{directory}: holds results of other code: the function's file has changed; choose another --out"
+        raise StudyError(message)
     return PARTIAL if summary["failed"] else DONE
+
+
+def _withdraw(directory: Path) -> None:
+    """Remove what `_prepare` has made, if nothing else is there: the study, corrected, may go to the same place."""
+    if [path.name for path in directory.iterdir()] == ["study.toml"]:
+        (directory / "study.toml").unlink()
+        directory.rmdir()
 
 
 def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
@@ -425,6 +449,7 @@ def _summary(
     every = evaluations.values()
     failed = sum(len(found.failures) for found in every)
     names = {label: _parameters(study, label) for label in evaluations}
+    source = _source(study)
     return {
         "study": name,
         "method": study.method.kind,
@@ -455,6 +480,7 @@ def _summary(
             "groups": groups,
             "processor": platform.machine(),
             "commit": _commit(),
+            **({} if source is None else {"source": source}),
             "versions": {"python": platform.python_version(), **_versions()},
         },
     }
