@@ -74,7 +74,7 @@ class Lengths:
 
 
 FEW = Lengths(4, 1000, 300, 1)
-FIELD = Lengths(2, 500, 200, 1)
+FIELD = Lengths(2, 1000, 200, 1)
 
 
 def walkers(size: int) -> Lengths:
@@ -133,7 +133,12 @@ class Chains:
     @property
     def mixed(self) -> bool:
         """Whether all chains say the same, of enough draws."""
-        return bool(self.rhat.max() <= MIXED and min(self.effective.min(), self.effective_tail.min()) >= INDEPENDENT)
+        return bool(self.rhat.max() <= MIXED and self.worth >= INDEPENDENT)
+
+    @property
+    def worth(self) -> float:
+        """Smallest effective number of draws of all quantities, for bulk and tails."""
+        return float(min(self.effective.min(), self.effective_tail.min()))
 
     @property
     def flat(self) -> FloatArray:
@@ -513,24 +518,49 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
 
 
 def verdict_on_field(
-    mode: Mode, gaussian: LowRankPosterior, found: FieldWeights | None, test: ResidualTest, chains: Chains | None = None
+    mode: Mode,
+    gaussian: LowRankPosterior,
+    found: FieldWeights | None,
+    test: ResidualTest,
+    chains: Chains | None = None,
+    values: FloatArray | None = None,
 ) -> Verdict:
-    """Judge means and standard deviations of the values of a field by weighted samples, if any, and the residuals."""
+    """Judge means and standard deviations of the values of a field by other solves, if any, and the residuals.
+
+    Parameters
+    ----------
+    mode, gaussian
+        What is judged.
+    found
+        Weighted samples.
+    test
+        Of the residuals.
+    chains
+        What was judged of chains, and `values` (n, N), the values of the field that they drew.
+    """
     objection = _objection(mode.converged, test)
     if objection is not None:
         return objection
-    if found is None and chains is not None:
-        return _by_chains("no weighted samples", chains)
-    if found is None:
+    if found is None and chains is None:
         why = f"the residuals agree with it (probability {test.probability:.2g}); it was not checked by other solves"
         return Verdict("laplace", why)
+    if found is None:
+        assert chains is not None
+        if not chains.mixed or values is None:
+            return _by_chains("no weighted samples", chains)
+        return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.worth, _said(chains))
     worth = f"weights worth {found.effective:.0f} of {len(found.log_weights)} samples, k̂ = {found.tail:.2f}"
     if not found.trusted or found.effective < FEWEST:
         return _by_chains(worth, chains)
+    return _compared(gaussian, found.mean, found.std, found.effective, worth)
+
+
+def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, effective: float, worth: str) -> Verdict:
+    """Compare the Gaussian with means and standard deviations (N,) by so many effective samples."""
     # Root mean squares over the vertices, less what as few samples would give by chance.
-    chance = 1 / found.effective
-    shift = np.sqrt(max(float((((found.mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
-    width = float(np.sqrt((found.std**2).mean() / (gaussian.std**2).mean()))
+    chance = 1 / effective
+    shift = np.sqrt(max(float((((mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
+    width = float(np.sqrt((std**2).mean() / (gaussian.std**2).mean()))
     far = f"means are {shift:.2f} standard deviations from the mode, widths {width:.2f} of the Gaussian's; {worth}"
     agrees = shift <= SHIFT and abs(np.log(width)) <= WIDTH + np.sqrt(chance)
     return Verdict("laplace" if agrees else "corrected", far)
@@ -551,7 +581,11 @@ def _objection(converged: bool, test: ResidualTest) -> Verdict | None:
 def _by_chains(worth: str, chains: Chains | None) -> Verdict:
     if chains is None:
         return Verdict("neither", f"{worth}; take more samples, or run chains")
-    said = f"R̂ up to {chains.rhat.max():.3f}, effective draws from {chains.effective.min():.0f}"
+    said = _said(chains)
     if chains.mixed:
         return Verdict("corrected", f"{worth}, but chains agree: {said}")
     return Verdict("neither", f"{worth}, and chains have not mixed: {said}")
+
+
+def _said(chains: Chains) -> str:
+    return f"R̂ up to {chains.rhat.max():.3f}, effective draws from {chains.worth:.0f}"

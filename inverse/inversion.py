@@ -83,7 +83,7 @@ class Invert(Settings):
         Prior of the factor on all standard deviations of the errors; without it they are what they are said to be.
     chains
         Run Markov chains too: "pcn", of proposals that a Gaussian of the posterior makes (5 204 solves; of a field
-        2 804), or, for few parameters, "emcee" (35 208 solves, or more). Where they have mixed, moments and draws of
+        4 804), or, for few parameters, "emcee" (35 208 solves, or more). Where they have mixed, moments and draws of
         few parameters are theirs; of a field, where Laplace's are not to be trusted.
     starts
         Starts of the search for the mode of few parameters.
@@ -441,7 +441,7 @@ def _of_chains(chains: Chains | None) -> Record:
     return {
         "chains": np.array(float(len(chains.draws) if chains.mixed else 0)),
         "chain_rhat": np.array(chains.rhat.max()),
-        "chain_effective": np.array(min(chains.effective.min(), chains.effective_tail.min())),
+        "chain_effective": np.array(chains.worth),
     }
 
 
@@ -678,14 +678,15 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
         # Chains are judged by the mean over the body: that all vertices have mixed would ask for far more draws.
         whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
         chains = replace(whole, names=("mean",), draws=whole.draws[:, :, :1])
-    verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains)
+    drawn = None if whole is None else whole.flat[:, 1:]
+    verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains, drawn)
     error = np.nan
     if log_evidence is None and weighed is not None and weighed.trusted and weighed.effective >= FEWEST:
         log_evidence, error = weighed.log_evidence, weighed.error
     scale = data.sigma * factor
     cases = int(data.cases.max()) + 1
     inferred_noise = (factor, log_std) if method.noise is not None else None
-    values, weights = _corrected(verdict, weighed, chains, whole)
+    values, weights = _corrected(verdict, weighed, chains, drawn)
     return {
         **_of_data(data, np.asarray(mode.point.solution.outputs), found.residual, scale, spectrum, cases),
         **_of_test(test),
@@ -712,14 +713,13 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
 
 
 def _corrected(
-    verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, whole: Chains | None
+    verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, drawn: FloatArray | None
 ) -> tuple[FloatArray | None, FloatArray]:
     """Values (n, N) of the field with weights (n,) that correct the Gaussian where it is not to be trusted."""
     if verdict.trust != "corrected":
         return None, np.zeros(0)
-    if chains is not None and whole is not None and chains.mixed:
-        values = whole.flat[:, 1:]
-        return values, np.full(len(values), 1 / len(values))
+    if chains is not None and drawn is not None and chains.mixed:
+        return drawn, np.full(len(drawn), 1 / len(drawn))
     assert weighed is not None
     return weighed.values, weighed.weights
 

@@ -254,6 +254,16 @@ def test_verdicts_on_fields():
     assert verdict_on_field(mode, found, moved, test).trust == "corrected"
     wider = replace(weights, values=found.mean + 1.6 * (weights.values - found.mean))
     assert verdict_on_field(mode, found, wider, test).trust == "corrected"
+    g = np.full((N, 1), 1 / N)
+    drawn = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), draws=1500)
+    chains, values = replace(drawn, draws=drawn.draws[:, :, :1]), drawn.flat[:, 1:]
+    assert chains.mixed
+    assert verdict_on_field(mode, found, None, test, chains, values).trust == "laplace"
+    far = verdict_on_field(mode, found, None, test, chains, values + 0.5 * found.std)
+    assert far.trust == "corrected"
+    assert "R̂" in far.why
+    short = replace(chains, draws=chains.draws[:, :50])
+    assert verdict_on_field(mode, found, None, test, short, values).trust == "neither"
     uneven = replace(weights, log_weights=5 * np.random.default_rng(0).standard_normal(64))
     assert verdict_on_field(mode, found, uneven, test).trust == "neither"
 

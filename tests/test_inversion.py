@@ -11,19 +11,26 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import inverse.inversion
 from forward.model import FunctionModel
+from inverse.chains import weigh_field
 from inverse.inversion import (
     Inversions,
     Invert,
     Synthesize,
     Variables,
+    Vertices,
     invert_by_all,
     invert_by_group,
+    invert_field,
     sentence,
     variables,
 )
+from inverse.low_rank import LowRankPosterior
+from inverse.newton_cg import find_mode
 from inverse.observations import Components
 from tests.launch import run, run_script
+from tests.test_low_rank import curved
 from uq.distributions import LogNormal, LogUniform, Normal
 from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
@@ -134,6 +141,31 @@ def test_what_is_predicted_is_as_sure_as_the_parameters():
     record = invert_by_group(Inputs(PRIORS), linear(), DATA, Invert(samples=32, starts=1), lambda points: points[:, :1])
     _, covariance = exactly(np.arange(12))
     np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
+
+
+def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
+    """Laplace's moments and draws where it can be trusted; else those of the weighted samples, with their evidence."""
+    posterior = curved()
+    n = len(posterior.data)
+    data = Components(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.int64), posterior.data, posterior.sigma)
+    vertices = Vertices(np.full(posterior.size, 0.1), np.ones(posterior.size))
+    method = Invert(samples=512, draws=100)
+    plain = invert_field(posterior, data, method, vertices)
+    assert plain["trust"] == 0
+    np.testing.assert_array_equal(plain["stiffness_mean"], plain["stiffness_mode"])
+    assert abs(plain["log_evidence"] - plain["laplace_log_evidence"]) > 1e-6
+    assert 0 < plain["log_evidence_error"] < 0.5
+    verdict = inverse.inversion.Verdict("corrected", "")
+    monkeypatch.setattr(inverse.inversion, "verdict_on_field", lambda *_: verdict)
+    record = invert_field(posterior, data, method, vertices)
+    mode = find_mode(posterior)
+    weighed = weigh_field(mode.point, LowRankPosterior.at(mode.point), 512)
+    np.testing.assert_allclose(record["stiffness_mean"], 0.1 + weighed.mean, rtol=1e-6)
+    np.testing.assert_allclose(record["stiffness_std"], weighed.std, rtol=1e-6)
+    assert record["mean"][0] == pytest.approx(0.1 + weighed.mean.mean())
+    assert record["lower"][0] < record["mean"][0] < record["upper"][0]
+    distance = np.abs(record["stiffness_draw"][:, None] - 0.1 - weighed.values).max(axis=2).min(axis=1)
+    assert distance.max() < 1e-6
 
 
 def test_inversions_are_evaluations():

@@ -571,7 +571,7 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
 
     # Draws of chains stand one after the other, as many of each.
     counts = set(found["chains"].to_numpy()[found["ok"].to_numpy()].astype(int).tolist())
-    chains = max(counts.pop() if len(counts) == 1 else 1, 1)
+    chains = max(counts.pop() if len(counts) == 1 and not study.field else 1, 1)
     each = found.sizes["sample"] // chains
 
     def draws(name: str) -> Any:

@@ -170,7 +170,7 @@ def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
         words = f"worth {number(float(one['effective']), 3)}, k̂ = {number(float(one['tail']), 2)}"
         yield "weighted points", words
     if np.isfinite(one["chain_rhat"]):
-        words = "their draws are the posterior below" if int(one["chains"]) else "they have not mixed"
+        words = "they have mixed" if int(one["chains"]) else "they have not mixed"
         said = f"R̂ up to {float(one['chain_rhat']):.3f}, effective draws from {float(one['chain_effective']):.0f}"
         yield "chains", f"{said}: {words}"
     yield "solves", f"{int(one['solves']):,}"
