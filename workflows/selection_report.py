@@ -226,7 +226,9 @@ def averages(dataset: xr.Dataset) -> Table:
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
         at = dataset["output_at"].values[members]
-        one = dataset.isel(output=members[int(np.argmax(np.abs(at - at[0]) if len(at) > 1 else [0]))])
+        # Data of displacements have numbers only: there, what moved most.
+        far = np.abs(at - at[0]) if quantity == "stress" else np.abs(dataset["measured"].values[members])
+        one = dataset.isel(output=members[int(np.argmax(far))])
         stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))
         rows.append(
             (
@@ -238,7 +240,8 @@ def averages(dataset: xr.Dataset) -> Table:
                 *(with_unit(number(std, 3), UNITS[quantity]) for std in stds),
             )
         )
-    head = ("group", "test", "at", "measured", "averaged prediction", "std within models", "std between models")
+    place = "at" if quantity == "stress" else "datum"
+    head = ("group", "test", place, "measured", "averaged prediction", "std within models", "std between models")
     return Table(head, rows, text=frozenset({0, 1}))
 
 
