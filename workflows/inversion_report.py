@@ -486,7 +486,7 @@ def _worth(one: xr.Dataset) -> float:
 
 def _smooth(draws: FloatArray, std: float, worth: float, x: FloatArray) -> FloatArray:
     """Density at x of draws that are worth so many independent ones, by normal kernels (Silverman's width)."""
-    width = max(std, 1e-300) * (4 / (3 * max(worth, 2.0))) ** 0.2
+    width = max(std, 1e-300) * (4 / (3 * max(min(worth, len(draws)), 2.0))) ** 0.2
     z = (x[:, None] - draws) / width
     return np.asarray(np.exp(-(z**2) / 2).mean(axis=1) / (width * np.sqrt(2 * np.pi)))
 
