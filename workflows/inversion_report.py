@@ -30,10 +30,11 @@ SEEN = 1.0  # λ above which the data say more of a direction than the prior
 def context(dataset: xr.Dataset, study: AnyStudy) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     if "clean" in dataset:
-        return {"lines": made(dataset), "batch": None, "priors": None, "sets": []}
+        return {"lines": [(line, False) for line in made(dataset)], "batch": None, "priors": None, "sets": []}
     several = dataset.sizes["data_set"] > 1
+    doubtful = ~dataset["ok"].to_numpy() | (dataset["trust"].to_numpy() != 0)
     return {
-        "lines": list(findings(dataset)),
+        "lines": list(zip(findings(dataset), doubtful.tolist(), strict=True)),
         "batch": batch(dataset) if several else None,
         "priors": priors(dataset, study),
         "sets": [_of_set(dataset.sel(data_set=name)) for name in dataset.data_set.values[dataset["ok"]][:DRAWN]],
@@ -361,13 +362,15 @@ def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
 
 
 def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends: tuple[float, float]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     low, high = ends if ends[1] > ends[0] else (ends[0] - 1e-3, ends[1] + 1e-3)
     drawn = ax.pcolormesh(*cut.lines, cut.values(values), cmap=colours, vmin=low, vmax=high, shading="gouraud")
     ax.set_aspect("equal")
     ax.set_title(title, fontsize="medium")
     ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
     ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
-    ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9)
+    ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9, ticks=MaxNLocator(3))
 
 
 def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:

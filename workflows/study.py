@@ -454,6 +454,7 @@ def _summary(
         "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
         "evaluations": sum(len(found.points) for found in every),
+        **_evaluation(study),
         "failed": failed,
         "failures": [
             {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
@@ -481,6 +482,13 @@ def _summary(
             "versions": {"python": platform.python_version(), **_versions()},
         },
     }
+
+
+def _evaluation(study: AnyStudy) -> dict[str, str]:
+    """Say what an evaluation is, where it is no solve."""
+    from workflows.inversion import Inversion
+
+    return {"evaluation": "data set"} if isinstance(study, Inversion) and not study.together else {}
 
 
 def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
@@ -530,6 +538,8 @@ def _commit() -> str | None:
 
 
 def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    from workflows.tables import solves
+
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
         f"probability {found['probability']:.3g}"
@@ -558,7 +568,7 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
             lines.append(f"{output}: derivative × range of the parameter: {shown}")
-    lines.append(f"{summary['evaluations']} solves in {summary['wall_seconds']:.1f} s, {summary['failed']} failed")
+    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {summary['failed']} failed")
     if "note" in summary:
         lines.append(summary["note"])
     lines.append(f"report: {directory / 'report.html'}")

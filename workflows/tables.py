@@ -403,9 +403,11 @@ def times(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     count = max(summary["evaluations"], 1)
     yield "wall time", f"{duration(summary['wall_seconds'])} (of the run that finished the study)"
     cpu = summary["cpu_seconds"]
-    yield "processor time of the solves", f"{duration(cpu)}; {duration(cpu / count)} a solve"
-    for name, amount in summary["work"].items():
-        yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
+    each = _evaluation(summary)
+    yield f"processor time of the {each}s", f"{duration(cpu)}; {duration(cpu / count)} a {each}"
+    if any(summary["work"].values()):  # that of inversions is said of each
+        for name, amount in summary["work"].items():
+            yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a {each}"
 
 
 def provenance(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -512,5 +514,9 @@ def estimates(studies: dict[str, Results], output: str) -> Table:
 
 
 def solves(summary: dict[str, Any]) -> str:
-    """The number of solves."""
-    return "1 solve" if summary["evaluations"] == 1 else f"{summary['evaluations']:,} solves"
+    """The number of solves, or of data sets that were inverted one by one."""
+    return f"{summary['evaluations']:,} {_evaluation(summary)}{'s' if summary['evaluations'] != 1 else ''}"
+
+
+def _evaluation(summary: dict[str, Any]) -> str:
+    return str(summary.get("evaluation", "solve"))
