@@ -30,7 +30,7 @@ MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
 
-HALF = 9.0  # inches: wider pictures are not legible on half a page
+HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 
 @dataclass(frozen=True)
