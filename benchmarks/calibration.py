@@ -10,10 +10,12 @@ from __future__ import annotations
 import time
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
+from benchmarks.beams import CONFIG
 from forward.specimen import Specimen, SpecimenModel
 from inverse.calibration import Kind, calibrate
 from inverse.posterior import Posterior
@@ -21,10 +23,15 @@ from uq.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.evaluate import Prediction, SerialEvaluate
 from uq.inputs import Inputs
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 CELLS = 4
 SPECIMENS = 200
 SAMPLES = 64
 FILE = Path("results/calibration.nc")
+PICTURE = CONFIG.parent.parent / "docs" / "gallery" / "ranks.png"
+BINS = 10
 NOISE = 0.02  # of the root mean square of the displacements of each load case
 PRIORS: dict[str, Distribution] = {
     "inclusions.tumour.x": Uniform(lower=0.3, upper=0.7),
@@ -77,19 +84,20 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
 
 
 def main(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:
-    """Print how uniform the ranks are, and write what a picture needs."""
+    """Print how uniform the ranks are, write and draw them."""
     begin = time.process_time()
     found = calibrate(problem(), specimens, samples=samples, starts=1)
     seconds = time.process_time() - begin
     FILE.parent.mkdir(parents=True, exist_ok=True)
-    found.dataset().to_netcdf(FILE)
+    found.dataset(BINS).to_netcdf(FILE, engine="h5netcdf")
+    draw(found.dataset(BINS))
     print("| parameter | posterior | uniform? p | 50 % interval holds | 90 % | histogram of the ranks (10 bins) |")
     print("|---|---|---|---|---|---|")
     kinds: tuple[Kind, Kind] = ("laplace", "corrected")
     for kind in kinds:
         p, half, most = found.probabilities(kind), found.coverage(kind, 0.5), found.coverage(kind, 0.9)
         for i, name in enumerate(found.names):
-            counts = " ".join(map(str, found.counts(kind, 10)[i]))
+            counts = " ".join(map(str, found.counts(kind, BINS)[i]))
             print(f"| {name} | {kind} | {p[i]:.2g} | {100 * half[i]:.0f} % | {100 * most[i]:.0f} % | {counts} |")
     good = found.trusted
     print(
@@ -98,3 +106,33 @@ def main(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:
         f"Weights of {samples} solves are worth {np.median(found.effective):.0f} (median), "
         f"{100 * good.mean():.0f} % of them trusted. {seconds:.0f} s of CPU; {FILE} holds the ranks."
     )
+
+
+def draw(calibration: xr.Dataset) -> None:
+    """Draw histograms of the ranks, with the band that holds 95 % of the bars of uniform ones."""
+    from matplotlib.figure import Figure
+    from scipy.stats import binom
+
+    count = calibration["count"]
+    n, bins = int(count[0, 0].sum()), count.sizes["bin"]
+    low, high = binom.interval(0.95, n, 1 / bins)
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    panels = figure.subplots(*count.shape[:2], sharex=True, sharey=True)
+    for (i, j), axis in np.ndenumerate(panels):
+        axis.axhspan(low, high, color="0.85")
+        axis.axhline(n / bins, color="0.5", linewidth=0.8)
+        axis.stairs(count[i, j], np.linspace(0, 1, bins + 1), fill=True, color=f"C{i}", alpha=0.7)
+        axis.text(
+            0.5,
+            0.96,
+            f"p = {float(calibration['probability'][i, j]):.2g}",
+            transform=axis.transAxes,
+            ha="center",
+            va="top",
+        )
+        if i == 0:
+            axis.set_title(str(calibration.parameter.values[j]).split(".")[-1])
+        if j == 0:
+            axis.set_ylabel(f"specimens, {calibration.posterior.values[i]}")
+    figure.supxlabel("probability that the posterior gives to what lies below the truth", fontsize="medium")
+    figure.savefig(PICTURE, dpi=110)

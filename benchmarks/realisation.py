@@ -10,10 +10,11 @@ from mpi4py import MPI
 from benchmarks.beams import beam
 from benchmarks.throughput import resident
 from uq.basis import orthonormal
-from uq.chaos import Data, Projections, StateExpansion, fit_best, whole
 from uq.evaluate import Evaluate, Request, SerialEvaluate
+from uq.field_regression import Projections, StateExpansion
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise
+from uq.regression import Data, fit_best, whole
 from uq.sampling import random_points, sobol_points
 
 DRAWS = 50

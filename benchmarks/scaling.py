@@ -175,12 +175,13 @@ def simulated(durations: FloatArray, groups: int, blocks: int, constants: Consta
     constants
         Measured times.
     latency
-        Longest time that rank 0 may leave the counter alone: as long as a solve, where the network needs its help.
+        Longest time that rank 0 may leave the counter of the others alone: as long as a solve, where the network needs
+        its help.
     """
     size = -(-len(durations) // blocks)
     edges = np.arange(0, len(durations), size)
     work = (np.add.reduceat(durations, edges) + constants.file).tolist()
-    wait = (np.random.default_rng(0).random(len(edges)) * latency).tolist()
+    wait = (np.random.default_rng(0).random(len(edges)) * latency * (1 - 1 / groups)).tolist()
     free = [constants.key * len(edges) + constants.reference * float(durations.mean())] * groups
     counter, ends = 0.0, []
     for seconds, unheard in zip(work, wait, strict=True):
@@ -241,9 +242,8 @@ def draw(curves: dict[str, list[tuple[int, float]]]) -> None:
             solve, _, setting = name.partition(", ")
             if solve == mean:
                 software = setting.endswith("software counter")
-                label = setting if not software else None
                 colour = {"128": "C0", "4": "C1", "8": "C2"}[setting.split()[0]]
-                axis.plot(*zip(*rows, strict=True), "--" if software else "-", color=colour, label=label)
+                axis.plot(*zip(*rows, strict=True), "--" if software else "-", color=colour, label=setting)
         axis.set(xscale="log", title=f"solves of {mean}", xlabel="groups of ranks", ylim=(0, 1.02))
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("efficiency")

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from benchmarks.beams import CONFIG
 from forward.homogeneous import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
 from inverse.comparison import Candidate, Data
@@ -39,11 +40,12 @@ PRIORS: dict[str, dict[str, Distribution]] = {
 }
 OGDEN = {"mu1": 6.3e5, "alpha1": 1.3, "mu2": 1.2e3, "alpha2": 5.0, "mu3": -1e4, "alpha3": -2.0}
 SMALLER = (0.15, 0.05, 0.02)  # errors of these data, of the stress
+PICTURE = CONFIG.parent.parent / "docs" / "gallery" / "reliability.png"
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 
 
 def main() -> None:
-    """Print the reliability table and how often the discrepancy test fires."""
+    """Print and draw how reliable probabilities are, and print how often the discrepancy test fires."""
     begin = time.process_time()
     rng = np.random.default_rng(7)
     names = list(PRIORS)
@@ -71,6 +73,7 @@ def main() -> None:
             happened.append(np.arange(len(names)) == k)
             alarms.append(alarm)
     P, true = np.concatenate(said), np.concatenate(happened)
+    bars = []
     print(f"{DRAWS} draws from each of five models, {len(labels)} stresses with errors of {100 * NOISE:.0f} %\n")
     print("| probability said | cases | mean of it | share that happened | ± |")
     print("|---|---|---|---|---|")
@@ -79,9 +82,9 @@ def main() -> None:
         n = int(members.sum())
         if n:
             spread = np.sqrt((P[members] * (1 - P[members])).sum()) / n
-            print(
-                f"| {low:g} to {high:g} | {n} | {P[members].mean():.3f} | {true[members].mean():.3f} | {spread:.3f} |"
-            )
+            bars.append((P[members].mean(), true[members].mean(), spread))
+            print(f"| {low:g} to {high:g} | {n} | {bars[-1][0]:.3f} | {bars[-1][1]:.3f} | {spread:.3f} |")
+    draw(np.array(bars))
     score = -np.log(P[true])
     logs = np.log(np.maximum(np.array(said), 1e-300))
     entropy = -(np.array(said) * logs).sum(axis=1)
@@ -96,3 +99,18 @@ def main() -> None:
         found = sum(compared(other, noise)[1] for _ in range(DRAWS))
         print(f"| {100 * noise:.0f} % | {found} of {DRAWS} |")
     print(f"\n{time.process_time() - begin:.0f} s")
+
+
+def draw(bars: FloatArray) -> None:
+    """Draw what happened against what was said: rows of mean probability, share and its standard error."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.4, 4.2), layout="constrained")
+    axis = figure.subplots()
+    axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.8, label="as said")
+    axis.errorbar(*bars.T[:2], yerr=2 * bars[:, 2], fmt="o", capsize=3, label="found, ± 2 standard errors")
+    axis.set(
+        xlabel="probability said", ylabel="share that happened", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal"
+    )
+    axis.legend(loc="lower right")
+    figure.savefig(PICTURE, dpi=110)

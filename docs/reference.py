@@ -42,8 +42,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Put in what a page quotes."""
-    return quoted(markdown)
+    """Put in what a page quotes; studies that it links to have a place on the site."""
+    return re.sub(r"\]\(\.\./configs/([\w-]+)\.toml\)", r"](studies.md#\1)", quoted(markdown))
 
 
 # --- pages -----------------------------------------------------------------------------------------------------------

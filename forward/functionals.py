@@ -27,7 +27,7 @@ from forward.outputs import (
 )
 
 if TYPE_CHECKING:
-    from forward.finite_element import Discretisation
+    from forward.discretisation import Discretisation
     from forward.vertex_fields import VertexField
 
 

@@ -17,7 +17,7 @@ from forward.acceleration import Inverse
 from forward.model import FloatArray, Reference, Work
 
 if TYPE_CHECKING:
-    from forward.finite_element import Discretisation
+    from forward.discretisation import Discretisation
 
 
 def rotations(F: FloatArray) -> FloatArray:

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from forward.layout import Layout
 
 
+SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
+
+
 class LoadCase(Settings):
     """What acts on a specimen at one time.
 
@@ -98,7 +101,7 @@ class Specimen(Settings):
 
     Parameters
     ----------
-    body, material, inclusions, fields, solver, formulation
+    body, material, regions, inclusions, fields, solver, formulation
         As of `Hyperelastic`; the same in all cases.
     cases
         Load cases.
@@ -109,6 +112,7 @@ class Specimen(Settings):
     kind: Literal["specimen"] = "specimen"
     body: Body
     material: Material
+    regions: dict[str, dict[str, float]] = Field(default={})
     inclusions: tuple[Inclusion, ...] = ()
     fields: tuple[RandomField, ...] = ()
     solver: SolverSettings = SolverSettings()
@@ -123,7 +127,7 @@ class Specimen(Settings):
 
     def loaded(self, case: LoadCase) -> Hyperelastic:
         """Return the body in one load case."""
-        shared = {name: getattr(self, name) for name in ("body", "material", "inclusions", "fields", "solver")}
+        shared = {name: getattr(self, name) for name in SHARED}
         acting = {name: getattr(case, name) for name in ("clamp", "displacements", "loads")}
         return _Loaded(formulation=self.formulation, **shared, **acting)
 
@@ -179,7 +183,10 @@ class Specimen(Settings):
                 self.loaded(case)
             except ValidationError as error:
                 for line in error.errors(include_url=False):
-                    yield _mistake(("cases", i, *line["loc"]), line["msg"], line["input"])
+                    common = line["loc"] and line["loc"][0] in SHARED
+                    if i == 0 or not common:  # what is wrong with the body is wrong in every case
+                        place = line["loc"] if common else ("cases", i, *line["loc"])
+                        yield _mistake(place, line["msg"], line["input"])
             if self.observed and not self.seen(case):
                 yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
         for i, item in enumerate(self.observed):

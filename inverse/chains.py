@@ -58,6 +58,30 @@ Map = Callable[[FloatArray], FloatArray]
 # --- chains ----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Lengths:
+    """How many chains there are, draws that are kept of each, steps before these, and steps for a draw."""
+
+    chains: int
+    draws: int
+    burn: int
+    thin: int
+
+    @property
+    def evaluations(self) -> int:
+        """How often ℓ is evaluated."""
+        return self.chains * (1 + self.burn + self.draws * self.thin)
+
+
+FEW = Lengths(4, 1000, 300, 1)
+FIELD = Lengths(2, 500, 200, 1)
+
+
+def walkers(size: int) -> Lengths:
+    """Lengths of an ensemble for so many unknowns: few walkers that go far, else no chain is long enough to judge."""
+    return Lengths(max(8, 2 * size), 800, 400, 5)
+
+
 @dataclass(frozen=True, eq=False)
 class Chains:
     """Draws of k quantities.
@@ -141,10 +165,10 @@ def crank_nicolson(
     *,
     keep: Map = lambda x: x,
     names: tuple[str, ...] | None = None,
-    chains: int = 4,
-    draws: int = 1000,
-    burn: int = 300,
-    thin: int = 1,
+    chains: int = FEW.chains,
+    draws: int = FEW.draws,
+    burn: int = FEW.burn,
+    thin: int = FEW.thin,
     seed: int = 0,
 ) -> Chains:
     """Run chains side by side: in every step, one evaluation of as many points as there are chains.
@@ -205,7 +229,7 @@ def crank_nicolson(
             levels.append(here)
     values = np.swapaxes(np.array(kept), 0, 1)
     labels = tuple(map(str, range(values.shape[2]))) if names is None else names
-    solves = chains * (1 + burn + draws * thin)
+    solves = Lengths(chains, draws, burn, thin).evaluations
     return Chains(labels, values, np.array(levels).T, accepted / (draws * thin), beta, solves)
 
 
@@ -213,10 +237,10 @@ def chains_of_few(
     posterior: Posterior,
     around: Laplace | Evidence,
     *,
-    chains: int = 4,
-    draws: int = 1000,
-    burn: int = 300,
-    thin: int = 1,
+    chains: int = FEW.chains,
+    draws: int = FEW.draws,
+    burn: int = FEW.burn,
+    thin: int = FEW.thin,
     seed: int = 0,
 ) -> Chains:
     """Run chains for few parameters, kept in physical units.
@@ -261,10 +285,10 @@ def chains_of_field(
     *,
     keep: Map | None = None,
     names: tuple[str, ...] | None = None,
-    chains: int = 2,
-    draws: int = 500,
-    burn: int = 200,
-    thin: int = 1,
+    chains: int = FIELD.chains,
+    draws: int = FIELD.draws,
+    burn: int = FIELD.burn,
+    thin: int = FIELD.thin,
     seed: int = 0,
 ) -> Chains:
     """Run chains for a field; kept are its values (N,), or quantities (n, k) of values (n, N)."""
@@ -282,17 +306,17 @@ def chains_of_field(
     )
 
 
-def ensemble(
-    posterior: Posterior,
-    gaussian: Laplace,
-    *,
-    walkers: int = 32,
-    draws: int = 200,
-    burn: int = 100,
-    thin: int = 5,
-    seed: int = 0,
-) -> Chains:
+def ensemble(posterior: Posterior, gaussian: Laplace, lengths: Lengths | None = None, *, seed: int = 0) -> Chains:
     """Run emcee's ensemble for few parameters, kept in physical units; its walkers are the chains.
+
+    Parameters
+    ----------
+    posterior, gaussian
+        What is sampled, and where the walkers start.
+    lengths
+        By default those of `walkers`.
+    seed
+        Of all draws.
 
     Raises
     ------
@@ -305,18 +329,18 @@ def ensemble(
         message = "an ensemble needs emcee, which is not installed: pip install emcee"
         raise ImportError(message) from None
     c = len(gaussian.mode)
-    sampler = emcee.EnsembleSampler(walkers, c, lambda x: posterior.at(x).log_posterior, vectorize=True)
-    z = np.random.default_rng(seed).standard_normal((walkers, c))
+    long = walkers(c) if lengths is None else lengths
+    count = long.chains
+    sampler = emcee.EnsembleSampler(count, c, lambda x: posterior.at(x).log_posterior, vectorize=True)
+    z = np.random.default_rng(seed).standard_normal((count, c))
     generator = np.random.RandomState(seed)
     state = emcee.State(gaussian.mode + z @ gaussian.root.T, random_state=generator.get_state())
-    state = sampler.run_mcmc(state, burn, store=False)
-    sampler.run_mcmc(state, draws, thin_by=thin)
+    state = sampler.run_mcmc(state, long.burn, store=False)
+    sampler.run_mcmc(state, long.draws, thin_by=long.thin)
     x = np.swapaxes(sampler.get_chain(), 0, 1)
-    values = posterior.physical(x.reshape(-1, c)).reshape(walkers, draws, c)
-    solves = walkers * (1 + burn + draws * thin)
-    return Chains(
-        posterior.names, values, sampler.get_log_prob().T, np.asarray(sampler.acceptance_fraction), np.nan, solves
-    )
+    values = posterior.physical(x.reshape(-1, c)).reshape(count, long.draws, c)
+    accepted = np.asarray(sampler.acceptance_fraction)
+    return Chains(posterior.names, values, sampler.get_log_prob().T, accepted, np.nan, long.evaluations)
 
 
 def bent(mode: Point, found: LowRankPosterior) -> Place:
@@ -495,6 +519,8 @@ def verdict_on_field(
     objection = _objection(mode.converged, test)
     if objection is not None:
         return objection
+    if found is None and chains is not None:
+        return _by_chains("no weighted samples", chains)
     if found is None:
         why = f"the residuals agree with it (probability {test.probability:.2g}); it was not checked by other solves"
         return Verdict("laplace", why)

@@ -24,7 +24,21 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, FunctionModel, FunctionSolution, Reference, SolveError
 from forward.settings import Settings
-from inverse.chains import chains_of_few, chains_of_field, ensemble, verdict_on_few, verdict_on_field, weigh_field
+from inverse.chains import (
+    FEW,
+    FEWEST,
+    FIELD,
+    Chains,
+    FieldWeights,
+    Verdict,
+    chains_of_few,
+    chains_of_field,
+    ensemble,
+    verdict_on_few,
+    verdict_on_field,
+    walkers,
+    weigh_field,
+)
 from inverse.comparison import quantiles
 from inverse.evidence import LEAST, Evidence, evidence
 from inverse.field_posterior import FieldPosterior
@@ -68,7 +82,9 @@ class Invert(Settings):
     noise
         Prior of the factor on all standard deviations of the errors; without it they are what they are said to be.
     chains
-        Run Markov chains too: "pcn", of proposals that Laplace's Gaussian makes, or, for few parameters, "emcee".
+        Run Markov chains too: "pcn", of proposals that a Gaussian of the posterior makes (5 204 solves; of a field
+        2 804), or, for few parameters, "emcee" (35 208 solves, or more). Where they have mixed, moments and draws of
+        few parameters are theirs; of a field, where Laplace's are not to be trusted.
     starts
         Starts of the search for the mode of few parameters.
     cutoff, rank
@@ -99,6 +115,14 @@ class Invert(Settings):
     def solves(self, *, field: bool) -> int:
         """Number of solves of a data set that correct the Gaussian."""
         return (0 if field else 256) if self.samples is None else self.samples
+
+    def chain_solves(self, size: int, *, field: bool) -> int:
+        """Number of solves of the chains of a data set with so many unknown parameters."""
+        if self.chains is None:
+            return 0
+        if field:
+            return 2 * FIELD.evaluations  # the map of fields takes two
+        return (FEW if self.chains == "pcn" else walkers(size)).evaluations
 
 
 class SyntheticNoise(Settings):
@@ -261,6 +285,9 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "laplace_log_evidence": (),
     "effective": (),
     "tail": (),
+    "chains": (),
+    "chain_rhat": (),
+    "chain_effective": (),
     "converged": (),
     "trust": (),
     "why": ("letter",),
@@ -283,6 +310,7 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "measured": ("datum",),
     "sigma": ("datum",),
     "predicted": ("datum",),
+    "predicted_std": ("datum",),
     "residual": ("datum",),
     "resolution": ("datum",),
     "stiffness_mode": ("node",),
@@ -362,8 +390,10 @@ class Inversions(FunctionModel):
 # --- what both have --------------------------------------------------------------------------------------------------
 
 
-def _of_data(data: Components, predicted: FloatArray, residual: FloatArray, spectrum: Spectrum, cases: int) -> Record:
-    """Data, residuals and resolution, and what each load case has of them."""
+def _of_data(
+    data: Components, predicted: FloatArray, residual: FloatArray, scale: FloatArray, spectrum: Spectrum, cases: int
+) -> Record:
+    """Data, residuals over the errors `scale`, and resolution, and what each load case has of them."""
     values = spectrum.values
     resolution = (spectrum.images**2 / (1 + values[:, None])).sum(axis=0)
     per_case = [data.cases == k for k in range(cases)]
@@ -375,6 +405,7 @@ def _of_data(data: Components, predicted: FloatArray, residual: FloatArray, spec
         "measured": data.values,
         "sigma": data.sigma,
         "predicted": predicted,
+        "predicted_std": scale * np.sqrt(resolution),  # S is the covariance of what the model predicts, over the errors
         "residual": residual,
         "resolution": resolution,
         "misfit": np.array([(residual[rows] ** 2).sum() for rows in per_case]),
@@ -401,6 +432,31 @@ def _of_test(test: ResidualTest) -> Record:
         "residual_probability": np.array(test.probability),
         "agreement_probability": np.array(test.agreement_probability),
     }
+
+
+def _of_chains(chains: Chains | None) -> Record:
+    """What chains are worth, and how many have mixed: none where there are none."""
+    if chains is None:
+        return {"chains": np.array(0.0), "chain_rhat": np.array(np.nan), "chain_effective": np.array(np.nan)}
+    return {
+        "chains": np.array(float(len(chains.draws) if chains.mixed else 0)),
+        "chain_rhat": np.array(chains.rhat.max()),
+        "chain_effective": np.array(min(chains.effective.min(), chains.effective_tail.min())),
+    }
+
+
+def _thinned(chains: Chains, count: int) -> FloatArray:
+    """At most `count` draws (n, k), chain after chain and as many of each."""
+    each = max(count // len(chains.draws), 1)
+    steps = np.linspace(0, chains.draws.shape[1] - 1, each).round().astype(int)
+    return chains.draws[:, steps].reshape(-1, chains.draws.shape[2])[:count]
+
+
+def _resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
+    """Points (n,) of equal weight: each as often as its weight says, by systematic resampling, in any order."""
+    places = (np.arange(count) + np.random.default_rng(seed).uniform()) / count
+    chosen = np.searchsorted(np.cumsum(weights), places).clip(max=len(weights) - 1)
+    return np.random.default_rng(seed + 1).permutation(chosen)
 
 
 def _letters(text: str) -> FloatArray:
@@ -477,18 +533,25 @@ def _invert(
     scale = data.sigma * (best[-1] if method.noise is not None else 1.0)
     residual = (at.outputs[0] - data.values) / scale
     test = examine(residual, spectrum, np.ones_like(residual), _pairs(data))
-    chains = None
-    if method.chains is not None:
-        run = chains_of_few if method.chains == "pcn" else ensemble
-        chains = run(posterior, gaussian, seed=method.seed)
+    chains = _chains(posterior, gaussian, found, method)
     verdict = verdict_on_few(gaussian, found, test, chains)
     cases = int(data.cases.max()) + 1
+    if chains is not None and chains.mixed:
+        points = chains.flat
+        weights = np.full(len(points), 1 / len(points))
+        draws = _thinned(chains, method.draws)
+        outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs
+    else:
+        weights, points = found.weights, posterior.physical(found.density.x)
+        chosen = _resampled(weights, method.draws, method.seed)
+        draws, outputs = points[chosen], found.density.outputs[chosen]
     return {
-        **_of_data(data, at.outputs[0], residual, spectrum, cases),
+        **_of_data(data, at.outputs[0], residual, scale, spectrum, cases),
         **_of_test(test),
-        **_moments(posterior, gaussian, found, look),
+        **_moments(posterior, gaussian, weights, points, look),
         **_alone(posterior, gaussian, spectrum, data),
-        **_draws(posterior, found, data, method),
+        **_draws(draws, outputs, data, method),
+        **_of_chains(chains),
         "mode": best,
         "log_evidence": np.array(found.log_evidence),
         "log_evidence_error": np.array(found.error),
@@ -506,11 +569,20 @@ def _invert(
     }
 
 
-def _moments(posterior: Posterior, gaussian: Laplace, found: Evidence, look: Look) -> Record:
+def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert) -> Chains | None:
+    if method.chains is None:
+        return None
+    if method.chains == "emcee":
+        return ensemble(posterior, gaussian, seed=method.seed)
+    # Fewer points than that say little of a covariance.
+    enough = found.effective >= max(FEWEST, 4 * len(gaussian.mode))
+    return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
+
+
+def _moments(posterior: Posterior, gaussian: Laplace, weights: FloatArray, points: FloatArray, look: Look) -> Record:
     """Moments and quantiles of the parameters and of the stiffness, by weighted points; widths of the Gaussian."""
-    w = found.weights
-    used = w > 0
-    w, points = w[used], posterior.physical(found.density.x[used])
+    used = weights > 0
+    w, points = weights[used], points[used]
     mean = w @ points
     gaps = points - mean
     ends = np.array([quantiles(column, w, ENDS) for column in points.T])
@@ -552,14 +624,10 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Co
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
 
 
-def _draws(posterior: Posterior, found: Evidence, data: Components, method: Invert) -> Record:
-    """Draws of equal weight: each point as often as its weight says, by systematic resampling."""
-    places = (np.arange(method.draws) + np.random.default_rng(method.seed).uniform()) / method.draws
-    chosen = np.searchsorted(np.cumsum(found.weights), places).clip(max=len(found.weights) - 1)
-    chosen = np.random.default_rng(method.seed + 1).permutation(chosen)
-    draws = posterior.physical(found.density.x[chosen])
+def _draws(draws: FloatArray, outputs: FloatArray, data: Components, method: Invert) -> Record:
+    """Draws of equal weight with what the data say of each."""
     scale = data.sigma * (draws[:, -1:] if method.noise is not None else 1.0)
-    gaps = (found.density.outputs[chosen] - data.values) / scale
+    gaps = (outputs - data.values) / scale
     return {"draw": draws, "draw_log_likelihood": -(gaps**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2}
 
 
@@ -604,20 +672,29 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
     test = examine(found.residual, spectrum, np.ones_like(found.residual), _pairs(data))
     samples = method.solves(field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
-    chains = None
+    g = vertices.volumes / vertices.volumes.sum()
+    chains = whole = None
     if method.chains is not None:
-        g = vertices.volumes / vertices.volumes.sum()
-        chains = chains_of_field(mode.point, found, keep=lambda m: m @ g[:, None], seed=method.seed)
+        # Chains are judged by the mean over the body: that all vertices have mixed would ask for far more draws.
+        whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
+        chains = replace(whole, names=("mean",), draws=whole.draws[:, :, :1])
     verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains)
-    noise = np.random.default_rng(method.seed).standard_normal((-(-method.draws // 10), len(found.mean)))
+    error = np.nan
+    if log_evidence is None and weighed is not None and weighed.trusted and weighed.effective >= FEWEST:
+        log_evidence, error = weighed.log_evidence, weighed.error
+    scale = data.sigma * factor
     cases = int(data.cases.max()) + 1
+    inferred_noise = (factor, log_std) if method.noise is not None else None
+    values, weights = _corrected(verdict, weighed, chains, whole)
     return {
-        **_of_data(data, np.asarray(mode.point.solution.outputs), found.residual, spectrum, cases),
+        **_of_data(data, np.asarray(mode.point.solution.outputs), found.residual, scale, spectrum, cases),
         **_of_test(test),
-        **_of_mean(found, vertices, (factor, log_std) if method.noise is not None else None),
+        **_of_mean(found, vertices, inferred_noise, values, weights),
+        **_of_stiffness(found, vertices, method, values, weights),
         **_directions(found),
+        **_of_chains(chains),
         "log_evidence": np.array(found.log_evidence if log_evidence is None else log_evidence),
-        "log_evidence_error": np.array(np.nan),
+        "log_evidence_error": np.array(error),
         "laplace_log_evidence": np.array(found.log_evidence),
         "effective": np.array(np.nan if weighed is None else weighed.effective),
         "tail": np.array(np.nan if weighed is None else weighed.tail),
@@ -628,12 +705,41 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
         "products": np.array(mode.products + spectrum.products),
         "step": _steps(mode),
         "stiffness_mode": vertices.offset + found.mean,
-        "stiffness_mean": vertices.offset + found.mean,
-        "stiffness_std": found.std,
-        "stiffness_draw": vertices.offset + found.samples(noise),
         "alone_stiffness_std": np.array([_alone_std(found, data.cases == k) for k in range(cases)]),
         "neglected": np.array(spectrum.neglected),
         "information": np.array(found.information),
+    }
+
+
+def _corrected(
+    verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, whole: Chains | None
+) -> tuple[FloatArray | None, FloatArray]:
+    """Values (n, N) of the field with weights (n,) that correct the Gaussian where it is not to be trusted."""
+    if verdict.trust != "corrected":
+        return None, np.zeros(0)
+    if chains is not None and whole is not None and chains.mixed:
+        values = whole.flat[:, 1:]
+        return values, np.full(len(values), 1 / len(values))
+    assert weighed is not None
+    return weighed.values, weighed.weights
+
+
+def _of_stiffness(
+    found: LowRankPosterior, vertices: Vertices, method: Invert, values: FloatArray | None, weights: FloatArray
+) -> Record:
+    """Mean, standard deviation and draws of ln stiffness."""
+    count = -(-method.draws // 10)
+    if values is None:
+        noise = np.random.default_rng(method.seed).standard_normal((count, len(found.mean)))
+        mean, std, draws = found.mean, found.std, found.samples(noise)
+    else:
+        mean = weights @ values
+        std = np.sqrt(weights @ (values - mean) ** 2)
+        draws = values[_resampled(weights, count, method.seed)]
+    return {
+        "stiffness_mean": vertices.offset + mean,
+        "stiffness_std": std,
+        "stiffness_draw": vertices.offset + draws,
     }
 
 
@@ -643,19 +749,32 @@ def _steps(mode: Mode) -> FloatArray:
     )
 
 
-def _of_mean(found: LowRankPosterior, vertices: Vertices, noise: tuple[float, float] | None) -> Record:
+def _of_mean(
+    found: LowRankPosterior,
+    vertices: Vertices,
+    noise: tuple[float, float] | None,
+    values: FloatArray | None,
+    weights: FloatArray,
+) -> Record:
     """Posterior of the mean of the logarithm over the body, and of the noise."""
     g = vertices.volumes / vertices.volumes.sum()
-    mean, std = found.marginal(g)
-    centres, widths = [mean + float(g @ vertices.offset)], [std]
+    offset = float(g @ vertices.offset)
+    at, std = found.marginal(g)
+    mode, mean = np.array([at + offset]), np.array([at + offset])
+    lower, upper = mode - 1.96 * std, mode + 1.96 * std
+    if values is not None:
+        means = values @ g + offset
+        mean = np.array([weights @ means])
+        std = float(np.sqrt(weights @ (means - mean) ** 2))
+        lower, upper = quantiles(means, weights, ENDS)[:, None]
+    widths = np.array([std])
     if noise is not None:
-        centres, widths = [*centres, noise[0]], [*widths, noise[0] * noise[1]]
-    mode, std_all = np.array(centres), np.array(widths)
-    lower, upper = mode - 1.96 * std_all, mode + 1.96 * std_all
-    if noise is not None:
-        lower[1], upper[1] = noise[0] * np.exp(-1.96 * noise[1]), noise[0] * np.exp(1.96 * noise[1])
-    covariance = np.diag(std_all**2)
-    return {"mode": mode, "mean": mode, "std": std_all, "lower": lower, "upper": upper, "covariance": covariance}
+        factor, log_std = noise
+        mode, mean, widths = np.append(mode, factor), np.append(mean, factor), np.append(widths, factor * log_std)
+        lower = np.append(lower, factor * np.exp(-1.96 * log_std))
+        upper = np.append(upper, factor * np.exp(1.96 * log_std))
+    covariance = np.diag(widths**2)
+    return {"mode": mode, "mean": mean, "std": widths, "lower": lower, "upper": upper, "covariance": covariance}
 
 
 def _directions(found: LowRankPosterior) -> Record:

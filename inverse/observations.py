@@ -177,6 +177,8 @@ class Components:
 def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     """Return the files that are meant by names, folders (all data files in them) and patterns such as ``*.csv``.
 
+    What is not there is among them too, so that others of a batch go on: it cannot be read.
+
     Parameters
     ----------
     patterns
@@ -187,9 +189,9 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     Raises
     ------
     DataError
-        If one of them means nothing.
+        If none of them means anything.
     """
-    found: dict[Path, None] = {}
+    found: dict[Path, bool] = {}
     missing = []
     for pattern in patterns:
         for folder in folders:
@@ -201,11 +203,12 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
             else:
                 here = sorted(folder.glob(pattern)) if any(sign in pattern for sign in "*?[") else []
             if here:
-                found |= dict.fromkeys(here)
+                found |= dict.fromkeys(here, True)
                 break
         else:
             missing.append(f"{pattern}: no such file, expected a file, a folder of data files or a pattern")
-    if missing:
+            found |= {folders[0] / pattern: False}
+    if not any(found.values()):
         raise DataError(*missing)
     return list(found)
 
@@ -235,6 +238,70 @@ def read(path: Path, cases: Sequence[str], unit: float = 1.0) -> Observations:
     if mistakes:
         raise DataError(*mistakes)
     return found
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of comma-separated values.
+
+    Attributes
+    ----------
+    remarks
+        Its lines that begin with #, without that.
+    columns
+        Their names.
+    rows
+        What stands in each column, row by row.
+    lines
+        Numbers of the lines of the rows.
+    """
+
+    remarks: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: list[dict[str, str]]
+    lines: list[int]
+
+
+def read_table(path: Path) -> Table:
+    """Read a table; its first line that is no remark names the columns, and rows without a word in them do not count.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is empty, or a row has other cells than there are columns.
+    """
+    name = path.name
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()  # programs of offices write a mark at the beginning
+    except UnicodeDecodeError:
+        raise DataError(f"{name}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read: {error.strerror}") from None
+    remarks = tuple(line.lstrip("# ") for line in lines if line.startswith("#"))
+    numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
+    reader = csv.reader((line for _, line in numbered), skipinitialspace=True)
+    try:
+        cells = [(numbered[reader.line_num - 1][0], [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise DataError(f"{name}: line {numbered[reader.line_num - 1][0]}: {error}, expected commas") from None
+    cells = [(n, row) for n, row in cells if any(row)]
+    if not cells:
+        raise DataError(f"{name}: empty, expected a line with the names of columns, and rows")
+    (first, head), *rest = cells
+    other = next((sign for sign in (";", "\t") if len(head) == 1 and sign in head[0]), None)
+    if other is not None:
+        raise DataError(f"{name}: line {first}: columns with {other!r} between them, expected commas")
+    twice = next((column for column in head if head.count(column) > 1), None)
+    if twice is not None:
+        raise DataError(f"{name}: line {first}: several columns '{twice}', expected different names")
+    if not rest:
+        raise DataError(f"{name}: no rows, expected some below the names of the columns")
+    odd = [(n, len(row)) for n, row in rest if len(row) != len(head)]
+    if odd:
+        n, count = odd[0]
+        more = _others(len(odd) - 1)
+        raise DataError(f"{name}: line {n}: {count} cells, expected {len(head)}, one for each column{more}")
+    return Table(remarks, tuple(head), [dict(zip(head, row, strict=True)) for _, row in rest], [n for n, _ in rest])
 
 
 def _mistakes(found: Observations, name: str) -> list[str]:
@@ -267,17 +334,8 @@ def _mistakes(found: Observations, name: str) -> list[str]:
 
 def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
     name = path.name
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{name}: not a text file in UTF-8") from None
-    except OSError as error:
-        raise DataError(f"{name}: cannot be read: {error.strerror}") from None
-    remarks = [line.lstrip("# ") for line in lines if line.startswith("#")]
-    numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
-    table = csv.DictReader((line for _, line in numbered), skipinitialspace=True)
-    columns = tuple(column.strip() for column in table.fieldnames or ())
-    table.fieldnames = columns
+    found = read_table(path)
+    columns = found.columns
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
     ]
@@ -288,10 +346,8 @@ def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         wrong.append(f"{name}: no column 'case', expected one where there are several load cases: {', '.join(cases)}")
     if wrong:
         raise DataError(*wrong)
-    rows = list(table)
-    labels = tuple(f"{name}: line {n}" for n, _ in numbered[1:])
-    if not rows:
-        raise DataError(f"{name}: no rows, expected displacements at points")
+    rows = found.rows
+    labels = tuple(f"{name}: line {n}" for n in found.lines)
     numbers: dict[str, FloatArray] = {}
     mistakes = []
     for column in (*POSITION, *MOTION, "sigma", *ERRORS):
@@ -304,7 +360,7 @@ def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
             given = rows[bad[0]][column]
             mistakes.append(f"{labels[bad[0]]}: {column} is {given!r}, expected a number{_others(len(bad) - 1)}")
         numbers[column] = unit * np.array([math.nan if v is None else v for v in values])
-    given_cases = [(row.get("case") or "").strip() if "case" in columns else cases[0] for row in rows]
+    given_cases = [row["case"] if "case" in columns else cases[0] for row in rows]
     strange = [i for i, case in enumerate(given_cases) if case not in cases]
     if strange:
         word = given_cases[strange[0]]
@@ -321,8 +377,8 @@ def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         cases,
         np.array([cases.index(case) for case in given_cases]),
         labels,
-        tuple(line for line in remarks if not line.startswith(TRUTH)),
-        dict(_assignment(line) for line in remarks if line.startswith(TRUTH)),
+        tuple(line for line in found.remarks if not line.startswith(TRUTH)),
+        dict(_assignment(line) for line in found.remarks if line.startswith(TRUTH)),
     )
 
 
@@ -337,11 +393,13 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         raise DataError(message) from None
     if not path.exists():
         raise DataError(f"{path.name}: cannot be read: No such file or directory")
+    said = io.StringIO()  # what meshio prints, and what it prints before it leaves
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # where meshio prints what it warns of
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             mesh = meshio.read(path)
     except (Exception, SystemExit) as error:
-        raise DataError(f"{path.name}: cannot be read as {path.suffix}: {error}") from None
+        reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
+        raise DataError(f"{path.name}: cannot be read as {path.suffix}: {' '.join(reason.split())}") from None
     fields = {case: f"displacement_{case}" for case in cases}
     if len(cases) == 1 and fields[cases[0]] not in mesh.point_data:
         fields[cases[0]] = "displacement"
@@ -373,9 +431,8 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
     )
 
 
-def _number(text: str | None) -> float | None:
+def _number(text: str) -> float | None:
     """A number, NaN for an empty cell, nothing where it is neither."""
-    text = (text or "").strip()
     try:
         return float(text) if text else math.nan
     except ValueError:

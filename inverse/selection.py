@@ -101,7 +101,7 @@ class Select(Settings):
     samples: Annotated[int, Field(ge=LEAST)] = 256
     noise: Noise
     other_noises: dict[str, Noise] = Field(default={})
-    subsets: dict[str, tuple[str, ...]] = Field(default={})
+    subsets: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
     held_out: bool = False
     seed: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 4

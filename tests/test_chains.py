@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from forward.model import FunctionModel, SolveError
-from inverse.chains import bent, chains_of_few, chains_of_field, ensemble, verdict_on_few, verdict_on_field, weigh_field
+from inverse.chains import (
+    Lengths,
+    bent,
+    chains_of_few,
+    chains_of_field,
+    ensemble,
+    verdict_on_few,
+    verdict_on_field,
+    weigh_field,
+)
 from inverse.evidence import evidence
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import laplace
@@ -46,7 +55,7 @@ def quick(posterior):
 def test_linear_models(run):
     posterior = quick(few())
     gaussian = laplace(posterior)
-    settings = {"draws": 150, "thin": 8} if run is ensemble else {"draws": 500}
+    settings = {"lengths": Lengths(32, 150, 100, 8)} if run is ensemble else {"draws": 500}
     found = run(posterior, gaussian, seed=2, **settings)
     assert found.names == ("a", "b", "c")
     assert (found.rhat < 1.06).all()
@@ -68,7 +77,7 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
     points = evidence(posterior, gaussian, 512)
     expected = summary(posterior.physical(points.density.x), points.weights)
     if run is ensemble:
-        found = ensemble(posterior, gaussian, draws=200, thin=8)
+        found = ensemble(posterior, gaussian, Lengths(32, 200, 100, 8))
     else:
         found = chains_of_few(posterior, points, chains=8, draws=600, thin=2)
         assert found.mixed

@@ -8,14 +8,15 @@ import pytest
 
 from forward.model import FunctionModel, SolveError
 from tests.launch import run_script
-from uq import chaos
+from uq import chaos, regression
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import Chaos, OutsideRangeWarning, load
+from uq.chaos import Chaos
 from uq.checkpoint import Checkpoint
 from uq.checkpoint import load as load_block
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.ensemble import Ensemble
 from uq.evaluate import Request, SerialEvaluate
+from uq.expansion import OutsideRangeWarning, load
 from uq.inputs import Inputs
 from uq.linearisation import linearise
 
@@ -161,7 +162,7 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     def function(p):
         return np.exp(p[0]) / (0.3 + p[1])
 
-    monkeypatch.setattr(chaos, "TRUNCATIONS", (1.0,))
+    monkeypatch.setattr(regression, "TRUNCATIONS", (1.0,))
     monkeypatch.setattr(chaos, "DICTIONARY", 0)  # nothing to select from
     data = run(Chaos(samples=20, max_order=3, gradients=gradients), inputs, function, by_complex_step(function))
     basis = load(data).basis

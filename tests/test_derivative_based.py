@@ -9,12 +9,12 @@ from scipy.optimize import brentq
 from scipy.special import j0, y0
 
 from forward.model import FunctionModel, SolveError
-from uq.chaos import Regression
 from uq.derivative_based import DerivativeBased, poincare
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.evaluate import SerialEvaluate
 from uq.inputs import Inputs
 from uq.monte_carlo import FIRST_ROUND
+from uq.regression import Regression
 
 STUDENT = 2.04  # of a 95 % interval with 31 degrees of freedom
 ISHIGAMI = Inputs({name: Uniform(lower=-np.pi, upper=np.pi) for name in "abc"})

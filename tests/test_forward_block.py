@@ -6,7 +6,7 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 from forward import fenicsx
-from forward.finite_element import Discretisation
+from forward.discretisation import Discretisation
 from forward.functionals import functional
 from forward.geometry import Block, Box
 from forward.hyperelastic import Hyperelastic

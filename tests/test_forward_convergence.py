@@ -11,7 +11,7 @@ import ufl
 from mpi4py import MPI
 
 from forward import fenicsx, kinematics, materials
-from forward.finite_element import Discretisation
+from forward.discretisation import Discretisation
 from forward.hyperelastic import Hyperelastic
 from forward.newton import solve
 

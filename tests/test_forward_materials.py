@@ -11,7 +11,7 @@ from mpi4py import MPI
 from mpmath import mp
 
 from forward import fenicsx, kinematics
-from forward.finite_element import _OPS
+from forward.discretisation import _OPS
 from forward.hyperelastic import Hyperelastic
 from forward.materials import MATERIALS, constants, measured, measures, small_strain_moduli, splits, units
 from forward.model import SolveError

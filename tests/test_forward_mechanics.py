@@ -8,7 +8,7 @@ import ufl
 from mpi4py import MPI
 
 from forward import fenicsx, kinematics, materials
-from forward.finite_element import Discretisation
+from forward.discretisation import Discretisation
 from forward.functionals import functional
 from forward.hyperelastic import Hyperelastic
 from forward.layout import Layout

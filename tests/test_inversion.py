@@ -29,6 +29,7 @@ from uq.evaluate import Request, SerialEvaluate
 from uq.inputs import Inputs
 from workflows import study as study_runs
 from workflows.config import StudyError, document, load, parse, schema
+from workflows.inversion import _volumes, groups
 from workflows.plan import plan
 from workflows.starter import starter
 from workflows.study import run as run_study
@@ -67,19 +68,22 @@ def linear():
     return FunctionModel(lambda p: MATRIX @ p, ("a", "b", "c"), tuple(map(str, range(12))), lambda p: MATRIX)
 
 
+def exactly(rows):
+    """Mean and covariance of the posterior by some of the data."""
+    A = MATRIX[rows] / 0.1
+    mean, std = np.array([(p.mean, p.std) for p in PRIORS.values()]).T
+    precision = A.T @ A + np.diag(std**-2.0)
+    right = A.T @ DATA.values[rows] / 0.1 + mean / std**2
+    return np.linalg.solve(precision, right), np.linalg.inv(precision)
+
+
 def test_linear_models_have_the_exact_posterior():
     method = Invert(samples=64, starts=2)
     record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
     prior_std = np.array([p.std for p in PRIORS.values()])
     mean = np.array([p.mean for p in PRIORS.values()])
 
-    def posterior(rows):
-        A = MATRIX[rows] / 0.1
-        precision = A.T @ A + np.diag(prior_std**-2.0)
-        right = A.T @ DATA.values[rows] / 0.1 + mean / prior_std**2
-        return np.linalg.solve(precision, right), np.linalg.inv(precision)
-
-    exact, covariance = posterior(np.arange(12))
+    exact, covariance = exactly(np.arange(12))
     np.testing.assert_allclose(record["mode"], exact, rtol=1e-8)
     np.testing.assert_allclose(record["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
     np.testing.assert_allclose(record["std"], np.sqrt(np.diag(covariance)), rtol=0.3)
@@ -90,7 +94,7 @@ def test_linear_models_have_the_exact_posterior():
     assert record["log_evidence"] == pytest.approx(log_evidence, abs=1e-8)
     for k in range(2):
         rows = np.flatnonzero(DATA.cases == k)
-        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(posterior(rows)[1])), rtol=1e-8)
+        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(exactly(rows)[1])), rtol=1e-8)
         A = MATRIX[rows] * prior_std / 0.1
         np.testing.assert_allclose(record["alone_eigenvalue"][k], np.linalg.eigvalsh(A.T @ A)[::-1], rtol=1e-8)
         assert record["misfit"][k] == pytest.approx((record["residual"][rows] ** 2).sum())
@@ -106,6 +110,30 @@ def test_the_noise_can_be_unknown():
     assert record["lower"][3] < 1 < record["upper"][3]
     assert np.isnan(record["alone_std"][:, 3]).all()
     np.testing.assert_array_equal(record["direction_parameter"][:, 3], 0)
+
+
+@pytest.mark.parametrize("kind", ["pcn", pytest.param("emcee", marks=pytest.mark.slow)])
+def test_what_is_left_is_of_chains_that_have_mixed(kind):
+    """Moments, intervals and draws: those of the exact posterior, closer than so few weighted points come."""
+    method = Invert(samples=32, starts=1, chains=kind)
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    exact, covariance = exactly(np.arange(12))
+    std = np.sqrt(np.diag(covariance))
+    assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
+    assert record["chain_rhat"] < 1.01
+    assert record["chain_effective"] > 400
+    np.testing.assert_allclose(record["mean"], exact, atol=0.15 * std.min())
+    np.testing.assert_allclose(record["std"], std, rtol=0.1)
+    np.testing.assert_allclose((record["upper"] - record["lower"]) / std, 2 * 1.96, rtol=0.1)
+    assert len(np.unique(record["draw"], axis=0)) > 200  # of 32 points there would be no more
+    r = (record["draw"][0] @ MATRIX.T - DATA.values) / 0.1
+    np.testing.assert_allclose(record["draw_log_likelihood"][0], -(r**2) / 2 - np.log(0.1 * np.sqrt(2 * np.pi)))
+
+
+def test_what_is_predicted_is_as_sure_as_the_parameters():
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, Invert(samples=32, starts=1), lambda points: points[:, :1])
+    _, covariance = exactly(np.arange(12))
+    np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
 
 
 def test_inversions_are_evaluations():
@@ -284,6 +312,48 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
 
 
+def test_volumes_of_inclusions(folder):
+    """Those of the draws; nothing where no radius is unknown, or nothing was found."""
+    radius = "parameters.inclusions.lump.radius={kind = 'uniform', lower = 0.2, upper = 0.4}"
+    study = load(folder / "few.toml", [radius])
+    draws = np.full((3, 50, 3), [2.0, 9e3, 0.3])
+    draws[0, :, 2] = np.linspace(0.25, 0.35, 50)
+    draws[2] = np.nan
+    found = _volumes(study, {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+    ball = 4 / 3 * np.pi * np.linspace(0.25, 0.35, 50) ** 3
+    for name, expected in (
+        ("mean", ball.mean()),
+        ("std", ball.std()),
+        ("mode", ball[0]),
+        ("true", 4 / 3 * np.pi * 0.027),
+    ):
+        np.testing.assert_allclose(found[f"volume_{name}"][1][0], [expected])
+    assert found["volume_std"][1][1] == pytest.approx([0], abs=1e-12)
+    assert np.isnan(found["volume_mean"][1][2])
+    assert found["inclusion"][1] == ["lump"]
+    assert not _volumes(load(folder / "few.toml"), {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+
+
+def test_chains_are_those_of_arviz(folder):
+    """Draws that stand chain after chain become chains, where all data sets have as many."""
+    study = load(folder / "few.toml", ["data.files=['data/made-1.csv']"])
+    draws = np.arange(100.0).reshape(1, 50, 2)
+    found = xr.Dataset(
+        {
+            "draw": (("data_set", "sample", "parameter"), draws),
+            "draw_log_likelihood": (("data_set", "sample", "datum"), draws),
+            "measured": (("data_set", "datum"), np.zeros((1, 2))),
+            "chains": ("data_set", [4.0]),
+            "ok": ("data_set", [True]),
+        },
+        {"data_set": ["made-1"], "parameter": list(study.names)},
+    )
+    kept = groups(study, found)
+    assert kept["log_likelihood"]["displacement"].shape == (4, 12, 2)
+    np.testing.assert_array_equal(kept["posterior"]["material.mu"], 1 + 2 * np.arange(48).reshape(4, 12))
+    assert groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
+
+
 def test_a_field_and_its_report(folder):
     assert here(folder / "field.toml", folder / "field") == 0
     found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
@@ -305,6 +375,9 @@ def test_a_field_and_its_report(folder):
         (FEW, 'files = ["data"]', 'files = ["nothing"]', r"data.files: nothing: no such file"),
         (FEW, 'files = ["data"]', 'files = ["data/wrong.csv"]', r"data: wrong.csv: unknown column 'vx'"),
         (FEW, 'files = ["data"]', 'files = ["data/made-1.csv"]\nunit = 1e3', r"expected a smaller one: is data\.unit"),
+        (FEW, 'files = ["data"]', 'files = "data/made-1.csv"\ntruth = { "material.nu" = 1 }',
+         "data.truth.material.nu: not a number of the model; did you mean 'material.mu'"),
+        (FEW, "draws = 50", 'noise = { kind = "normal", mean = 1, std = 1 }', "method.noise: reaches -.*is positive"),
         (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
         (FEW, "lower = 1,", "lower = -1,", "lower"),
         (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',

@@ -10,10 +10,11 @@ from forward.model import FunctionModel, SolveError, Work
 from tests.launch import run_script
 from uq import chaos
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import StateExpansion, load
 from uq.checkpoint import Checkpoint
 from uq.distributions import Beta, Uniform
 from uq.evaluate import Request, SerialEvaluate
+from uq.expansion import load
+from uq.field_regression import StateExpansion
 from uq.inputs import Inputs
 from uq.linearisation import linearise
 from uq.multilevel_chaos import MultilevelChaos

@@ -54,6 +54,12 @@ def test_a_table_is_read_component_by_component(table):
         ("0.01, extension", "0.01, shear", "line 6: the point of line 4 again in load case 'shear'"),
         ("0.01, extension", "0.01, shear", "no data in load case 'extension'"),
         ("0.3, 0.4", ", nan", "no data in load case 'extension'"),
+        ("0.4, 0.01, ext", "0.4, 0.01, 1, ext", "line 6: 8 cells, expected 7, one for each column"),
+        ("0.02, shear", "0.02", "line 5: 6 cells, expected 7"),
+        ("ux, uz", "ux, ux", "line 3: several columns 'ux', expected different names"),
+        ("x, y, z, ux, uz, sigma, case", "x;y;z;ux;uz;sigma;case", "line 3: columns with ';' between them"),
+        (TABLE[TABLE.index("0, 0.5") :], "", "no rows"),
+        (TABLE, "# nothing\n", "empty, expected a line with the names of columns"),
         ("extension\n", "extensoin\n", "line 6: unknown load case 'extensoin'; did you mean 'extension'"),
     ],
 )
@@ -62,6 +68,12 @@ def test_one_line_for_a_mistake(table, old, new, told):
         read(table(TABLE.replace(old, new, 1)), CASES)
     assert any(told in line for line in caught.value.args), caught.value.args
     assert all(line.startswith("data.csv: ") and "\n" not in line for line in caught.value.args)
+
+
+def test_marks_of_other_programs_do_not_matter(table):
+    found = read(table("\ufeff" + TABLE.replace("\n", "\r\n") + ",,,,,,\n"), CASES)
+    assert len(found.places) == 3
+    assert found.source == ("speckles of the camera",)
 
 
 def test_points_are_put_on_the_body(table):
@@ -102,6 +114,9 @@ def test_files_folders_and_patterns(tmp_path):
     assert [path.name for path in files(["b.csv", "?.csv"], [tmp_path / "no", tmp_path])] == ["b.csv", "a.csv"]
     with pytest.raises(DataError, match=r"c\.csv: no such file"):
         files(["c.csv"], [tmp_path])
+    assert [path.name for path in files(["c.csv", "b.csv"], [tmp_path])] == ["c.csv", "b.csv"]
+    with pytest.raises(DataError, match=r"c\.csv: cannot be read: No such file"):
+        read(tmp_path / "c.csv", CASES)
 
 
 def test_meshes(tmp_path):
@@ -116,5 +131,5 @@ def test_meshes(tmp_path):
     with pytest.raises(DataError, match="no point data 'displacement_pull'"):
         read(path, ("shear", "pull"))
     path.write_text("nothing")
-    with pytest.raises(DataError, match=r"data.vtu: cannot be read as \.vtu"):
+    with pytest.raises(DataError, match=r"data.vtu: cannot be read as \.vtu: Error: Couldn't read file"):
         read(path, CASES)

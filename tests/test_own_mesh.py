@@ -12,12 +12,14 @@ import pytest
 import pyvista
 import xarray as xr
 from mpi4py import MPI
+from pydantic import ValidationError
 
 from forward.conformance import check_derivatives
 from forward.geometry import Box
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.own_mesh import OwnMesh
+from forward.specimen import Specimen
 from tests.bodies import loaded_body
 from tests.launch import ROOT, run_script
 from workflows.config import StudyError, differences, document, load, parse
@@ -204,6 +206,33 @@ def test_ranks_that_share_the_mesh_agree(file):
     assert done.returncode == 0, done.stderr
     for a, b in zip(answers(MPI.COMM_SELF, file), json.loads(done.stdout.splitlines()[-1]), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
+
+
+def specimen(file, **changes):
+    """The regional model in two load cases that are alike, of which one corner is observed."""
+    acting = {key: getattr(regional(file), key) for key in ("clamp", "displacements", "loads")}
+    blocks = {
+        "body": {"kind": "mesh", "file": str(file), "degree": regional(file).body.degree},
+        "material": regional(file).material.model_dump(),
+        "regions": {"right": REGION},
+        "cases": [{"name": name, **acting} for name in ("first", "second")],
+        "observed": [{"at": [SIZE]}],
+    }
+    return Specimen.model_validate(blocks | changes)
+
+
+@pytest.mark.fem
+def test_specimens_have_regions(file):
+    """What is observed of a specimen follows the numbers of its regions; what is wrong with them is said once."""
+    found = specimen(file).build(MPI.COMM_SELF, NUMBERS)
+    point = np.array([1e4, 2e4, 3e4, 1e5, 1.5])
+    expected = built(regional(file), *NUMBERS).solve(point)
+    solution = found.solve(point)
+    np.testing.assert_allclose(solution.solutions[0].state, expected.state, rtol=1e-9, atol=1e-12)
+    check_derivatives(found, point, 0.1 * point, noise=1e-10).require()
+    with pytest.raises(ValidationError, match="unknown region; did you mean 'right'") as caught:
+        specimen(file, regions={"rigth": {"contrast": 2.0}})
+    assert [error["loc"] for error in caught.value.errors()] == [("regions", "rigth")]
 
 
 @pytest.mark.fem

@@ -249,6 +249,12 @@ def small(tmp_path):
         ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
         ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
         ("weight = 2", "weight = 0", "candidates.mooney-rivlin.weight"),
+        ("samples = 32", "samples = 32\nsubsets = { none = [] }", "method.subsets.none: .* at least 1 item"),
+        (
+            "absolute = 20 }",
+            'absolute = 20, factor = { kind = "uniform", lower = -1, upper = 2 } }',
+            "method.noise.factor: reaches -1, expected a factor on standard deviations",
+        ),
     ],
 )
 def test_one_line_for_a_mistake(small, old, new, told):
@@ -263,9 +269,10 @@ def test_one_line_for_a_mistake(small, old, new, told):
     [
         ("torsion,1.1,2", "line 6: unknown mode 'torsion'"),
         ("uniaxial,1.1,much", "line 6, stress: 'much', expected a number"),
-        ("uniaxial,1.1", "line 6, stress: None, expected a number"),
+        ("uniaxial,1.1", "table.csv: line 6: 2 cells, expected 3"),
+        ("uniaxial,1.1,2,3", "table.csv: line 6: 4 cells, expected 3"),
         ("uniaxial,nan,1", "line 6, stretch: 'nan', expected a number"),
-        ("uniaxial,-1,1", "data.tests.0.: at: stretch -1"),
+        ("uniaxial,-1,1", "line 6, stretch: -1, expected more than 0"),
     ],
 )
 def test_one_line_for_a_bad_row(small, row, told):
@@ -273,6 +280,18 @@ def test_one_line_for_a_bad_row(small, row, told):
     with pytest.raises(StudyError, match=told) as caught:
         load(small)
     assert len(caught.value.args) == 1
+
+
+def test_second_stretches_and_errors_in_a_table(small):
+    """The column of second stretches is of biaxial tests alone; errors of the data are more than nothing."""
+    rows = ["mode,stretch,other,stress,error", "uniaxial,1.1,,0.3,0.1", "biaxial,1.1,1.2,0.4,0.1"]
+    columns = ["data.across='other'", "data.sigma='error'"]
+    (small.parent / "table.csv").write_text("\ufeff" + "\n".join(rows))
+    tests = load(small, columns).data.tests
+    assert [test.across for test in tests] == [None, (1.2,)]
+    (small.parent / "table.csv").write_text("\n".join([*rows, "biaxial,1.2,1.2,0.4,0"]))
+    with pytest.raises(StudyError, match="line 4, error: 0, expected more than 0"):
+        load(small, columns)
 
 
 def test_subsets_are_of_known_tests(small):

@@ -48,7 +48,8 @@ samples = 8
 def command(*arguments):
     """A server as a process of its own, that says on its first line where it listens."""
     process = subprocess.Popen(
-        list(map(str, arguments)),
+        # Where the tests run in the background, children ignore interrupts unless told otherwise.
+        ["env", "--default-signal=INT", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -61,7 +62,7 @@ def command(*arguments):
         yield "http://" + first.split("http://")[1].split(",")[0].strip(), process
     finally:
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)
+            process.terminate()
         process.wait(timeout=20)
         process.stdout.close()
         process.stderr.close()

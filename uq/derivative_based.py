@@ -27,7 +27,6 @@ from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import Regression
 from uq.distributions import Distribution, Gamma, LogNormal, Normal, Uniform
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import bootstrap, bootstrap_error, shares
@@ -35,6 +34,7 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
+from uq.regression import Regression
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 

@@ -23,24 +23,14 @@ from pydantic import Field
 
 from forward.model import WORK, FloatArray
 from uq.basis import hyperbolic, orthonormal
-from uq.chaos import (
-    Data,
-    Expanded,
-    Fit,
-    Probability,
-    Projections,
-    Regression,
-    StateExpansion,
-    expansion_dataset,
-    fit_best,
-    objection,
-    whole,
-)
+from uq.chaos import Expanded, Probability, expansion_dataset, objection
 from uq.evaluate import Evaluate, Evaluations, Prediction, Recorder, Request, Start
+from uq.field_regression import Projections, StateExpansion
 from uq.indices import coefficient_moments
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise
 from uq.moments import Moments, estimate, monomials, ratio
+from uq.regression import Data, Fit, Regression, fit_best, whole
 from uq.sampling import sobol_points
 from uq.stopping import Amount
 

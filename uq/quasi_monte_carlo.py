@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
-from uq.chaos import FULL, ROWS_PER_TERM, Deviations, fit_deviations
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
+from uq.field_regression import Deviations, fit_deviations
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import (
@@ -32,6 +32,7 @@ from uq.moments import (
     ratio,
 )
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
+from uq.regression import FULL, ROWS_PER_TERM
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.taylor import Control, quadratic, tangent
 

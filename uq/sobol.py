@@ -22,7 +22,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import nearest
-from uq.chaos import LARGEST, Chaos, Regression, expansion_dataset
+from uq.chaos import LARGEST, Chaos, expansion_dataset
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import (
     Analysis,
@@ -42,6 +42,7 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, by_node
+from uq.regression import Regression
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 
@@ -362,21 +363,22 @@ def _read(directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
     if not ("multi_index" in source or "values" in source):
         message = f"{directory}: holds neither samples nor an expansion, expected results of chaos or of sampling"
         raise FileNotFoundError(message)
-    for name, ours in (("parameter_mean", inputs.mean), ("parameter_std", inputs.std)):
-        if not np.allclose(source[name], ours, rtol=1e-10, atol=0):
-            message = f"{directory}: holds results of other distributions, expected those of this study"
-            raise FileNotFoundError(message)
-    if _distributions(source.attrs.get("config")) not in (None, _as_written(inputs)):
+    ours, written = _as_written(inputs), _distributions(source.attrs.get("config"))
+    if not (
+        np.allclose(source["parameter_mean"], inputs.mean, rtol=1e-10, atol=0)
+        and np.allclose(source["parameter_std"], inputs.std, rtol=1e-10, atol=0)
+        and all(ours[name] == value for name, value in written.items())  # coefficients of fields are not written
+    ):
         message = f"{directory}: holds results of other distributions, expected those of this study"
         raise FileNotFoundError(message)
     return source
 
 
-def _distributions(config: str | None) -> Any:
+def _distributions(config: str | None) -> dict[str, Any]:
     """Return the distributions of a study that was written down, if it was."""
     import tomllib
 
-    return None if config is None else tomllib.loads(config).get("parameters")
+    return dict(tomllib.loads(config or "").get("parameters", {}))
 
 
 def _as_written(inputs: Inputs) -> dict[str, Any]:

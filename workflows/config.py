@@ -222,6 +222,16 @@ def refused(title: str, mistakes: Sequence[Mistake]) -> None:
         )
 
 
+def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
+    """Find a prior of the factor on standard deviations of errors that reaches what is no standard deviation."""
+    if prior is None:
+        return
+    lowest = prior.support[0] if prior.support is not None else prior.at(NEGLIGIBLE)
+    if lowest < 0:
+        message = f"reaches {lowest:.4g}, expected a factor on standard deviations, which is positive"
+        yield place, message, prior.model_dump()
+
+
 def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
     """Find parameters that are no numbers of a model, or that reach where it is impossible."""
     for path, distribution in parameters.items():

@@ -5,27 +5,29 @@ from __future__ import annotations
 import csv
 import io
 import json
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
-from forward.settings import Settings
+from forward.settings import Settings, nearest
 from forward.specimen import Specimen
-from inverse.inversion import Invert, Synthesize, names_of, sentence, variables
+from inverse.inversion import ENDS, Invert, Synthesize, names_of, sentence, variables
 from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
-from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -65,7 +67,7 @@ class DataFiles(Settings):
     ----------
     files
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
-        directory. Each file is a data set, which is inverted by itself.
+        directory; one alone may be given as a word. Each file is a data set, which is inverted by itself.
     sigma
         Standard deviation (m) of the errors where a file does not say.
     unit
@@ -84,6 +86,11 @@ class DataFiles(Settings):
     tolerance: Annotated[float, Field(ge=0)] = 0.0
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
+
+    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
+    @classmethod
+    def _one_alone(cls, given: Any) -> Any:
+        return (given,) if isinstance(given, str) else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +180,9 @@ class Inversion(Settings):
     def planned(self) -> int:
         """Number of evaluations: data sets, or solves where all groups work on one."""
         if self.together:
-            return self.method.solves(field=False) + 12 * self.method.starts + 2 * len(self.parameters)
+            method = self.method
+            corrections = method.solves(field=False) + method.chain_solves(len(self.names), field=False)
+            return corrections + 12 * method.starts + 2 * len(self.parameters)
         return len(self.data.sets) + 1
 
     @property
@@ -210,7 +219,7 @@ class Inversion(Settings):
             except DataError as error:
                 measurement, wrong = None, "; ".join(error.args)
                 lines += [f"data: {line}" for line in error.args]
-            digest = sha256(path.read_bytes()).hexdigest()[:16]
+            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
             sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
             found.append(measurement)
         if all(measurement is None for measurement in found):
@@ -247,9 +256,18 @@ class Inversion(Settings):
             yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
         if nodal and self.method.chains == "emcee":
             yield ("method", "chains"), "expected 'pcn', the chains for fields", "emcee"
+        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
+            if find_spec(package) is None:
+                message = f"needs {package}, which is not installed: pip install {package}"
+                yield ("method", "chains"), message, self.method.chains
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        yield from mistakes_of_factor(self.method.noise, "method", "noise")
+        for name, value in self.data.truth.items():
+            if name not in self.model.scalars:
+                message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
+                yield ("data", "truth", name), message, value
         try:
             self.inputs  # noqa: B018 - checks the correlations
         except ValueError as error:
@@ -400,6 +418,7 @@ def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vert
             if name in study.names:
                 true[k, study.names.index(name)] = value
     held["true"] = (("data_set", "parameter"), true)
+    held |= _volumes(study, record, found)
     held["stiffness_true"] = (("data_set", "node"), np.array([_true_at(study, m, places) for m in found]))
     held["node_position"] = (("node", "axis"), places)
     held["cell_nodes"] = (("cell", "corner"), cells, {"vtk_cell_type": kind})
@@ -414,6 +433,35 @@ def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vert
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
     return xr.Dataset(held, coordinates).drop_dims("letter", errors="ignore")
+
+
+def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
+    """Posterior of the volumes (m³) of inclusions whose radii are unknown, by the draws that are kept."""
+    names = study.inputs.names
+    before = derived(study.model.inclusions, names, prior_draws(study)) if not study.field else {}
+    labels = [label for label, values in before.items() if np.ptp(values) > 0]
+    if not labels:
+        return {}
+
+    def of(points: FloatArray, inclusions: tuple[Any, ...] = study.model.inclusions) -> FloatArray:
+        values = derived(inclusions, names if points.shape[1] else (), points)
+        return np.column_stack([values.get(label, np.full(len(points), np.nan)) for label in labels])
+
+    draws = np.array([of(rows[:, : len(names)]) for rows in record["draw"]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of data sets that could not be inverted there are none
+        lower, upper = np.nanquantile(draws, ENDS, axis=1)
+        mean, std = np.nanmean(draws, axis=1), np.nanstd(draws, axis=1)
+    true = np.array([of(np.zeros((1, 0)), m.inclusions if m is not None else ())[0] for m in found])
+    here = {"mode": of(record["mode"][:, : len(names)]), "mean": mean, "std": std, "lower": lower, "upper": upper}
+    prior = np.column_stack([before[label] for label in labels])
+    return {
+        **{f"volume_{name}": (("data_set", "inclusion"), values) for name, values in here.items()},
+        "volume_true": (("data_set", "inclusion"), true),
+        "volume_prior_mean": ("inclusion", prior.mean(axis=0)),
+        "volume_prior_std": ("inclusion", prior.std(axis=0)),
+        "inclusion": ("inclusion", [label.split(".")[1] for label in labels]),
+    }
 
 
 def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -459,7 +507,8 @@ def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArr
 def summary(found: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results; that of the only data set stands above it."""
     sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
-    return {**(next(iter(sets.values())) if len(sets) == 1 else {}), "data_sets": sets}
+    only = next(iter(sets.values())) if len(sets) == 1 else {}
+    return {**only, "solves": int(np.nansum(found["solves"])), "data_sets": sets}
 
 
 def _one(found: xr.Dataset) -> dict[str, Any]:
@@ -520,8 +569,17 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
 
     of_set = found if found.sizes["data_set"] > 1 else found.isel(data_set=0, drop=True)
 
+    # Draws of chains stand one after the other, as many of each.
+    counts = set(found["chains"].to_numpy()[found["ok"].to_numpy()].astype(int).tolist())
+    chains = max(counts.pop() if len(counts) == 1 else 1, 1)
+    each = found.sizes["sample"] // chains
+
     def draws(name: str) -> Any:
-        return of_set[name].expand_dims("chain").rename({"sample": "draw"}).transpose("chain", "draw", ...)
+        values = of_set[name].isel(sample=slice(chains * each)).transpose("sample", ...)
+        shape = (chains, each, *values.shape[1:])
+        dims = ("chain", "draw", *values.dims[1:])
+        here = {key: value for key, value in values.coords.items() if "sample" not in value.dims}
+        return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
 
     left: dict[str, xr.Dataset] = {}
     observed = {"displacement": of_set["measured"]}

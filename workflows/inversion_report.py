@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from workflows import plots
 from workflows.tables import Table
-from workflows.words import number, settings, unit_of, with_unit
+from workflows.words import number, settings, unit_of, with_error, with_unit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,26 +22,49 @@ if TYPE_CHECKING:
     from workflows.config import AnyStudy
 
 DIRECTIONS = 10  # of few parameters that a table lists
+MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
 DRAWN = 8  # data sets that have more than a row of the table
+Density = tuple[FloatArray, FloatArray]
 SEEN = 1.0  # λ above which the data say more of a direction than the prior
 
 
 def context(dataset: xr.Dataset, study: AnyStudy) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     if "clean" in dataset:
-        return {"lines": [(line, False) for line in made(dataset)], "batch": None, "priors": None, "sets": []}
+        return {"lines": made(dataset), "batch": None, "priors": None, "sets": []}
     several = dataset.sizes["data_set"] > 1
-    doubtful = ~dataset["ok"].to_numpy() | (dataset["trust"].to_numpy() != 0)
+    drawn = dataset.data_set.values[dataset["ok"]][:DRAWN]
+    priors_of = _prior_densities(study)
     return {
-        "lines": list(zip(findings(dataset), doubtful.tolist(), strict=True)),
+        "lines": list(findings(dataset)) if several else [],
         "batch": batch(dataset) if several else None,
         "priors": priors(dataset, study),
-        "sets": [_of_set(dataset.sel(data_set=name)) for name in dataset.data_set.values[dataset["ok"]][:DRAWN]],
+        "sets": [_of_set(dataset.sel(data_set=name), priors_of) for name in drawn],
     }
 
 
-def _of_set(one: xr.Dataset) -> dict[str, Any]:
+def _prior_densities(study: AnyStudy) -> dict[str, Density]:
+    """Curves (values, density) of the priors by the names of the parameters; those of a field have none."""
+    from workflows.inversion import Inversion
+
+    assert isinstance(study, Inversion)
+    if study.field:
+        return {}
+    known = dict(study.inputs.marginals)
+    if study.method.noise is not None:
+        known["noise"] = study.method.noise
+    z = np.linspace(-6, 6, 1201)
+    curves = {}
+    for name, distribution in known.items():
+        values, slopes = distribution.from_normal(z)
+        density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / np.maximum(slopes, 1e-300)
+        seen = np.exp(-(z**2) / 2) > 1e-7  # beyond, slopes of bounded distributions are rounding
+        curves[name] = values[seen], density[seen]
+    return curves
+
+
+def _of_set(one: xr.Dataset, before: dict[str, Density]) -> dict[str, Any]:
     return {
         "name": str(one.data_set.item()),
         "verdict": str(one["why"].item()),
@@ -51,22 +74,24 @@ def _of_set(one: xr.Dataset) -> dict[str, Any]:
         "cases": cases(one),
         "directions": directions(one) if "direction_parameter" in one else None,
         "iterations": iterations(one),
-        "pictures": list(pictures(one)),
+        "pictures": list(pictures(one, before)),
     }
 
 
-def made(dataset: xr.Dataset) -> list[str]:
-    """Say what synthetic data were made."""
+def made(dataset: xr.Dataset) -> list[tuple[str, bool]]:
+    """Say what synthetic data were made; no warning."""
     counts = np.isfinite(dataset["values"].to_numpy()).sum(axis=1)
-    return [f"{len(counts)} data sets of {', '.join(map(str, counts))} components, in the folder data."]
+    sets = f"{len(counts)} data sets" if len(counts) > 1 else "1 data set"
+    return [(f"{sets} of {', '.join(map(str, counts))} components, in the folder data.", False)]
 
 
-def findings(dataset: xr.Dataset) -> Iterator[str]:
-    """Say what stands and what does not."""
+def findings(dataset: xr.Dataset) -> Iterator[tuple[str, bool]]:
+    """Say what stands and what does not, each with whether it is a warning."""
     for name in dataset.data_set.values:
         one = dataset.sel(data_set=name)
         words = str(one["why"].item())
-        yield f"{name}: {words}" if bool(one["ok"]) else f"{name} could not be inverted: {words}"
+        ok = bool(one["ok"])
+        yield f"{name}: {words}" if ok else f"{name} could not be inverted: {words}", not ok or int(one["trust"]) > 0
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------
@@ -142,10 +167,14 @@ def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
     if np.isfinite(one["effective"]):
         words = f"worth {number(float(one['effective']), 3)}, k̂ = {number(float(one['tail']), 2)}"
         yield "weighted points", words
+    if np.isfinite(one["chain_rhat"]):
+        words = "their draws are the posterior below" if int(one["chains"]) else "they have not mixed"
+        said = f"R̂ up to {float(one['chain_rhat']):.3f}, effective draws from {float(one['chain_effective']):.0f}"
+        yield "chains", f"{said}: {words}"
     yield "solves", f"{int(one['solves']):,}"
     if "products" in one:
         yield "Hessian products", f"{int(one['products']):,}"
-    if np.isfinite(one["stiffness_true"]).all():
+    if np.isfinite(one["stiffness_true"]).all() and "draw" not in one:
         inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
         yield "true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"
 
@@ -154,21 +183,29 @@ def posterior(one: xr.Dataset) -> Table:
     """Prior and posterior of every parameter, with the truth where it is known."""
     known = bool(np.isfinite(one["true"]).any())
     laplace = "laplace_std" in one
-    rows = []
-    for name in one.parameter.values:
-        of = one.sel(parameter=name)
-        unit = _unit(str(name))
-        row = [str(name), f"{_shown(of['prior_mean'])} ± {_shown(of['prior_std'], 2)}"]
-        row += [with_unit(_shown(of["mode"]), unit), with_unit(_estimate(of), unit)]
-        row += [f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
-        row += [_shown(of["laplace_std"], 2)] if laplace else []
-        row += [_shown(of["true"])] if known else []
-        if known:
-            inside = float(of["lower"]) <= float(of["true"]) <= float(of["upper"])
-            row += ["yes" if inside else "no" if np.isfinite(of["true"]) else ""]
-        rows.append(row)
+    rows = [
+        _row(one.sel(parameter=name), str(name), _unit(str(name)), laplace=laplace, known=known)
+        for name in one.parameter.values
+    ]
+    for label in one["inclusion"].values if "inclusion" in one else ():
+        of = one.sel(inclusion=label)
+        numbers = {str(key).removeprefix("volume_"): of[key] for key in of.data_vars if str(key).startswith("volume_")}
+        rows.append(_row(numbers, f"inclusions.{label}.volume", "m³", laplace=laplace, known=known))
     head = ["", "prior", "mode", "posterior", "95 %", *(["± by Laplace"] if laplace else [])]
     return Table([*head, *(["truth", "inside"] if known else [])], rows)
+
+
+def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[str]:
+    """Name, prior, mode, posterior, interval; width by Laplace where there is one, truth where it is known."""
+    row = [name, with_unit(with_error(float(of["prior_mean"]), float(of["prior_std"])), unit)]
+    row += [with_unit(_shown(of["mode"]), unit), with_unit(_estimate(of), unit)]
+    row += [f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
+    if laplace:
+        row.append(_shown(of["laplace_std"], 2) if "laplace_std" in of else "")
+    if known:
+        inside = float(of["lower"]) <= float(of["true"]) <= float(of["upper"])
+        row += [_shown(of["true"]), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
+    return row
 
 
 def cases(one: xr.Dataset) -> Table:
@@ -198,7 +235,7 @@ def cases(one: xr.Dataset) -> Table:
     else:
         together.append(_shown(one["stiffness_std"].mean(), 3))
     head = ["load case", "data", "|r|², expected", "directions with λ > 1", "determined"]
-    head += [f"± {name}" for name in names if name != "noise"] if few else ["mean ± of ln stiffness"]
+    head += [f"± {_with_unit(name)}" for name in names if name != "noise"] if few else ["mean ± of ln stiffness"]
     return Table(head, [*rows, together])
 
 
@@ -229,18 +266,23 @@ def _shown(value: Any, digits: int = 4) -> str:
     return number(float(value), digits)
 
 
-def _estimate(of: xr.Dataset) -> str:
-    return f"{_shown(of['mean'])} ± {_shown(of['std'], 2)}"
+def _estimate(of: Any) -> str:
+    return with_error(float(of["mean"]), float(of["std"]))
 
 
 def _unit(path: str) -> str:
     return "1" if path == "noise" else unit_of(path)
 
 
+def _with_unit(path: str) -> str:
+    unit = _unit(path)
+    return path if unit == "1" else f"{path} ({unit})"
+
+
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
-def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
+def pictures(one: xr.Dataset, before: dict[str, Density]) -> Iterator[tuple[Axes, str]]:
     """Draw what was found for one data set, each with what it shows."""
     cut = Cut.of(one)
     where = f"the plane {'xyz'[cut.axis]} = {cut.level:.4g} m"
@@ -249,15 +291,20 @@ def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
     yield spectrum(one), "λ of all load cases together and of each alone; above 1 the data say more than the prior."
     if "draw" in one:
         yield (
-            marginals(one),
+            marginals(one, before),
             "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",
         )
     else:
         words = "The directions that the data constrain most, and the last that were found"
         yield direction_slices(one, cut), f"{words}, on {where}."
         yield alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {where}."
+        words = "Prior and posterior of ln stiffness where it is found to be least and most, and where least is known"
+        yield node_marginals(one), f"{words}; the truth where it is known."
     yield misfits(one), "|r|² of each load case, and what is expected: mean and two standard deviations."
-    if np.isfinite(one["stiffness_true"]).all():
+    if "draw" in one:
+        if np.isfinite(one["true"]).any():
+            yield errors(one), "Mean less truth over the posterior standard deviation; 95 % lie in the grey band."
+    elif np.isfinite(one["stiffness_true"]).all():
         yield (
             coverage(one),
             "Error at the nodes over the posterior standard deviation, and the standard normal density.",
@@ -329,7 +376,7 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
     shown = [values for name, values in panels.items() if "deviation" not in name]
     ends = min(float(v.min()) for v in shown), max(float(v.max()) for v in shown)
     widest = max(float(values.max()) for name, values in panels.items() if "deviation" in name)
-    found = plots.grid(len(panels), columns=len(panels))
+    found = plots.grid(len(panels), columns=2)
     for ax, (name, values) in zip(found, panels.items(), strict=True):
         spread = "deviation" in name
         limits = (0.0, widest) if spread else ends
@@ -340,13 +387,15 @@ def slices(one: xr.Dataset, cut: Cut) -> Axes:
 def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw directions of a field on a plane."""
     shown = [i for i, n in enumerate(one["shown_number"].to_numpy()) if n >= 0]
-    found = plots.grid(len(shown), columns=4)
+    found = plots.grid(len(shown), columns=4, height=2.7, width=2.1)
     for ax, i in zip(found, shown, strict=True):
         values = one["direction_stiffness"].isel(shown=i).to_numpy()
         n = int(one["shown_number"][i])
         largest = float(np.abs(values).max())
         label = f"{n + 1}: λ = {float(one['eigenvalue'][n]):.3g}"
         _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
+    for part in found[0].figure.axes:
+        part.tick_params(labelsize="x-small")
     return found[0]
 
 
@@ -355,7 +404,7 @@ def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
     panels = {str(case): one["alone_stiffness_std"].sel(case=case).to_numpy() for case in one.case.values}
     panels["all together"] = one["stiffness_std"].to_numpy()
     widest = float(one["stiffness_prior_std"].max())
-    found = plots.grid(len(panels), columns=4)
+    found = plots.grid(len(panels), columns=2)
     for ax, (name, values) in zip(found, panels.items(), strict=True):
         _draw(ax, cut, values, name, "plasma", (0.0, widest))
     return found[0]
@@ -370,11 +419,16 @@ def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends
     ax.set_title(title, fontsize="medium")
     ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
     ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
-    ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9, ticks=MaxNLocator(3))
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(3))
+    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9)
+    bar.ax.xaxis.set_major_locator(MaxNLocator(4))
 
 
 def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw λ of all load cases and of each alone."""
+    from matplotlib.ticker import MaxNLocator
+
     ax = ax or plots.axes()
     rows = {"all together": one["eigenvalue"].to_numpy()}
     rows |= {str(case): one["alone_eigenvalue"].sel(case=case).to_numpy() for case in one.case.values}
@@ -384,37 +438,114 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
         ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=name, linewidth=1, markersize=4)
     ax.axhline(SEEN, color=plots.PLAIN, linestyle="--", linewidth=1)
     ax.set_yscale("log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("direction")
     ax.set_ylabel("λ")
     ax.legend(fontsize="small", frameon=False)
     return ax
 
 
-def marginals(one: xr.Dataset) -> Axes:
-    """Draw prior and posterior densities of the parameters."""
-    names = [str(name) for name in one.parameter.values]
-    found = plots.grid(len(names), columns=min(len(names), 3), height=2.4)
+def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
+    """Draw prior and posterior densities of the parameters, of many those that the data narrow most."""
+    narrowed = (one["std"] / one["prior_std"]).to_numpy()
+    chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
+    names = [str(one.parameter.values[i]) for i in chosen]
+    found = plots.grid(len(names), columns=min(len(names), 2), height=2.2)
     for ax, name in zip(found, names, strict=True):
         of = one.sel(parameter=name)
-        ax.hist(of["draw"].to_numpy(), bins=30, density=True, color=plots.CONTROLLED, alpha=0.45, label="posterior")
+        draws = of["draw"].to_numpy()
+        draws = draws[np.isfinite(draws)]
         mean, std = float(of["mode"]), float(of["laplace_std"])
         wide = max(float(of["std"]), std)
-        x = np.linspace(mean - 5 * wide, mean + 5 * wide, 300)
-        bell = np.exp(-(((x - mean) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi))
-        ax.plot(x, bell, color=plots.DARK, linewidth=1, label="Laplace")
-        before = float(of["prior_std"])
-        flat = np.exp(-(((x - float(of["prior_mean"])) / before) ** 2) / 2) / (before * np.sqrt(2 * np.pi))
-        ax.plot(x, flat, color=plots.PLAIN, linestyle="--", label="normal with the prior's moments")
+        low = min(mean - 4 * std, draws.min(initial=mean) - 0.5 * wide)
+        high = max(mean + 4 * std, draws.max(initial=mean) + 0.5 * wide)
+        if np.isfinite(of["true"]):
+            low, high = min(low, float(of["true"]) - 0.5 * wide), max(high, float(of["true"]) + 0.5 * wide)
+        values, density = before[name]
+        x = np.linspace(max(low, values[0]), min(high, values[-1]), 300)
+        ax.fill_between(x, _smooth(draws, float(of["std"]), _worth(one), x), **_FILLED)
+        ax.plot(x, _bell(x, mean, std), color=plots.DARK, linewidth=1, label="Laplace")
+        ax.plot(x, np.interp(x, values, density), color=plots.PLAIN, linestyle="--", label="prior")
         if np.isfinite(of["true"]):
             ax.axvline(float(of["true"]), color=plots.HIGH, label="truth")
-        ax.set_xlim(x[0], x[-1])
-        ax.set_yticks([])
-        unit = _unit(name)
-        ax.set_xlabel(name if unit == "1" else f"{name} ({unit})", fontsize="small")
-        ax.tick_params(labelsize="small")
+        _finish(ax, _with_unit(name), x)
+    _legend(found)
+    return found[0]
+
+
+_FILLED: dict[str, Any] = {"color": plots.CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
+
+
+def _worth(one: xr.Dataset) -> float:
+    """How many independent draws the draws are worth."""
+    return float(one["chain_effective"] if int(one["chains"]) else one["effective"])
+
+
+def _smooth(draws: FloatArray, std: float, worth: float, x: FloatArray) -> FloatArray:
+    """Density at x of draws that are worth so many independent ones, by normal kernels (Silverman's width)."""
+    width = max(std, 1e-300) * (4 / (3 * max(worth, 2.0))) ** 0.2
+    z = (x[:, None] - draws) / width
+    return np.asarray(np.exp(-(z**2) / 2).mean(axis=1) / (width * np.sqrt(2 * np.pi)))
+
+
+def _finish(ax: Axes, label: str, x: FloatArray) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(bottom=0)
+    ax.set_yticks([])
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.set_xlabel(label, fontsize="small")
+    ax.tick_params(labelsize="small")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _legend(found: list[Axes]) -> None:
     handles, labels = found[0].get_legend_handles_labels()
     found[0].figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
+
+
+def node_marginals(one: xr.Dataset) -> Axes:
+    """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, that which is known least."""
+    mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
+    before = one["stiffness_prior_std"].to_numpy()
+    centre = float(one["prior_mean"][0])
+    nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
+    found = plots.grid(len(nodes), columns=len(nodes), height=2.6, width=2.2)
+    for ax, node in zip(found, nodes, strict=True):
+        low = min(centre - 3 * before[node], mean[node] - 4 * std[node])
+        x = np.linspace(low, max(centre + 3 * before[node], mean[node] + 4 * std[node]), 300)
+        ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)
+        ax.plot(x, _bell(x, centre, before[node]), color=plots.PLAIN, linestyle="--", label="prior")
+        if np.isfinite(one["stiffness_true"][node]):
+            ax.axvline(float(one["stiffness_true"][node]), color=plots.HIGH, label="truth")
+        place = ", ".join(f"{x + 0.0:.3g}" for x in one["node_position"].to_numpy()[node].round(9))
+        _finish(ax, f"ln stiffness at\n({place}) m", x)
+        ax.xaxis.label.set_fontsize("x-small")
+    _legend(found)
     return found[0]
+
+
+def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:
+    return np.asarray(np.exp(-(((x - mean) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi)))
+
+
+def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw errors of the parameters whose truth is known, over their standard deviations."""
+    names = [str(name) for name in one.parameter.values if np.isfinite(one["true"].sel(parameter=name))]
+    ax = ax or plots.axes(height=1.2 + 0.35 * len(names))
+    known = one.sel(parameter=names)
+    z = ((known["mean"] - known["true"]) / known["std"]).to_numpy()
+    places = np.arange(len(names))[::-1]
+    ax.axvspan(-1.96, 1.96, color=plots.DARK, alpha=0.08, linewidth=0)
+    ax.errorbar(z, places, xerr=1, fmt="o", color=plots.CONTROLLED, capsize=4)
+    ax.axvline(0, color=plots.HIGH, linewidth=1)
+    ax.set_yticks(places, names)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    farthest = max(3.0, float(np.abs(z).max()) + 1.3)
+    ax.set_xlim(-farthest, farthest)
+    ax.set_xlabel("(mean − truth)/standard deviation")
+    return ax
 
 
 def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:

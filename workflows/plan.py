@@ -114,11 +114,13 @@ def _inversion(study: Inversion) -> list[str]:
     if study.field:
         unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
         seconds = (
-            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + study.method.solves(field=True) * each
+            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD)
+            + 2 * study.method.solves(field=True) * each
         )
     else:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
         seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
+    seconds += each * study.method.chain_solves(len(study.names), field=study.field)
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",

@@ -163,7 +163,11 @@ def _inversion(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) ->
     found = inversion_report.context(dataset, study)
     for one in found["sets"]:
         one["pictures"] = [_picture(*drawn) for drawn in one["pictures"]]
-    return _of_all(dataset, summary, study) | found
+    here = _of_all(dataset, summary, study)
+    count = dataset.sizes["data_set"]
+    if count > 1 and "data_sets" in summary:
+        here["amount"] = f"{count} data sets, {summary['failed']} failed; {tables.solves(summary)}"
+    return here | found
 
 
 def _comparison(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> dict[str, Any]:

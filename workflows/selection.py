@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -18,10 +18,11 @@ from forward.materials import MATERIALS, constants
 from forward.model import ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
+from inverse.observations import DataError, read_table
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
-from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, refused
+from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mistakes_of_factor, refused
 
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
@@ -62,8 +63,8 @@ class DataFile(Settings):
     file
         The table, beside the study.
     mode, at, across, measured, sigma, group
-        Names of the columns: kind of test, stretch or amount of shear, second stretch, stress and, if there are any,
-        its standard deviation and the group.
+        Names of the columns: kind of test, stretch or amount of shear, second stretch (of biaxial tests), stress and,
+        if there are any, its standard deviation and the group.
     modes
         What the words of the column of modes mean, where they are not modes themselves.
     unit
@@ -99,45 +100,42 @@ class DataFile(Settings):
         """
         path = folder / self.file
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except UnicodeDecodeError:
-            message = f"data.file: {path}: not a text file in UTF-8"
-            raise StudyError(message) from None
-        except OSError as error:
-            message = f"data.file: {path}: cannot be read: {error.strerror}"
-            raise StudyError(message) from None
-        numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
-        table = csv.DictReader(line for _, line in numbered)
+            table = read_table(path)
+        except DataError as error:
+            raise StudyError(*(f"data.file: {line}" for line in error.args)) from None
         columns = [self.mode, self.at, self.measured, self.across, self.sigma, self.group, *self.where]
         for column in columns:
-            if column is not None and column not in (table.fieldnames or ()):
-                message = f"data: {path} has no column '{column}'; {nearest(column, tuple(table.fieldnames or ()))}"
+            if column is not None and column not in table.columns:
+                message = f"data: {path} has no column '{column}'; {nearest(column, table.columns)}"
                 raise StudyError(message)
         tests: dict[tuple[str, str], dict[str, list[float]]] = {}
-        for (line, _), row in zip(numbered[1:], table, strict=False):
+        for line, row in zip(table.lines, table.rows, strict=True):
             if any(row[column] != word for column, word in self.where.items()):
                 continue
-            at = _number(row[self.at], f"{path}, line {line}, {self.at}")
+            word = row[self.mode]
+            mode = self.modes.get(word, word)
+            sheared = mode == "simple-shear"
+            at = _number(row[self.at], f"{path}, line {line}, {self.at}", positive=not sheared)
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
-            word = row[self.mode]
-            if self.modes.get(word, word) not in MODES:
+            if mode not in MODES:
                 message = f"data: {path}, line {line}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
                 raise StudyError(message)
             test = tests.setdefault((row[self.group] if self.group else WHOLE, word), {})
-            for key, column, unit in (
-                ("at", self.at, 1.0),
-                ("across", self.across, 1.0),
-                ("measured", self.measured, self.unit),
-                ("sigma", self.sigma, self.unit),
+            for key, column, unit, positive in (
+                ("at", self.at, 1.0, not sheared),
+                ("across", self.across, 1.0, True),
+                ("measured", self.measured, self.unit, False),
+                ("sigma", self.sigma, self.unit, True),
             ):
-                if column is not None:
-                    test.setdefault(key, []).append(unit * _number(row[column], f"{path}, line {line}, {column}"))
+                if column is not None and (key != "across" or mode == "biaxial"):
+                    value = _number(row[column], f"{path}, line {line}, {column}", positive=positive)
+                    test.setdefault(key, []).append(unit * value)
         if not tests:
             message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
             raise StudyError(message)
         return {
-            "source": [line.lstrip("# ") for line in lines if line.startswith("#")],
+            "source": list(table.remarks),
             "tests": [
                 {"mode": self.modes.get(word, word), "name": word, "group": group, "stress": self.stress, **columns}
                 for (group, word), columns in tests.items()
@@ -308,6 +306,9 @@ class Comparison(Settings):
 
     def mistakes_of_method(self) -> Iterator[Mistake]:
         """Find what does not fit the candidates and the data."""
+        if self.method.check is not None and find_spec(self.method.check) is None:
+            message = f"needs {self.method.check}, which is not installed: pip install {self.method.check}"
+            yield ("method", "check"), message, self.method.check
         known = tuple(dict.fromkeys(test for group in self.group_names for test in self.tests(group)))
         for name, tests in self.method.subsets.items():
             for test in tests:
@@ -322,6 +323,7 @@ class Comparison(Settings):
             (("noise",), self.method.noise),
             *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
         ):
+            yield from mistakes_of_factor(noise.factor, "method", *place, "factor")
             for data in self.groups.values():
                 try:
                     noise.sigma(data.values, data.sigma)
@@ -468,12 +470,15 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return {**document, "data": table.read(folder)}
 
 
-def _number(text: str | None, place: str) -> float:
+def _number(text: str, place: str, *, positive: bool = False) -> float:
     try:
-        value = float(text or "")
+        value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         message = f"data: {place}: {text!r}, expected a number"
+        raise StudyError(message)
+    if positive and value <= 0:
+        message = f"data: {place}: {value:g}, expected more than 0"
         raise StudyError(message)
     return value

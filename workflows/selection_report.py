@@ -248,13 +248,15 @@ def averages(dataset: xr.Dataset) -> Table:
 def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw ln Z of each model less the largest, with three standard errors."""
     order = ranking(dataset["log_evidence"])[::-1]
-    ax = ax or plots.axes(height=1.2 + 0.42 * len(order))
+    ax = ax or plots.axes(height=1.2 + 0.5 * len(order))
     values = dataset["log_evidence"].sel(model=order).values
     errors = dataset["log_evidence_error"].sel(model=order).values
     places = np.arange(len(order))
     below = values - values.max()
     ax.barh(places, below, xerr=3 * errors, color=plots.CONTROLLED, ecolor=plots.DARK, capsize=4, height=0.6)
-    ax.set_yticks(places, order)
+    # Beside models that are hopeless, what the others differ in cannot be seen: the numbers stand with the names.
+    labels = [f"{model}\n{with_error(float(z), float(e))}" for model, z, e in zip(order, below, errors, strict=True)]
+    ax.set_yticks(places, labels, fontsize="small")
     ax.set_xlim(1.15 * min(below.min(), -1.0), 0.05 * abs(below.min()) + 3 * errors.max())
     ax.set_xlabel("ln Z − ln Z of the most probable")
     return ax
@@ -341,6 +343,8 @@ def _with_unit(constant: str) -> str:
 
 def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
     """Draw what each model leaves of the data of a test, over the stated errors, against what was measured."""
+    from matplotlib.ticker import MaxNLocator
+
     ax = ax or plots.axes(height=3.4)
     one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))
     measured = one["measured"].values
@@ -350,6 +354,7 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
         colour = plots.COLOURS[k % len(plots.COLOURS)]
         ax.plot(measured, left, ".", markersize=4, color=colour, label=f"{model} ({P:.2g})")
     ax.axhspan(-2, 2, color=plots.DARK, alpha=0.08, linewidth=0)
+    ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_xlabel("measured displacement (m)")
     ax.set_ylabel("residual / σ")
     ax.legend(fontsize="small", frameon=False)

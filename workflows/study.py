@@ -287,7 +287,10 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         data = study.measurements[number].observations.components()
-        observed = model.observing(data.places, data.axes, data.cases)
+        try:
+            observed = model.observing(data.places, data.axes, data.cases)
+        except ValueError as error:  # a place that no cell has, by rounding: the other data sets go on
+            raise SolveError(str(error)) from None
         if prior is None:
             return layout.pack(invert_by_group(study.inputs, observed, data, method, look))
         posterior = FieldPosterior(observed, data.values, data.sigma, prior)
@@ -457,7 +460,6 @@ def _summary(
         "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
         "evaluations": sum(len(found.points) for found in every),
-        **_evaluation(study),
         "failed": failed,
         "failures": [
             {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
@@ -485,13 +487,6 @@ def _summary(
             "versions": {"python": platform.python_version(), **_versions()},
         },
     }
-
-
-def _evaluation(study: AnyStudy) -> dict[str, str]:
-    """Say what an evaluation is, where it is no solve."""
-    from workflows.inversion import Inversion
-
-    return {"evaluation": "data set"} if isinstance(study, Inversion) and not study.together else {}
 
 
 def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
@@ -541,8 +536,6 @@ def _commit() -> str | None:
 
 
 def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    from workflows.tables import solves
-
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
         f"probability {found['probability']:.3g}"
@@ -571,7 +564,10 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
             lines.append(f"{output}: derivative × range of the parameter: {shown}")
-    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {summary['failed']} failed")
+    from workflows.tables import solves
+
+    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
+    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
     if "note" in summary:
         lines.append(summary["note"])
     lines.append(f"report: {directory / 'report.html'}")

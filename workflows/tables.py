@@ -400,14 +400,13 @@ def failures_line(summary: dict[str, Any]) -> str:
 
 def times(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """What the study took."""
-    count = max(summary["evaluations"], 1)
+    count = max(_count(summary), 1)
     yield "wall time", f"{duration(summary['wall_seconds'])} (of the run that finished the study)"
     cpu = summary["cpu_seconds"]
-    each = _evaluation(summary)
-    yield f"processor time of the {each}s", f"{duration(cpu)}; {duration(cpu / count)} a {each}"
-    if any(summary["work"].values()):  # that of inversions is said of each
+    yield "processor time of the solves", f"{duration(cpu)}; {duration(cpu / count)} a solve"
+    if any(summary["work"].values()):  # of inversions side by side it is not known
         for name, amount in summary["work"].items():
-            yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a {each}"
+            yield name.replace("_", " "), f"{amount:,}; {amount / count:.1f} a solve"
 
 
 def provenance(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -514,9 +513,11 @@ def estimates(studies: dict[str, Results], output: str) -> Table:
 
 
 def solves(summary: dict[str, Any]) -> str:
-    """The number of solves, or of data sets that were inverted one by one."""
-    return f"{summary['evaluations']:,} {_evaluation(summary)}{'s' if summary['evaluations'] != 1 else ''}"
+    """The number of solves."""
+    count = _count(summary)
+    return "1 solve" if count == 1 else f"{count:,} solves"
 
 
-def _evaluation(summary: dict[str, Any]) -> str:
-    return str(summary.get("evaluation", "solve"))
+def _count(summary: dict[str, Any]) -> int:
+    """Number of solves; a data set of several that are inverted side by side is one evaluation of many solves."""
+    return int(max(summary["evaluations"], summary.get("solves", 0)))

@@ -1,0 +1,451 @@
+"""Regression of outputs on values and gradients in orthonormal polynomials.
+
+The expansion Σ_a c_a ψ_a(ω) is fitted to the samples by least squares. A sample gives one row for its value, ψ(ω_z)·c =
+f(ω_z), and with derivatives one row more for each parameter, σ_i ∂_iψ(ω_z)·c = σ_i ∂_i f(ω_z): d + 1 rows for little
+more than the price of one solve. All rows count the same: on five test functions of two to four parameters, weights of
+1/4 to 3/2 for the gradients gave errors within the scatter of the designs.
+
+What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
+residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there by (I − H_z)⁻¹ r_z, and its coefficients differ
+by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forward.model import FloatArray, SolveError
+from uq.basis import Basis, IntArray, by_degree, hyperbolic, orthonormal
+from uq.evaluate import Evaluations
+from uq.indices import Analysis, coefficient_moments, shares
+from uq.inputs import Inputs
+
+TRUNCATIONS = (0.5, 0.75, 1.0)
+ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
+FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
+DICTIONARY = 2000  # functions to select from, at most
+FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
+ROUNDING = 1e-13  # relative error below which there is nothing left to select for
+PATIENCE = 30  # functions that may be selected without a gain before the selection ends
+
+
+# --- candidates ------------------------------------------------------------------------------------------------------
+
+
+def rows_of(inputs: Inputs, *, gradients: bool) -> int:
+    """Number of rows that a sample gives."""
+    return 1 + len(inputs.names) if gradients else 1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Some functions of the largest basis, by their numbers; order and q of the set that they are from.
+
+    Where `sparse` is set they are a dictionary, to select functions from.
+    """
+
+    order: int
+    q: float
+    which: IntArray
+    sparse: bool = False
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Sets to choose from; `all` (P, d) is their union."""
+
+    all: IntArray
+    sets: tuple[Candidate, ...]
+
+
+def whole(inputs: Inputs, order: int) -> Candidates:
+    """Return the full basis of one order as the only choice."""
+    indices = hyperbolic(len(inputs.names), order, 1.0)
+    return Candidates(indices, (Candidate(order, 1.0, np.arange(len(indices))),))
+
+
+def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> Candidates:
+    """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
+    d = len(inputs.names)
+    most = max(rows // ROWS_PER_TERM, d + 1)
+    found: dict[tuple[bool, tuple[tuple[int, ...], ...]], tuple[int, float]] = {}
+    determined = False
+    for q in reversed(TRUNCATIONS):
+        for order in range(1, max_order + 1):
+            indices = hyperbolic(d, order, q)
+            members = tuple(map(tuple, indices.tolist()))
+            if d <= FULL and (len(indices) <= most or order == 1):
+                found.setdefault((False, members), (order, q))
+            if len(indices) <= dictionary or order == 1:
+                widest = members, order
+        if (True, widest[0]) not in found and not determined:
+            found[True, widest[0]] = (widest[1], q)
+        # Nothing is lost by selecting from all of them where there are as many rows.
+        determined = determined or (widest[1] == max_order and len(widest[0]) <= rows)
+    union = sorted({index for _, members in found for index in members}, key=by_degree)
+    number = {index: i for i, index in enumerate(union)}
+    sets = [
+        Candidate(order, q, np.array([number[a] for a in members]), sparse)
+        for (sparse, members), (order, q) in found.items()
+    ]
+    return Candidates(np.array(union, dtype=np.int64), tuple(sets))
+
+
+# --- regression ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Data:
+    """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) per standard deviation or nothing.
+
+    `weights` (n,) count the samples in sums of squares.
+    """
+
+    points: FloatArray
+    values: FloatArray
+    slopes: FloatArray | None
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
+        """Take those of the evaluations that have an answer; `weights` are one where none are given."""
+        ok = evaluations.ok
+        tangents = None if evaluations.tangents is None else evaluations.tangents[ok]
+        counted = None if weights is None else weights[ok]
+        return cls.at(evaluations.points[ok], evaluations.outputs[ok], tangents, inputs, counted)
+
+    @classmethod
+    def at(
+        cls,
+        points: FloatArray,
+        values: FloatArray,
+        tangents: FloatArray | None,
+        inputs: Inputs,
+        weights: FloatArray | None = None,
+    ) -> Data:
+        """Take values (n, m) and, where they are given, tangents (n, m, d) at points; `weights` as of `of`."""
+        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
+        return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
+
+    def first(self, count: int) -> Data:
+        """Return the first `count` samples."""
+        slopes = None if self.slopes is None else self.slopes[:count]
+        return Data(self.points[:count], self.values[:count], slopes, self.weights[:count])
+
+    @property
+    def right(self) -> FloatArray:
+        """Right-hand sides (n, rows, m)."""
+        return self._rows(self.values, self.slopes)
+
+    def left(self, basis: Basis) -> FloatArray:
+        """Matrix (n, rows, P)."""
+        return self._rows(basis.values(self.points), None if self.slopes is None else basis.derivatives(self.points))
+
+    def _rows(self, values: FloatArray, slopes: FloatArray | None) -> FloatArray:
+        blocks = values[:, None, :]
+        if slopes is not None:
+            blocks = np.concatenate([blocks, slopes], axis=1)
+        return np.asarray(blocks * np.sqrt(self.weights)[:, None, None])
+
+    def size(self, errors: FloatArray) -> FloatArray:
+        """Root mean square (m,) of the first rows of residuals (n, rows, m): those of the values."""
+        return np.asarray(np.sqrt((errors[:, 0] ** 2).sum(axis=0) / self.weights.sum()))
+
+    def relative(self, errors: FloatArray) -> FloatArray:
+        """The same over the standard deviation of the values; zero where that is rounding."""
+        share = self.weights / self.weights.sum()
+        mean = share @ self.values
+        std = np.sqrt(share @ (self.values - mean) ** 2)
+        constant = std <= 1e-13 * np.abs(mean)
+        return np.where(constant, 0.0, self.size(errors) / np.where(constant, 1.0, std))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A regression and what it is worth.
+
+    Attributes
+    ----------
+    chosen
+        The functions of the fit.
+    coefficients
+        (P, m).
+    without
+        Coefficients (g, P', m), of all functions of the largest basis, of fits that leave a gth of the samples out.
+    sampled
+        Standard errors (P, m) of the coefficients as of a regression with independent errors of any sizes.
+    triangle
+        R (P, P) of the matrix of the regression, of which the Gram matrix is RᵀR.
+    loo, relative
+        Root mean square (m,) of the leave-one-out errors of the values, and that over their standard deviation.
+    squares
+        Sum of squares (m,) of the residuals of all rows.
+    """
+
+    chosen: Candidate
+    coefficients: FloatArray
+    without: FloatArray
+    sampled: FloatArray
+    triangle: FloatArray
+    loo: FloatArray
+    relative: FloatArray
+    squares: FloatArray
+
+
+@dataclass(frozen=True)
+class _Folds:
+    """What was selected without some of the samples.
+
+    Attributes
+    ----------
+    held
+        Number (n,) of the selection that went without the sample.
+    which
+        Functions (K, P) of each selection.
+    errors
+        Errors (n, rows, m) at each sample of the fit without it.
+    """
+
+    held: IntArray
+    which: IntArray
+    errors: FloatArray
+
+
+def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
+    """Choose the functions with the smallest leave-one-out error, and fit.
+
+    Raises
+    ------
+    SolveError
+        If there are not enough samples.
+    """
+    left, right = data.left(largest), data.right
+    n, rows, _ = right.shape
+    d = largest.indices.shape[1]
+    held = np.arange(n) % min(n, FOLDS)
+    scores: list[tuple[float, Candidate, _Folds | None]] = []
+    for candidate in candidates.sets:
+        terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
+        if candidate.sparse and (d > FULL or n * rows > d):
+            scores.append(_select(left, right, data, candidate, held, most))
+        elif (
+            not candidate.sparse
+            and terms <= n * rows
+            and (candidate.order == 1 or len(candidates.sets) == 1 or terms <= most)
+        ):
+            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(n * rows, -1))
+            size = np.abs(np.diag(r))
+            if size.min() > 1e-10 * size.max():
+                blocks = q.reshape(n, rows, terms)
+                residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
+                scores.append((float(data.relative(_left_out(blocks, residual, held)).max()), candidate, None))
+    scores = [found for found in scores if np.isfinite(found[0])]
+    if not scores:
+        message = f"{n} samples have an answer, too few for an expansion of order 1"
+        raise SolveError(message)
+    best = min(score for score, *_ in scores)
+    # Of those that are as good, the smallest.
+    good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
+    return _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
+
+
+def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
+    """Errors (n, rows, m) at each sample of the fit without those that share its number in `held` (n,).
+
+    They follow from the orthonormal columns (n, rows, P) and the residuals.
+    """
+    errors = np.empty_like(residual)
+    for number in np.unique(held):
+        out = held == number
+        part = blocks[out].reshape(-1, blocks.shape[2])
+        rest = np.eye(len(part)) - part @ part.T
+        if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
+            errors[out] = np.inf
+        else:
+            errors[out] = np.linalg.solve(rest, residual[out].reshape(len(part), -1)).reshape(residual[out].shape)
+    return errors
+
+
+def _select(
+    left: FloatArray, right: FloatArray, data: Data, dictionary: Candidate, held: IntArray, most: int
+) -> tuple[float, Candidate, _Folds]:
+    """Take functions one by one, each time the one that explains most of what all outputs have left.
+
+    Orthogonal least squares, from all samples and, to learn when to stop, without those of each number in `held` (n,):
+    what is selected by samples cannot be judged by them.
+
+    Returns
+    -------
+    float, Candidate, _Folds
+        The relative error at the samples left out, the functions selected from all, and those selected without some.
+    """
+    n, rows, m = right.shape
+    columns = left[:, :, dictionary.which].reshape(n * rows, -1)
+    # The last of these fits sees everything.
+    numbers = np.arange(held.max() + 2)
+    seen = np.repeat(held[None, :] != numbers[:, None], rows, axis=1).astype(float)
+    scale = np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    rest = np.tile(right.reshape(n * rows, m) / scale, (len(numbers), 1, 1))
+    lengths = seen @ columns**2
+    left_over = lengths.copy()
+    taken: list[IntArray] = []
+    limit = min(most, columns.shape[1])
+    q = np.empty((len(numbers), n * rows, limit))
+    scores: list[float] = []
+    left_out: list[FloatArray] = []
+    while (step := len(taken)) < limit and (
+        not scores or (step - int(np.argmin(scores)) <= PATIENCE and min(scores) > ROUNDING)
+    ):
+        usable = left_over > 1e-8 * lengths
+        if not usable.any(axis=1).all():
+            break
+        pick = np.zeros(len(numbers), dtype=np.int64)  # the constant comes first
+        if taken:
+            gains = np.swapaxes(rest * seen[:, :, None], 1, 2) @ columns
+            pick = np.where(usable, (gains**2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0).argmax(axis=1)
+        column = columns[:, pick].T
+        earlier = q[:, :, :step]
+        column = column - (earlier @ (np.swapaxes(earlier, 1, 2) @ (column * seen)[:, :, None]))[:, :, 0]
+        column = column / np.sqrt((column**2 * seen).sum(axis=1))[:, None]
+        q[:, :, step] = column
+        left_over -= ((column * seen) @ columns) ** 2
+        rest = rest - column[:, :, None] * np.einsum("fn,fnm->fm", column * seen, rest)[:, None, :]
+        taken.append(pick)
+        left_out.append(rest.reshape(len(numbers), n, rows, m)[held, np.arange(n)] * scale)
+        scores.append(float(data.relative(left_out[-1]).max()))
+    count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
+    picks = dictionary.which[np.array(taken[:count])]
+    chosen = Candidate(dictionary.order, dictionary.q, picks[:, -1], sparse=True)
+    return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1])
+
+
+def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate, folds: _Folds | None) -> Fit:
+    from scipy.linalg import solve_triangular
+
+    n, rows, m = right.shape
+    q, r = np.linalg.qr(left[:, :, chosen.which].reshape(n * rows, -1))
+    blocks = q.reshape(n, rows, -1)
+    rotated = np.einsum("zrp,zrm->pm", blocks, right)
+    residual = right - blocks @ rotated
+    coefficients = solve_triangular(r, rotated)
+    if folds is None:
+        errors = _left_out(blocks, residual, np.arange(n))
+        terms = chosen.which.size
+        moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
+        without = np.zeros((n, left.shape[2], m))
+        without[:, chosen.which] = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
+    else:
+        errors = folds.errors
+        without = np.zeros((len(folds.which), left.shape[2], m))
+        for k, which in enumerate(folds.which):
+            kept = folds.held != k
+            matrix = left[kept][:, :, which].reshape(-1, which.size)
+            without[k, which] = np.linalg.lstsq(matrix, right[kept].reshape(-1, m), rcond=None)[0]
+    squares = (residual**2).sum(axis=(0, 1))
+    sampled = _sampled(blocks, residual, r)
+    return Fit(chosen, coefficients, without, sampled, r, data.size(errors), data.relative(errors), squares)
+
+
+def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
+    """Standard errors (P, m) of coefficients from the residuals of samples that are independent of each other.
+
+    With (I − H_z)^(−1/2) r_z for the errors of sample z (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002)
+    169–181), which has the right variance where all rows err alike.
+    """
+    from scipy.linalg import solve_triangular
+
+    n, rows, m = residual.shape
+    sizes, axes = np.linalg.eigh(np.eye(rows) - blocks @ np.swapaxes(blocks, 1, 2))
+    scaled = (np.swapaxes(axes, 1, 2) @ residual) / np.sqrt(np.maximum(sizes, 1e-10))[:, :, None]
+    moved = np.einsum("zrp,zrm->pzm", blocks, axes @ scaled).reshape(-1, n * m)
+    return np.asarray(np.sqrt((solve_triangular(triangle, moved).reshape(-1, n, m) ** 2).sum(axis=1)))
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A fit to samples and what it was chosen from.
+
+    Attributes
+    ----------
+    inputs
+        The parameters.
+    candidates, largest
+        The sets of functions that were tried, and the basis of all of them.
+    data
+        The samples that have an answer.
+    fit
+        The fit.
+    """
+
+    inputs: Inputs
+    candidates: Candidates
+    largest: Basis
+    data: Data
+    fit: Fit
+
+    @classmethod
+    def of(
+        cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int
+    ) -> Regression:
+        """Fit to values (n, m) and, where they are given, tangents (n, m, d) at points (n, d).
+
+        Raises
+        ------
+        SolveError
+            If there are not enough samples.
+        """
+        data = Data.at(points, values, tangents, inputs)
+        rows = len(points) * rows_of(inputs, gradients=tangents is not None)
+        candidates = candidates_of(inputs, max_order, rows, DICTIONARY)
+        largest = orthonormal(inputs, candidates.all)
+        return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
+
+    def first(self, count: int) -> Regression:
+        """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
+        data = self.data.first(count)
+        return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
+
+    @property
+    def basis(self) -> Basis:
+        """The P functions of the fit."""
+        return self.largest.subset(self.fit.chosen.which)
+
+    def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
+        """Return what follows from the coefficients, by output, with standard errors."""
+        cautious = None in [m.support for m in self.inputs.marginals.values()]
+        return _estimates(self.fit, self.largest.indices, len(self.data.points), cautious=cautious, of=of)
+
+
+def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
+    """Moments and indices by output with their standard errors, by the jackknife over samples.
+
+    The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
+    parts select anew: what the samples chose is uncertain as they are.
+
+    The jackknife asks of a fit what it does in the hole that a sample left, and claims too much; a regression with
+    independent errors takes the rest, which is smooth, for noise, and claims too little. For the mean, the geometric
+    mean of the two is claimed: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
+    jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. For the standard deviation, where
+    the rest that no polynomial takes is a bias, it is the jackknife: 92 to 100 %.
+
+    Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
+    there, `cautious`, its norm, the leave-one-out error λ, is added: λ for the standard deviation, as |σ_f − σ_g| ≤
+    ‖f − g‖, and λ/√n for the mean, which keeps the jackknife. (Without, intervals of functions of normal and gamma
+    parameters covered 60 % instead of 95 %.) The indices always have its share (λ/σ)² of the variance.
+    """
+    indices = largest[fit.chosen.which]
+    central = of(fit.coefficients.T, indices)
+    left_out = of(np.swapaxes(fit.without, 1, 2), largest)
+    groups = len(fit.without)
+    share = shares(fit.loo**2, central["std"] ** 2)
+    nothing = np.zeros_like(fit.loo)
+    missing = {"mean": fit.loo / np.sqrt(n) if cautious else nothing, "std": fit.loo if cautious else nothing}
+    for name, values in left_out.items():
+        spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
+        if name == "mean" and not cautious:
+            spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
+        unseen = missing.get(name, share)
+        central[f"{name}_error"] = np.hypot(spread, unseen.reshape(-1, *(1,) * (spread.ndim - 1)))
+    return central
