@@ -174,7 +174,9 @@ def _look(plotter: Any, up: FloatArray) -> None:
     plotter.show_axes()
     plotter.view_vector(front + 0.6 * right + 0.4 * up, viewup=up)
     plotter.reset_camera()
-    plotter.camera.zoom(1.02)
+    extents = np.ptp(np.reshape(plotter.bounds, (3, 2)), axis=1)
+    tall = extents @ np.abs(up) > 0.8 * (extents * (1 - np.abs(up))).max()
+    plotter.camera.zoom(0.86 if tall else 1.02)  # the numbers below and above a tall body need room
     plotter.camera.SetWindowCenter(0, -0.06)  # the numbers of the axes are below the body
 
 

@@ -30,7 +30,7 @@ MAPS_DRAWN = 4  # parameters whose indices are drawn on the body
 NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
 
 
-MANY = 10  # panels of a picture that are legible side by side with other pictures
+HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,8 @@ def _of_all(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> di
 
 
 def _picture(ax: Axes, caption: str) -> Picture:
-    panels = len(ax.figure.axes)
-    return Picture(base64.b64encode(plots.png(ax)).decode(), caption, wide=panels > MANY)
+    wide = ax.figure.get_figure(root=True).get_size_inches()[0] > HALF
+    return Picture(base64.b64encode(plots.png(ax)).decode(), caption, wide=wide)
 
 
 def _charts(dataset: xr.Dataset, output: str) -> list[Picture]:

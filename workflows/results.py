@@ -62,7 +62,8 @@ def read_dataset(directory: Path) -> xr.Dataset:
 
     path = directory / "results.nc"
     if not path.exists():
-        message = f"{directory}: holds no results.nc, expected the directory of a finished study"
+        begun = "; the command that began this one continues it" if (directory / "study.toml").exists() else ""
+        message = f"{directory}: holds no results.nc, expected the directory of a finished study{begun}"
         raise FileNotFoundError(message)
     try:
         found = xr.load_dataset(path, engine="h5netcdf")

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.external import PythonModel
-from forward.model import ModelError
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.sampling import random_points
 from workflows.config import Study, StudyError, differences, document, dump
@@ -80,9 +79,13 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     StudyError
         If the directory holds another study or cannot be written, or if there is less work than groups of ranks.
     ModelError
-        If the model cannot be made; the directory is then left as it was.
+        If the model cannot be made.
     SolveError
         If the study cannot be finished because the model has no answer.
+
+    Notes
+    -----
+    Where it fails before anything is solved, the directory is left as it was.
     """
     from mpi4py import MPI
 
@@ -113,14 +116,14 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
     try:
         job = _job(study, ensemble, name)
-    except ModelError:
+        kept = checkpoint if job.costly else None
+        dataset = ensemble.run(
+            job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
+        )
+    except BaseException:
         if world.rank == 0:
             _withdraw(directory)
         raise
-    kept = checkpoint if job.costly else None
-    dataset = ensemble.run(
-        job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
-    )
     if dataset is None:
         return DONE
     progress.close()
