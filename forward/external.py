@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import json
+import sys
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -132,6 +135,7 @@ class _External(Settings):
         return self
 
 
+_texts: dict[str, tuple[Path | None, bytes]] = {}  # files of imported modules, and what they held
 Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
 
 
@@ -166,11 +170,11 @@ class PythonModel(_External):
         found = hashlib.sha256()
         for path in filter(None, (self.function, self.jacobian)):
             try:
-                spec = importlib.util.find_spec(path.rpartition(".")[0])
+                file = _file(path.rpartition(".")[0])
             except (ImportError, ValueError):  # whoever imports it says why
                 continue
-            if spec is not None and spec.has_location and spec.origin is not None:
-                found.update(Path(spec.origin).read_bytes())
+            if file is not None:
+                found.update(file.read_bytes())
         return found.hexdigest()
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
@@ -179,13 +183,33 @@ class PythonModel(_External):
         return function, _guarded(self.jacobian, "jacobian") if self.jacobian else None
 
 
+def _file(module: str) -> Path | None:
+    """Return the file of a module as it would be found now, whatever was imported under this name before."""
+    spec = None if "." in module else importlib.machinery.PathFinder.find_spec(module)
+    spec = spec or importlib.util.find_spec(module)
+    return None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
+
+
+def _imported(module: str) -> ModuleType:
+    """Import a module, again if its file is another one, or another text, than when it was imported last."""
+    file = _file(module)
+    now = (file, file.read_bytes() if file else b"")
+    known = sys.modules.get(module)
+    before = _texts.get(module, now if known is None else (Path(getattr(known, "__file__", None) or ""), now[1]))
+    if known is not None and "." not in module and file is not None and before != now:
+        del sys.modules[module]
+        importlib.invalidate_caches()
+    _texts[module] = now
+    return importlib.import_module(module)
+
+
 def _guarded(path: str, key: str) -> Callable[[FloatArray], Any]:
     """Import a function; the exceptions that it raises become failed solves."""
     module, _, name = path.rpartition(".")
     try:
-        function = getattr(importlib.import_module(module), name)
+        function = getattr(_imported(module), name)
     except AttributeError:
-        known = tuple(word for word in dir(importlib.import_module(module)) if not word.startswith("_"))
+        known = tuple(word for word in dir(_imported(module)) if not word.startswith("_"))
         message = f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}"
         raise ModelError(message) from None
     except Exception as error:

@@ -194,6 +194,19 @@ def test_modules_are_found_beside_the_study(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err == "model.function: 'own_beam' has no 'bem'; did you mean 'beam'?\n"
 
 
+def test_the_function_is_that_of_the_file_as_it_is_now(tmp_path, monkeypatch):
+    """In one process, as in a notebook: other folders with a file of the same name, and files that were edited."""
+    model = PythonModel(function="my_own.f", parameters={"a": 2.0}, outputs=("b",))
+    found = []
+    for folder, factor in (("one", 1), ("two", 10), ("two", 200)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "my_own.py").write_text(f"def f(p):\n    return {factor} * p\n")
+        monkeypatch.syspath_prepend(tmp_path / folder)
+        found.append((model.build(None, ("a",)).solve(np.array([2.0])).outputs[0], model.source))
+    assert [value for value, _ in found] == [2, 20, 400]
+    assert len({source for _, source in found}) == 3
+
+
 def test_the_shipped_example(monkeypatch):
     from workflows.__main__ import main
 
