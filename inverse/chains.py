@@ -542,7 +542,10 @@ def verdict_on_field(
     if objection is not None:
         return objection
     if found is None and chains is None:
-        why = f"the residuals agree with it (probability {test.probability:.2g}); it was not checked by other solves"
+        why = (
+            f"the residuals agree with it (probability {test.probability:.2g}); no other solves have checked what it "
+            "says of the directions with the largest λ (method.samples does)"
+        )
         return Verdict("laplace", why)
     if found is None:
         assert chains is not None

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uq.moments import estimate, monomials, quantiles
+from uq.moments import estimate, estimate_from_replicates, monomials, quantiles
 
 REPEATS, N = 2000, 100
 # w = x + x²/5 with x ~ N(0, 1) has mean 1/5 and variance 1 + 2/25.
@@ -75,6 +75,16 @@ def test_nodes_that_do_not_move_have_no_error():
     m = estimate(sums, 10, np.zeros(3), np.zeros(3), "optimal")
     for value in (m.mean, m.mean_error, m.std, m.std_error):
         np.testing.assert_array_equal(value, 0)
+
+
+def test_an_estimated_variance_below_nothing_has_a_finite_error():
+    """The square of a mean that is known badly may exceed the mean of the squares."""
+    means = np.random.default_rng(0).normal(size=(2, 16, 500)) * [[[0.3]], [[1e-2]]]
+    found = estimate_from_replicates(means, np.zeros(500))
+    clipped = found.std == 0
+    assert clipped.any()
+    assert np.isfinite(found.std_error).all()
+    assert (found.std_error[clipped] > 0).all()
 
 
 def test_quantile_errors_cover():

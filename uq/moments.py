@@ -144,7 +144,7 @@ def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | F
         mean=reference + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
-        std_error=ratio(variance_error, 2.0 * std),
+        std_error=_error_of_root(std, variance_error),
         coefficient=np.broadcast_to(coefficient, std.shape),
     )
 
@@ -291,9 +291,15 @@ def estimate_from_replicates(
         mean=reference + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
-        std_error=ratio(np.sqrt(variance_variance), 2 * std),
+        std_error=_error_of_root(std, np.sqrt(variance_variance)),
         coefficient=beta1,
     )
+
+
+def _error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:
+    """Error of σ given that of σ²: e/(2σ), and √e at most: what σ could be where the estimate of σ² is nothing."""
+    largest: FloatArray = np.sqrt(variance_error)
+    return ratio(variance_error, np.maximum(2 * std, largest))
 
 
 def _scatter(values: FloatArray) -> FloatArray:
