@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from inverse.laplace import Laplace
@@ -203,6 +204,13 @@ def _by_surrogate(
     # wrong by a factor makes its share of the mixture wrong by that.
     scatter = max(found.error, np.sqrt(1 / found.effective - 1 / len(density.x)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))
+
+
+def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
+    """Return points (count,): each as often as its weight says, by systematic resampling, in any order."""
+    places = (np.arange(count) + np.random.default_rng(seed).uniform()) / count
+    chosen = np.searchsorted(np.cumsum(weights), places).clip(max=len(weights) - 1)
+    return np.random.default_rng(seed + 1).permutation(chosen)
 
 
 def tail_shape(weights: FloatArray) -> float:

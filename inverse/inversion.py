@@ -40,7 +40,7 @@ from inverse.chains import (
     weigh_field,
 )
 from inverse.comparison import quantiles
-from inverse.evidence import LEAST, Evidence, evidence
+from inverse.evidence import LEAST, Evidence, evidence, resampled
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import Laplace, laplace
 from inverse.low_rank import CUTOFF, LowRankPosterior, Spectrum
@@ -452,13 +452,6 @@ def _thinned(chains: Chains, count: int) -> FloatArray:
     return chains.draws[:, steps].reshape(-1, chains.draws.shape[2])[:count]
 
 
-def _resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
-    """Points (n,) of equal weight: each as often as its weight says, by systematic resampling, in any order."""
-    places = (np.arange(count) + np.random.default_rng(seed).uniform()) / count
-    chosen = np.searchsorted(np.cumsum(weights), places).clip(max=len(weights) - 1)
-    return np.random.default_rng(seed + 1).permutation(chosen)
-
-
 def _letters(text: str) -> FloatArray:
     """A sentence as the numbers of its letters: records have nothing else."""
     return np.array([ord(letter) for letter in text[:LETTERS]], dtype=float)
@@ -543,7 +536,7 @@ def _invert(
         outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs
     else:
         weights, points = found.weights, posterior.physical(found.density.x)
-        chosen = _resampled(weights, method.draws, method.seed)
+        chosen = resampled(weights, method.draws, method.seed)
         draws, outputs = points[chosen], found.density.outputs[chosen]
     return {
         **_of_data(data, at.outputs[0], residual, scale, spectrum, cases),
@@ -735,7 +728,7 @@ def _of_stiffness(
     else:
         mean = weights @ values
         std = np.sqrt(weights @ (values - mean) ** 2)
-        draws = values[_resampled(weights, count, method.seed)]
+        draws = values[resampled(weights, count, method.seed)]
     return {
         "stiffness_mean": vertices.offset + mean,
         "stiffness_std": std,

@@ -358,6 +358,11 @@ def test_a_study_from_the_command_line(small):
     assert "no estimates of outputs" in both.stderr
     found = xr.load_dataset(small.parent / "one" / "results.nc")
     assert found["prior_probability"].to_numpy() == pytest.approx([1 / 3, 2 / 3])
+    posterior = xr.load_dataset(small.parent / "one" / "results.nc", group="posterior")
+    drawn = posterior["mooney-rivlin.C1"].mean(("chain", "draw"))
+    expected = found["constant_mean"].sel(model="mooney-rivlin", parameter="C1")
+    spread = found["constant_std"].sel(model="mooney-rivlin", parameter="C1")
+    assert (abs(drawn - expected) < 0.1 * spread).all()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
@@ -18,14 +18,19 @@ from forward.materials import MATERIALS, constants
 from forward.model import ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
+from inverse.evidence import resampled
 from inverse.observations import DataError, read_table
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mistakes_of_factor, refused
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
+DRAWS = 1000  # of the constants, that are left for ArviZ
 WHOLE = "all"  # name of the group where there is one
 
 
@@ -482,3 +487,21 @@ def _number(text: str, place: str, *, positive: bool = False) -> float:
         message = f"data: {place}: {value:g}, expected more than 0"
         raise StudyError(message)
     return value
+
+
+def groups(found: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return ArviZ's groups: draws of the constants of every model, in each group of data, and the data."""
+    import xarray as xr
+
+    drawn: dict[str, Any] = {}
+    for model in found.model.values:
+        points = found["point"].sel(model=model)
+        weights = found["point_weight"].sel(model=model)
+        chosen = [resampled(weights.sel(group=group).to_numpy(), DRAWS, 0) for group in found.group.values]
+        for parameter in found.parameter.values:
+            columns = points.sel(parameter=parameter).transpose("group", "point").to_numpy()
+            values = np.array([column[which] for column, which in zip(columns, chosen, strict=True)])
+            if np.isfinite(values).all():
+                drawn[f"{model}.{parameter}"] = (("chain", "draw", "group"), values.T[None])
+    posterior = xr.Dataset(drawn, {"group": found.group.values})
+    return {"posterior": posterior, "observed_data": xr.Dataset({found.attrs["quantity"]: found["measured"]})}

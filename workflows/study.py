@@ -242,6 +242,7 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
 def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     """The candidates, each for each group of data; making them is collective over the group."""
     from uq.evaluate import SerialEvaluate
+    from workflows.selection import groups
 
     pairs = study.pairs
     makers = [partial(study.build, *pair, ensemble.group) for pair in pairs]
@@ -261,7 +262,7 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     def labelled(found: xr.Dataset) -> xr.Dataset:
         return found.assign_attrs(quantity=study.quantity)
 
-    return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, costly=study.costly)
+    return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, groups=groups, costly=study.costly)
 
 
 def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
