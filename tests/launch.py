@@ -29,7 +29,7 @@ def run(ranks, *command):
         on_ranks(ranks, *command),
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=300,  # a hang; busy machines are slow
         env=environment(),
         check=False,
         cwd=ROOT,
