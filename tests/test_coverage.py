@@ -105,6 +105,7 @@ def test_sensitivity_monte_carlo_is_unbiased_and_a_wrong_expansion_point_is_noti
     assert not is_unbiased(mean)
 
 
+@pytest.mark.slow
 def test_a_running_mean_in_the_second_moment_is_noticed(monkeypatch):
     """The square of the deviation from the mean of the same samples, without the variance of that mean."""
     method = MonteCarlo(samples=8, fields=False)

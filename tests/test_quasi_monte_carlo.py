@@ -132,6 +132,7 @@ def with_slopes_times(factor, of):
     )
 
 
+@pytest.mark.slow
 def test_a_bad_fit_costs_efficiency_and_no_bias():
     good, bad = (
         repeats(of, 60, samples=32, scrambles=4, control="chaos") for of in (PRODUCT, with_slopes_times(3, PRODUCT))
@@ -141,6 +142,7 @@ def test_a_bad_fit_costs_efficiency_and_no_bias():
         assert wrong.std() > 10 * right.std()
 
 
+@pytest.mark.slow
 def test_samples_that_the_control_was_fitted_to_would_be_noticed(monkeypatch):
     settings = {"samples": 8, "scrambles": 2, "control": "chaos", "control_samples": 4}
     mean, _, variance, _ = repeats(STEEP, 120, **settings)
@@ -184,7 +186,7 @@ def test_claimed_intervals_cover_where_controls_are_useless(control, coefficient
     ("control", "coefficient"),
     [
         ("tangent", "one"),
-        ("quadratic", "optimal"),
+        pytest.param("quadratic", "optimal", marks=pytest.mark.slow),
         *(pytest.param(control, "one", marks=pytest.mark.slow) for control in ("none", "quadratic", "chaos")),
     ],
 )
