@@ -78,7 +78,8 @@ class Invert(Settings):
     Parameters
     ----------
     samples
-        Solves that correct Laplace's Gaussian: by default 256 for few parameters, and none for a field.
+        Solves that correct Laplace's Gaussian: by default 256 for few parameters, none for a field. With 64, intervals
+        of 90 % held the truth in 82 % of the specimens where posteriors are thin and bent (docs/design.md).
     noise
         Prior of the factor on all standard deviations of the errors; without it they are what they are said to be.
     chains
