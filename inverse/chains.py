@@ -543,8 +543,8 @@ def verdict_on_field(
         return objection
     if found is None and chains is None:
         why = (
-            f"the residuals agree with it (probability {test.probability:.2g}); what it says of the directions with the "
-            "largest λ was not checked by other solves (method.samples does)"
+            f"the residuals agree with it (probability {test.probability:.2g}); what it says of the directions with "
+            "the largest λ was not checked by other solves (method.samples does)"
         )
         return Verdict("laplace", why)
     if found is None:
