@@ -32,13 +32,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from forward.model import FloatArray, Reference, SolveError
-from inverse.evidence import ALIKE, TRUSTED, Evidence, tail_shape
+from inverse.evidence import Evidence
 from inverse.field_posterior import Point
 from inverse.laplace import Laplace
 from inverse.low_rank import LowRankPosterior
 from inverse.newton_cg import Mode
 from inverse.posterior import Posterior
 from inverse.predictive import ResidualTest
+from inverse.weights import effective_number, normalised, tail_shape, trustworthy
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -170,10 +171,7 @@ def crank_nicolson(
     *,
     keep: Map = lambda x: x,
     names: tuple[str, ...] | None = None,
-    chains: int = FEW.chains,
-    draws: int = FEW.draws,
-    burn: int = FEW.burn,
-    thin: int = FEW.thin,
+    lengths: Lengths = FEW,
     seed: int = 0,
 ) -> Chains:
     """Run chains side by side: in every step, one evaluation of as many points as there are chains.
@@ -188,8 +186,8 @@ def crank_nicolson(
         Quantities (n, k) at x (n, c) that are kept.
     names
         Of these; by default their numbers.
-    chains, draws, burn, thin
-        Number of chains, draws that are kept of each, steps before these (in which β is adapted), and steps for a draw.
+    lengths
+        Number of chains, and how long they are; β is adapted in the steps before the draws that are kept.
     seed
         Of all draws; each chain has its own numbers.
 
@@ -198,7 +196,8 @@ def crank_nicolson(
     SolveError
         If there is no answer at the start of a chain.
     """
-    rngs = [np.random.default_rng([seed, chain]) for chain in range(chains)]
+    burn, thin = lengths.burn, lengths.thin
+    rngs = [np.random.default_rng([seed, chain]) for chain in range(lengths.chains)]
 
     def normals() -> FloatArray:
         return np.array([rng.standard_normal(size) for rng in rngs])
@@ -215,8 +214,8 @@ def crank_nicolson(
         raise SolveError("the model has no answer where a chain starts")
     odds = np.log(FIRST_STEP / (1 - FIRST_STEP))
     kept, levels = [], []
-    accepted = np.zeros(chains)
-    for step in range(-burn, draws * thin):
+    accepted = np.zeros(lengths.chains)
+    for step in range(-burn, lengths.draws * thin):
         beta = float(1 / (1 + np.exp(-odds)))
         moved = np.sqrt(1 - beta**2) * z + beta * normals()
         x_moved, there = place(moved)
@@ -234,18 +233,15 @@ def crank_nicolson(
             levels.append(here)
     values = np.swapaxes(np.array(kept), 0, 1)
     labels = tuple(map(str, range(values.shape[2]))) if names is None else names
-    solves = Lengths(chains, draws, burn, thin).evaluations
-    return Chains(labels, values, np.array(levels).T, accepted / (draws * thin), beta, solves)
+    share = accepted / (lengths.draws * thin)
+    return Chains(labels, values, np.array(levels).T, share, beta, lengths.evaluations)
 
 
 def chains_of_few(
     posterior: Posterior,
     around: Laplace | Evidence,
     *,
-    chains: int = FEW.chains,
-    draws: int = FEW.draws,
-    burn: int = FEW.burn,
-    thin: int = FEW.thin,
+    lengths: Lengths = FEW,
     seed: int = 0,
 ) -> Chains:
     """Run chains for few parameters, kept in physical units.
@@ -257,7 +253,7 @@ def chains_of_few(
     around
         Laplace's Gaussian, or weighted points, of which the mean and the covariance (made a little wider) are taken:
         where the posterior is curved, Laplace's is too narrow, and chains stick in its tails.
-    chains, draws, burn, thin, seed
+    lengths, seed
         As of `crank_nicolson`.
     """
     if isinstance(around, Laplace):
@@ -276,10 +272,7 @@ def chains_of_few(
         len(centre),
         keep=posterior.physical,
         names=posterior.names,
-        chains=chains,
-        draws=draws,
-        burn=burn,
-        thin=thin,
+        lengths=lengths,
         seed=seed,
     )
 
@@ -290,10 +283,7 @@ def chains_of_field(
     *,
     keep: Map | None = None,
     names: tuple[str, ...] | None = None,
-    chains: int = FIELD.chains,
-    draws: int = FIELD.draws,
-    burn: int = FIELD.burn,
-    thin: int = FIELD.thin,
+    lengths: Lengths = FIELD,
     seed: int = 0,
 ) -> Chains:
     """Run chains for a field; kept are its values (N,), or quantities (n, k) of values (n, N)."""
@@ -303,10 +293,7 @@ def chains_of_field(
         len(mode.noise),
         keep=values if keep is None else lambda x: keep(values(x)),
         names=names,
-        chains=chains,
-        draws=draws,
-        burn=burn,
-        thin=thin,
+        lengths=lengths,
         seed=seed,
     )
 
@@ -399,8 +386,7 @@ class FieldWeights:
     @property
     def weights(self) -> FloatArray:
         """Weights (n,) of sum 1."""
-        w = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(w / w.sum())
+        return normalised(self.log_weights)
 
     @property
     def mean(self) -> FloatArray:
@@ -415,7 +401,7 @@ class FieldWeights:
     @property
     def effective(self) -> float:
         """Effective number of samples."""
-        return float(1 / (self.weights**2).sum())
+        return effective_number(self.weights)
 
     @property
     def share(self) -> float:
@@ -430,7 +416,7 @@ class FieldWeights:
     @property
     def trusted(self) -> bool:
         """Whether the weights are worth what they say."""
-        return self.tail <= TRUSTED or self.share > ALIKE
+        return trustworthy(self.tail, self.effective, len(self.log_weights))
 
     @property
     def log_evidence(self) -> float:

@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.evidence import Evidence, tail_shape
+from inverse.evidence import Evidence
 from inverse.laplace import Laplace
 from inverse.posterior import Posterior
+from inverse.weights import tail_shape
 from uq.inputs import Inputs
 
 if TYPE_CHECKING:

@@ -25,17 +25,15 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from inverse.laplace import Laplace
 from inverse.posterior import Density, Posterior
 from inverse.surrogate import SCRAMBLES, Mixture, fit, sample
+from inverse.weights import TRUSTED, normalised, tail_shape, trustworthy
 from uq.sampling import sobol_points
 
-TRUSTED = 0.7  # k̂ up to which weights are worth what they say
 EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
-ALIKE = 0.8  # effective share from which on weights are equal for all that matters
 QUARTERS = 4
 LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
 ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding
@@ -75,15 +73,12 @@ class Evidence:
     @property
     def trusted(self) -> bool:
         """Whether the estimate is worth what it says."""
-        # The tail of weights that are all but equal says nothing.
-        alike = self.effective > ALIKE * len(self.log_weights)
-        return self.route == "closed form" or self.tail <= TRUSTED or alike
+        return self.route == "closed form" or trustworthy(self.tail, self.effective, len(self.log_weights))
 
     @property
     def weights(self) -> FloatArray:
         """Weights (n,) of the points in the posterior, of sum 1."""
-        w = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(w / w.sum())
+        return normalised(self.log_weights)
 
     def reweighted(self, change: FloatArray) -> tuple[float, float]:
         """Return ln Z and its error with ln of the prior density changed by `change` (n,) at the points."""
@@ -204,36 +199,3 @@ def _by_surrogate(
     # wrong by a factor makes its share of the mixture wrong by that.
     scatter = max(found.error, np.sqrt(1 / found.effective - 1 / len(density.x)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))
-
-
-def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
-    """Return points (count,): each as often as its weight says, by systematic resampling, in any order."""
-    places = (np.arange(count) + np.random.default_rng(seed).uniform()) / count
-    chosen = np.searchsorted(np.cumsum(weights), places).clip(max=len(weights) - 1)
-    return np.random.default_rng(seed + 1).permutation(chosen)
-
-
-def tail_shape(weights: FloatArray) -> float:
-    """Shape k̂ of the generalised Pareto distribution of the largest weights; infinite where they are fewer than 5.
-
-    The fit is the empirical Bayes estimate of J. Zhang, M. A. Stephens, Technometrics 51 (2009) 316–325, drawn a little
-    towards 1/2 as Vehtari et al. do.
-    """
-    n = weights.size
-    count = int(np.ceil(min(0.2 * n, 3 * np.sqrt(n))))
-    ordered = np.sort(weights)
-    exceed = ordered[n - count :] - ordered[n - count - 1] if n > count else np.empty(0)
-    exceed = exceed[exceed > 0]
-    m = exceed.size
-    if m < 5:
-        return float("inf")
-    # A grid of θ = −k/σ, each weighted by its profile likelihood.
-    grid = 30 + int(np.sqrt(m))
-    j = np.arange(1, grid + 1)
-    theta = 1 / exceed[-1] + (1 - np.sqrt(grid / (j - 0.5))) / (3 * exceed[int(m / 4 + 0.5) - 1])
-    k = np.log1p(-theta[:, None] * exceed).mean(axis=1)
-    profile = m * (np.log(-theta / k) - k - 1)
-    share = 1 / np.exp(profile - profile[:, None]).sum(axis=1)
-    mean = float(theta @ share / share.sum())
-    shape = float(np.log1p(-mean * exceed).mean())
-    return float((shape * m + 0.5 * 10) / (m + 10))

@@ -40,7 +40,7 @@ from inverse.chains import (
     weigh_field,
 )
 from inverse.comparison import quantiles
-from inverse.evidence import LEAST, Evidence, evidence, resampled
+from inverse.evidence import LEAST, Evidence, evidence
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import Laplace, laplace
 from inverse.low_rank import CUTOFF, LowRankPosterior, Spectrum
@@ -49,6 +49,7 @@ from inverse.noise import infer_noise
 from inverse.observations import Components
 from inverse.posterior import NOISE, Posterior
 from inverse.predictive import ResidualTest, examine, neighbours, spectrum_of
+from inverse.weights import resampled
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate, Recorder, Request, SerialEvaluate, Start
 from uq.inputs import Inputs

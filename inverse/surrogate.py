@@ -17,6 +17,7 @@ import numpy as np
 from forward.model import WORK, FloatArray, SolveError
 from inverse.laplace import Laplace
 from inverse.posterior import Density, Posterior
+from inverse.weights import effective_number, normalised
 from uq.basis import Basis, hyperbolic
 from uq.distributions import Normal
 from uq.evaluate import Evaluations, Failure, Request
@@ -246,13 +247,12 @@ class Cloud:
     @property
     def weights(self) -> FloatArray:
         """Weights (N,) of sum 1."""
-        w = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(w / w.sum())
+        return normalised(self.log_weights)
 
     @property
     def effective(self) -> float:
         """Effective number of points."""
-        return float(1 / (self.weights**2).sum())
+        return effective_number(self.weights)
 
     @property
     def error(self) -> float:

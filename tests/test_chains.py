@@ -7,6 +7,8 @@ import pytest
 
 from forward.model import FunctionModel, SolveError
 from inverse.chains import (
+    FEW,
+    FIELD,
     Lengths,
     bent,
     chains_of_few,
@@ -55,15 +57,15 @@ def quick(posterior):
 def test_linear_models(run):
     posterior = quick(few())
     gaussian = laplace(posterior)
-    settings = {"lengths": Lengths(32, 150, 100, 8)} if run is ensemble else {"draws": 500}
-    found = run(posterior, gaussian, seed=2, **settings)
+    lengths = Lengths(32, 150, 100, 8) if run is ensemble else replace(FEW, draws=500)
+    found = run(posterior, gaussian, seed=2, lengths=lengths)
     assert found.names == ("a", "b", "c")
     assert (found.rhat < 1.06).all()
     agrees(found, gaussian.mode, np.sqrt(np.diag(gaussian.covariance)))
     assert found.log_density.shape == found.draws.shape[:2]
-    again = run(posterior, gaussian, seed=2, **settings)
+    again = run(posterior, gaussian, seed=2, lengths=lengths)
     np.testing.assert_array_equal(found.draws, again.draws)
-    assert not np.array_equal(found.draws, run(posterior, gaussian, seed=3, **settings).draws)
+    assert not np.array_equal(found.draws, run(posterior, gaussian, seed=3, lengths=lengths).draws)
     if run is chains_of_few:  # the proposals are reversible with respect to the posterior itself
         assert (found.accepted == 1).all()
         assert found.step > 0.9
@@ -79,10 +81,10 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
     if run is ensemble:
         found = ensemble(posterior, gaussian, Lengths(32, 200, 100, 8))
     else:
-        found = chains_of_few(posterior, points, chains=8, draws=600, thin=2)
+        found = chains_of_few(posterior, points, lengths=replace(FEW, chains=8, draws=600, thin=2))
         assert found.mixed
         # In Laplace's Gaussian, which is too narrow along the ridge, they have not mixed, and say so.
-        assert not chains_of_few(posterior, gaussian, chains=8, draws=600).mixed
+        assert not chains_of_few(posterior, gaussian, lengths=replace(FEW, chains=8, draws=600)).mixed
     assert found.rhat.max() < 1.06
     got = summary(found.flat)
     error = expected.std * np.sqrt(1 / found.effective + 1 / points.effective)
@@ -93,7 +95,7 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
 def test_the_layout_is_that_of_arviz():
     arviz = pytest.importorskip("arviz")
     posterior = few()
-    found = chains_of_few(posterior, laplace(posterior), draws=100, burn=50)
+    found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=100, burn=50))
     groups = arviz.InferenceData(**found.groups())
     table = arviz.summary(groups, round_to="none")
     assert list(table.index) == ["a", "b", "c"]
@@ -116,7 +118,7 @@ def test_where_there_is_no_answer():
 
     model = replace(posterior.evaluate.model, function=ends)
     half = replace(posterior, evaluate=SerialEvaluate(model))
-    found = chains_of_few(half, gaussian, draws=300, burn=100)
+    found = chains_of_few(half, gaussian, lengths=replace(FEW, draws=300, burn=100))
     assert found.flat[:, 0].min() >= bound
     width = np.sqrt(gaussian.covariance[0, 0])
     assert found.flat[:, 0].mean() == pytest.approx(bound + width * np.sqrt(2 / np.pi), abs=0.3 * width)
@@ -126,7 +128,7 @@ def test_where_there_is_no_answer():
 
     never = replace(posterior, evaluate=SerialEvaluate(replace(model, function=refuse)))
     with pytest.raises(SolveError, match="where a chain starts"):
-        chains_of_few(never, gaussian, draws=10, burn=3)
+        chains_of_few(never, gaussian, lengths=replace(FEW, draws=10, burn=3))
 
 
 # --- fields ----------------------------------------------------------------------------------------------------------
@@ -136,11 +138,13 @@ def test_chains_of_linear_models_of_fields():
     problem = Linear()
     mode, found = solved(problem, cutoff=0.1)
     g = np.random.default_rng(1).standard_normal((N, 3)) / N
-    chains = chains_of_field(mode.point, found, keep=lambda m: m @ g, chains=4, draws=400, burn=100)
+    chains = chains_of_field(
+        mode.point, found, keep=lambda m: m @ g, lengths=replace(FIELD, chains=4, draws=400, burn=100)
+    )
     assert (chains.accepted > 0.6).all()  # the pairs that are left out
     assert (chains.rhat < 1.03).all()
     agrees(chains, problem.mean @ g, np.sqrt(np.diag(g.T @ problem.covariance @ g)))
-    everything = chains_of_field(mode.point, found, draws=5, burn=2)
+    everything = chains_of_field(mode.point, found, lengths=replace(FIELD, draws=5, burn=2))
     assert everything.draws.shape == (2, 5, N)
 
 
@@ -166,7 +170,7 @@ def test_curved_fields_by_weights_and_by_chains():
     gaussian = LowRankPosterior.at(mode)
     weighted = weigh_field(mode, gaussian, 1500)
     expected = summary(weighted.values, weighted.weights)
-    chains = chains_of_field(mode, gaussian, chains=4, draws=600)
+    chains = chains_of_field(mode, gaussian, lengths=replace(FIELD, chains=4, draws=600))
     assert chains.rhat.max() < 1.03
     got = summary(chains.flat)
     error = expected.std * np.sqrt(1 / chains.effective + 1 / weighted.effective)
@@ -206,7 +210,7 @@ def test_the_strong_directions_follow_the_weak_ones():
     assert abs(found.log_evidence - np.log(likelihood.mean())) < 4 * error
     assert abs(gaussian.log_evidence - found.log_evidence) > 0.2
     assert found.values.mean() == pytest.approx(-(0.25**2) / 2, abs=0.003)  # of m, where the mean of eᵐ is 1
-    chains = chains_of_field(mode, gaussian, keep=lambda m: m.mean(axis=1)[:, None], draws=600)
+    chains = chains_of_field(mode, gaussian, keep=lambda m: m.mean(axis=1)[:, None], lengths=replace(FIELD, draws=600))
     assert chains.accepted.min() > 0.25
     assert chains.flat.mean() == pytest.approx(found.weights @ found.values.mean(axis=1), abs=0.002)
 
@@ -235,9 +239,9 @@ def test_verdicts_on_few_parameters():
     assert (lost.trust, lost.why) == ("neither", "the search for the mode did not converge")
     uneven = replace(found, tail=0.9, effective=30.0)
     assert "run chains" in verdict_on_few(gaussian, uneven, test).why
-    short = chains_of_few(posterior, gaussian, draws=10, burn=5)
+    short = chains_of_few(posterior, gaussian, lengths=replace(FEW, draws=10, burn=5))
     assert "have not mixed" in verdict_on_few(gaussian, uneven, test, short).why
-    long = chains_of_few(posterior, found, draws=600, thin=2, chains=8)
+    long = chains_of_few(posterior, found, lengths=replace(FEW, draws=600, thin=2, chains=8))
     assert "but chains agree" in verdict_on_few(gaussian, uneven, test, long).why
     agreeing = replace(test, agreement_probability=0.001)
     assert "residuals of neighbours" in verdict_on_few(gaussian, found, agreeing).why
@@ -255,7 +259,9 @@ def test_verdicts_on_fields():
     wider = replace(weights, values=found.mean + 1.6 * (weights.values - found.mean))
     assert verdict_on_field(mode, found, wider, test).trust == "corrected"
     g = np.full((N, 1), 1 / N)
-    drawn = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), draws=1500)
+    drawn = chains_of_field(
+        mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), lengths=replace(FIELD, draws=1500)
+    )
     chains, values = replace(drawn, draws=drawn.draws[:, :, :1]), drawn.flat[:, 1:]
     assert chains.mixed
     assert verdict_on_field(mode, found, None, test, chains, values).trust == "laplace"
@@ -273,5 +279,5 @@ def test_a_posterior_of_one_parameter():
     base = few()
     inputs = replace(base.inputs, marginals={"a": base.inputs.marginals["a"]})
     posterior = Posterior(inputs, SerialEvaluate(model), np.array([1.0]), np.array([1.0]))
-    found = chains_of_few(posterior, laplace(posterior), draws=500)
+    found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=500))
     agrees(found, np.array([0.5]), np.array([np.sqrt(0.5)]))

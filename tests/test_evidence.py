@@ -5,12 +5,13 @@ import pytest
 from scipy.special import logsumexp
 
 from forward.model import FunctionModel, SolveError
-from inverse.evidence import evidence, tail_shape
+from inverse.evidence import evidence
 from inverse.laplace import laplace
 from inverse.nested import nested
 from inverse.posterior import Posterior
 from inverse.selection import posterior as assemble
 from inverse.surrogate import fit
+from inverse.weights import tail_shape
 from tests.rubber import CONFIGS, CURVED, FACTOR, LINEAR, on_treloar, treloar
 from uq.distributions import LogNormal, Normal, Uniform
 from uq.evaluate import SerialEvaluate

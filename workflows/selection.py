@@ -18,9 +18,9 @@ from forward.materials import MATERIALS, constants
 from forward.model import ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
-from inverse.evidence import resampled
 from inverse.observations import DataError, read_table
 from inverse.selection import Select
+from inverse.weights import resampled
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mistakes_of_factor, refused
