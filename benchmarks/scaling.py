@@ -235,7 +235,7 @@ def draw(curves: dict[str, list[tuple[int, float]]]) -> None:
     """Draw efficiency against groups."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    figure = Figure(figsize=(9, 3.5), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for axis, mean in zip(axes, ("0.025 s", "1 s", "60 s"), strict=True):
         for name, rows in curves.items():
@@ -247,5 +247,5 @@ def draw(curves: dict[str, list[tuple[int, float]]]) -> None:
         axis.set(xscale="log", title=f"solves of {mean}", xlabel="groups of ranks", ylim=(0, 1.02))
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("efficiency")
-    axes[-1].legend(fontsize="small", loc="lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(PICTURE, dpi=110)
