@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
@@ -18,6 +18,7 @@ from forward.geometry import AXES, Body, Vector
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
 from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
+from forward.model import Finding
 from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
 from forward.settings import Settings, nearest
@@ -106,6 +107,18 @@ class RegionNumbers(Settings):
     """
 
     contrast: Annotated[float, Gt(0)]
+
+
+def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]:
+    """Find inclusions whose transition is below the size of a cell."""
+    edge = body.longest_edge
+    for inclusion in inclusions:
+        if inclusion.width < edge:
+            text = (
+                f"inclusions.{inclusion.label}.width = {inclusion.width:g} m is below a cell ({edge:.3g} m): few "
+                "quadrature points see the transition, and derivatives by place and size are rough."
+            )
+            yield Finding("warning", text)
 
 
 class Hyperelastic(Settings):
@@ -224,6 +237,11 @@ class Hyperelastic(Settings):
         """Unit vectors along the families of fibres in the undeformed body."""
         given = getattr(self.material, "fibres", ())
         return tuple((x / length, y / length, z / length) for x, y, z in given for length in [math.hypot(x, y, z)])
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the body before anything is solved."""
+        return (*(Finding("warning", text) for text in self.body.warnings), *too_narrow(self.body, self.inclusions))
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,24 @@ class SolveError(Exception):
         self.reason = reason
         self.history = tuple(history)
         self.work = work or Work()
+
+
+Severity = Literal["note", "warning", "error"]
+
+
+class Finding(NamedTuple):
+    """What a user has to know of a result beside its numbers.
+
+    Parameters
+    ----------
+    severity
+        "note" is worth knowing; with "warning" a number may be off; with "error" a number cannot be trusted.
+    text
+        A sentence or two: what, where, by how much, what to do.
+    """
+
+    severity: Severity
+    text: str
 
 
 class ModelError(ValueError):

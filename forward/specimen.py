@@ -22,7 +22,7 @@ from forward.geometry import AXES, Body, Vector
 from forward.hyperelastic import Hyperelastic, Material, Scalar
 from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
-from forward.model import FloatArray, Reference, SolveError, Work
+from forward.model import Finding, FloatArray, Reference, SolveError, Work
 from forward.newton import SolverSettings
 from forward.outputs import Output
 from forward.settings import Settings, nearest
@@ -152,6 +152,11 @@ class Specimen(Settings):
     def unknowns(self) -> int:
         """Number of unknowns of each load case."""
         return self.loaded(self.cases[0]).unknowns
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the load cases before anything is solved, each once."""
+        return tuple(dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings))
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         """Mesh the body and compile the forms of every case on a communicator; collective.

@@ -27,7 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done; 1 failed, with one line that says why; 2 bad study or arguments; 3 finished, but some solves failed.
+        0 done; 1 failed, with one line that says why; 2 bad study or arguments; 3 finished, but some solves failed or
+        a number cannot be trusted.
     """
     options = _parser().parse_args(arguments)
     from forward.model import ModelError, SolveError

@@ -13,7 +13,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
 from forward.hyperelastic import Hyperelastic, Mistake, Scalar
-from forward.model import ModelError
+from forward.model import Finding, ModelError
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
@@ -134,6 +134,11 @@ class Study(Settings):
     def planned(self) -> int:
         """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
         return self.method.planned(len(self.parameters) + len(self.model.coefficients))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the study before anything is solved."""
+        return () if self.body is None else self.body.findings
 
     @model_validator(mode="after")
     def _check(self) -> Study:

@@ -32,7 +32,7 @@ from workflows.config import Correlation, Parallel, StudyError, mistakes_of_fact
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import FloatArray
+    from forward.model import Finding, FloatArray
     from forward.specimen import SpecimenModel
     from inverse.inversion import Variables
 
@@ -151,6 +151,11 @@ class Inversion(Settings):
         return isinstance(other, Inversion) and self.model_dump() == other.model_dump()
 
     __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the specimen before anything is solved."""
+        return self.model.findings
 
     @property
     def field(self) -> bool:
@@ -296,6 +301,11 @@ class Synthesis(Settings):
     correlations: tuple[Correlation, ...] = ()
     method: Synthesize
     parallel: Parallel = Parallel()
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the specimen before anything is solved."""
+        return self.model.findings
 
     @cached_property
     def inputs(self) -> Inputs:

@@ -39,10 +39,10 @@ def context(dataset: xr.Dataset, study: AnyStudy) -> dict[str, Any]:
     drawn = dataset.data_set.values[dataset["ok"]][:DRAWN]
     priors_of = _prior_densities(study)
     return {
-        "lines": list(findings(dataset)) if several else [],
+        "lines": [],
         "batch": batch(dataset) if several else None,
         "priors": priors(dataset, study),
-        "sets": [_of_set(dataset.sel(data_set=name), priors_of) for name in drawn],
+        "sets": [_of_set(dataset.sel(data_set=name), priors_of, several=several) for name in drawn],
     }
 
 
@@ -66,10 +66,10 @@ def _prior_densities(study: AnyStudy) -> dict[str, Density]:
     return curves
 
 
-def _of_set(one: xr.Dataset, before: dict[str, Density]) -> dict[str, Any]:
+def _of_set(one: xr.Dataset, before: dict[str, Density], *, several: bool) -> dict[str, Any]:
     return {
         "name": str(one.data_set.item()),
-        "verdict": str(one["why"].item()),
+        "verdict": str(one["why"].item()) if several else None,
         "trusted": int(one["trust"]) == 0,
         "amounts": list(amounts(one)),
         "posterior": posterior(one),
@@ -80,20 +80,11 @@ def _of_set(one: xr.Dataset, before: dict[str, Density]) -> dict[str, Any]:
     }
 
 
-def made(dataset: xr.Dataset) -> list[tuple[str, bool]]:
-    """Say what synthetic data were made; no warning."""
+def made(dataset: xr.Dataset) -> list[str]:
+    """Say what synthetic data were made."""
     counts = np.isfinite(dataset["values"].to_numpy()).sum(axis=1)
     sets = f"{len(counts)} data sets" if len(counts) > 1 else "1 data set"
-    return [(f"{sets} of {', '.join(map(str, counts))} components, in the folder data.", False)]
-
-
-def findings(dataset: xr.Dataset) -> Iterator[tuple[str, bool]]:
-    """Say what stands and what does not, each with whether it is a warning."""
-    for name in dataset.data_set.values:
-        one = dataset.sel(data_set=name)
-        words = str(one["why"].item())
-        ok = bool(one["ok"])
-        yield f"{name}: {words}" if ok else f"{name} could not be inverted: {words}", not ok or int(one["trust"]) > 0
+    return [f"{sets} of {', '.join(map(str, counts))} components, in the folder data."]
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------

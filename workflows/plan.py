@@ -27,6 +27,10 @@ SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
+    return [*_planned(study, groups), *(f"{one.severity:10}  {one.text}" for one in study.findings)]
+
+
+def _planned(study: AnyStudy, groups: int) -> list[str]:
     if not isinstance(study, Study):
         return _of_other_kinds(study)
     if study.body is None:
@@ -37,8 +41,6 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
     memory = sum(bytes_per_model(other.unknowns) for other in study.models if isinstance(other, Hyperelastic))
     form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
-    edge = body.longest_edge
-    narrow = [inclusion for inclusion in model.inclusions if inclusion.width < edge]
     up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
     seconds = study.planned * each[0]
     if isinstance(method, MultilevelMonteCarlo):
@@ -64,12 +66,6 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
         f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
-        *(
-            f"warning     inclusions.{inclusion.label}.width = {inclusion.width:g} m is below a cell ({edge:.3g} m):"
-            " few quadrature points see the transition, and derivatives by place and size are rough"
-            for inclusion in narrow
-        ),
-        *(f"warning     {warning}" for warning in body.warnings),
     ]
 
 

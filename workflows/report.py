@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uq.findings import findings
 from workflows import bodies, plots, tables
 from workflows.config import Study, StudyError, parse
 from workflows.results import read_dataset, read_summary, write_text
@@ -124,6 +125,7 @@ def _context(results: Results) -> dict[str, Any]:
         "method": str(type(results.study.method).__doc__).partition("\n")[0],
         "amount": f"{summary['stopped']}; {tables.solves(summary)}, {summary['failed']:,} failed",
         "note": summary.get("note"),
+        "findings": findings(dataset),
         "model": list(model_in_words(results.study)),
         "parameters": tables.parameters(results),
         "nominal": tables.nominal(results),
@@ -189,6 +191,7 @@ def _of_all(dataset: xr.Dataset, summary: dict[str, Any], study: AnyStudy) -> di
     """What these templates show alike."""
     return {
         "title": f"Study {summary['study']}",
+        "findings": findings(dataset),
         "method": str(type(study.method).__doc__).partition("\n")[0],
         "amount": f"{tables.solves(summary)}, {summary['failed']:,} failed",
         "failed_line": tables.failures_line(summary) if summary["failures"] else "none failed",

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
-from workflows.verdict import findings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -97,8 +96,7 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
             "models": {
                 str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
                 for model in dataset.model.values
-            },
-            "findings": findings(dataset),
+            }
         }
     summary: dict[str, Any] = {}
     outputs = [str(name) for name in dataset.output.values]
@@ -159,7 +157,7 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
             lines.append(f"{name}: failed: {found['failed']}")
             continue
         values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
-        lines += [f"{name}: {', '.join(values)}", f"{name}: {found['verdict']}"]
+        lines.append(f"{name}: {', '.join(values)}")
     if "data" in summary:
         lines.append(f"{summary['data']} data made")
     return lines

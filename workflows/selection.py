@@ -15,7 +15,7 @@ from forward.geometry import Vector
 from forward.homogeneous import HomogeneousModel, MaterialTest, Mode, unfit
 from forward.hyperelastic import Mistake
 from forward.materials import MATERIALS, constants
-from forward.model import ForwardModel
+from forward.model import Finding, ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
 from inverse.observations import DataError, read_table
@@ -263,6 +263,11 @@ class Comparison(Settings):
     def seconds_per_solve(self) -> float:
         """Processor time of a solve, roughly."""
         raise NotImplementedError
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the study before anything is solved."""
+        return ()
 
     def described(self, name: str) -> str:
         """What a candidate is, in words."""

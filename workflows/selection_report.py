@@ -9,7 +9,7 @@ import numpy as np
 
 from workflows import plots
 from workflows.tables import Table
-from workflows.verdict import bayes_factor, conflicts, findings, grade, ranking
+from workflows.verdict import bayes_factor, conflicts, grade, ranking
 from workflows.words import NONE, number, settings, unit_of, with_error, with_unit
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ UNITS = {"stress": "Pa", "displacement": "m"}
 def context(dataset: xr.Dataset, study: Comparison) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     return {
-        "findings": findings(dataset),
         "source": study.source,
         "priors": priors(study),
         "evidences": evidences(dataset),

@@ -25,6 +25,7 @@ from workflows.config import Correlation, Parallel, StudyError, mistakes_of_para
 from workflows.selection import WHOLE, Comparison
 
 if TYPE_CHECKING:
+    from forward.model import Finding
     from forward.specimen import SpecimenModel
 
 Positive = Annotated[float, Field(gt=0)]
@@ -175,6 +176,11 @@ class SpecimenSelection(Comparison):
             name: Specimen.model_validate(_changed(self.model, candidate.model))
             for name, candidate in self.candidates.items()
         }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the specimens before anything is solved, each once."""
+        return tuple(dict.fromkeys(finding for one in self.specimens.values() for finding in one.findings))
 
     @property
     def source(self) -> tuple[str, ...]:

@@ -22,7 +22,9 @@ import numpy as np
 
 from forward.external import PythonModel
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
+from uq.findings import add, findings
 from uq.sampling import random_points
+from workflows import verdict
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
 from workflows.results import (
@@ -72,7 +74,8 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     Returns
     -------
     int
-        Exit code: 0 done, 3 finished but some solves failed (on rank 0; 0 on the others).
+        Exit code: 0 done, 3 finished but some solves failed or a number cannot be trusted (on rank 0; 0 on the
+        others).
 
     Raises
     ------
@@ -128,6 +131,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
         return DONE
     progress.close()
     dataset = job.labelled(dataset)
+    add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
@@ -136,7 +140,13 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     _leave(directory, dataset, evaluations, summary, checkpoint, job)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
-    return PARTIAL if summary["failed"] else DONE
+    return exit_code(summary)
+
+
+def exit_code(summary: Mapping[str, Any]) -> int:
+    """Return the exit code of a finished study: 3 where solves failed, or where a number cannot be trusted."""
+    doubtful = any(one["severity"] == "error" for one in summary.get("findings", ()))
+    return PARTIAL if summary["failed"] or doubtful else DONE
 
 
 def _leave(
@@ -260,7 +270,9 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
         return study.method.run(study.models, study.groups, recorded, free)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        return found.assign_attrs(quantity=study.quantity)
+        found = found.assign_attrs(quantity=study.quantity)
+        add(found, *verdict.findings(found))
+        return found
 
     return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, groups=groups, costly=study.costly)
 
@@ -312,6 +324,10 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
             raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
         return inversion.dataset(study, found.outputs, reasons, vertices)
 
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        add(found, *verdict.findings_of_inversion(found))
+        return found
+
     first: ForwardModel = Inversions(invert, ("data_set",), layout.names)
     if study.together:
         data = study.measurements[0].observations.components()
@@ -321,7 +337,7 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
         [],
         one if study.together else many,
         recorders,
-        lambda found: found,
+        labelled,
         groups=partial(inversion.groups, study),
         texts=lambda found: {"batch.csv": inversion.batch_table(found)},
     )
@@ -411,7 +427,7 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     if summary["provenance"].get("source") != _source(study):
         message = f"{directory}: holds results of other code: the function's file has changed; choose another --out"
         raise StudyError(message)
-    return PARTIAL if summary["failed"] else DONE
+    return exit_code(summary)
 
 
 def _withdraw(directory: Path) -> None:
@@ -460,6 +476,7 @@ def _summary(
         "status": "partial" if failed else "complete",
         "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
+        "findings": [one._asdict() for one in findings(dataset)],
         "evaluations": sum(len(found.points) for found in every),
         "failed": failed,
         "failures": [
@@ -542,7 +559,6 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         f"probability {found['probability']:.3g}"
         for model, found in summary.get("models", {}).items()
     ]
-    lines += summary.get("findings", [])
     lines += inverted(summary)
     for output, values in summary.get("outputs", {}).items():
         unit = dataset.unit.sel(output=output).item()
@@ -571,5 +587,6 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
     lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
     if "note" in summary:
         lines.append(summary["note"])
+    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
     lines.append(f"report: {directory / 'report.html'}")
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""What a comparison of models says, in sentences."""
+"""What a comparison of models, or an inversion, says in sentences."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.model import Finding
 from workflows.words import number, with_error
 
 if TYPE_CHECKING:
@@ -45,39 +46,42 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
     return said
 
 
-def findings(dataset: xr.Dataset) -> list[str]:
+def findings(dataset: xr.Dataset) -> list[Finding]:
     """Say which model the data support, by how much, how sure that is and what it depends on."""
     order = ranking(dataset["log_evidence"])
     best = order[0]
     P = float(dataset["probability"].sel(model=best))
-    said = []
+    said: list[Finding] = []
     if len(order) > 1:
         ln_B, error = bayes_factor(dataset, best, order[1])
-        said.append(
+        support = (
             f"{best} is the most probable of the candidates, with {number(100 * P, 4)} %; ln of the Bayes factor over "
             f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B)}."
         )
     else:
-        said.append(f"{best} is the only candidate.")
+        support = f"{best} is the only candidate."
+    said.append(Finding("note", support))
     wrong = conflicts(dataset, best)
     if wrong:
-        said.append(f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}.")
+        said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
     changed = []
     for variant in dataset.variant.values[1:]:
         other = ranking(dataset["variant_log_evidence"].sel(variant=variant))
         if other[0] != best:
             changed.append(f"{other[0]} with {variant}")
         elif other != order:
-            said.append(f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+            said.append(
+                Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+            )
     if changed:
-        said.append(f"It depends: the most probable is {'; '.join(changed)}.")
+        said.append(Finding("warning", f"It depends: the most probable is {'; '.join(changed)}."))
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
-        said.append(f"Left-out data are predicted best by {predicts}.")
+        said.append(Finding("warning", f"Left-out data are predicted best by {predicts}."))
     if "held_out_score" in dataset:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
-            said.append(f"Whole tests are predicted best, from the others, by {predicts}.")
+            said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
     doubtful = [
         f"{model}" + (f" ({group})" if dataset.sizes["group"] > 1 else "")
         for model in order
@@ -85,7 +89,20 @@ def findings(dataset: xr.Dataset) -> list[str]:
         if not bool(dataset["trusted"].sel(model=model, group=group))
     ]
     if doubtful:
-        said.append(f"Evidences not to be trusted, by the tail of their weights: {', '.join(doubtful)}.")
+        said.append(
+            Finding("warning", f"Evidences not to be trusted, by the tail of their weights: {', '.join(doubtful)}.")
+        )
+    return said
+
+
+def findings_of_inversion(dataset: xr.Dataset) -> list[Finding]:
+    """Say of each data set what stands and what does not."""
+    said = []
+    for name in dataset.data_set.values:
+        one = dataset.sel(data_set=name)
+        words, ok = str(one["why"].item()), bool(one["ok"])
+        text = f"{name}: {words}" if ok else f"{name} could not be inverted: {words}"
+        said.append(Finding("note" if ok and int(one["trust"]) == 0 else "warning", text))
     return said
 
 
