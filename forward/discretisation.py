@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal, assert_never
 
 import numpy as np
 import ufl
@@ -107,7 +107,6 @@ class Discretisation:
         self._factorised_at = np.zeros(self.size)
         points = fenicsx.quadrature_points(self.space, spec.body.quadrature)
         self._jacobians = fenicsx.PointValues(self.J, points, self.space, comm)
-        self._compiled: dict[tuple[int, str], Any] = {}
         self._external = 0.0
         self._rounding: float | None = None
         self._given: FloatArray | None = None  # parameters that are set
@@ -162,12 +161,15 @@ class Discretisation:
             factor *= stiffness_factor(_OPS, X, inclusion.kind, **numbers)
         return factor * self._factor_of("stiffness")
 
-    def _factor_of(self, quantity: str) -> Any:
+    def _factor_of(self, quantity: Literal["stiffness", "density"]) -> Any:
         """Product of the random fields on a quantity; 1 without any."""
         factor = 1
         for field in self.fields:
-            if field.field.of == quantity:
-                factor *= field.factor
+            match field.field.of:
+                case "stiffness" | "density" as of:
+                    factor = factor * field.factor if of == quantity else factor
+                case _:
+                    assert_never(field.field.of)
         return factor
 
     def _numbers(self, block: str) -> dict[str, Any]:
@@ -229,6 +231,8 @@ class Discretisation:
                     # Nanson's formula: the deformed area element is J F⁻ᵀ N dS.
                     normal = ufl.dot(self.J * ufl.inv(self.F).T, ufl.FacetNormal(self.mesh))
                     works.append((size * ufl.dot(normal, self.test), self.surface(load.on)))
+                case _:
+                    assert_never(load)
         return works
 
     def _imbalance_form(self, change: Callable[[Any], Any | None] = lambda integrand: integrand) -> Any | None:
@@ -251,13 +255,6 @@ class Discretisation:
         ]
         terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
         return sum(terms[1:], terms[0]) if terms else None
-
-    def compiled(self, owner: object, what: str, make: Callable[[], Any]) -> Any:
-        """Compile a form of an output when it is first needed."""
-        key = (id(owner), what)
-        if key not in self._compiled:
-            self._compiled[key] = make()
-        return self._compiled[key]
 
     @cached_property
     def _parameter_force(self) -> fenicsx.VectorAssembler | None:

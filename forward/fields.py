@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, assert_never
 
 import numpy as np
 from annotated_types import Gt
@@ -100,15 +100,19 @@ class RandomField(Settings):
 
     def on(self, body: Body) -> Expansion:
         """Expand the field on the vertices of a body, in this process: one factorisation, and a solve per vertex."""
-        if self.basis == "nodes":
-            return Nodal(np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2))
-        matern = Matern.on(body, self.length, self.smoothness)
-        if self.basis == "noise":
-            offset = np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2)
-            return Noise(offset, matern, self.log_std)
-        modes = self.log_std * matern.modes(self.modes or 0)
-        kept = (matern.mass @ modes**2).sum() / (self.log_std**2 * matern.mass.sum())
-        return Modes(np.log(self.mean) - (modes**2).sum(axis=1) / 2, modes, float(kept))
+        offset = np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2)
+        match self.basis:
+            case "nodes":
+                return Nodal(offset)
+            case "noise":
+                return Noise(offset, Matern.on(body, self.length, self.smoothness), self.log_std)
+            case "modes":
+                matern = Matern.on(body, self.length, self.smoothness)
+                modes = self.log_std * matern.modes(self.modes or 0)
+                kept = (matern.mass @ modes**2).sum() / (self.log_std**2 * matern.mass.sum())
+                return Modes(np.log(self.mean) - (modes**2).sum(axis=1) / 2, modes, float(kept))
+            case _:
+                assert_never(self.basis)
 
 
 class Expansion(Protocol):

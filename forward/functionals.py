@@ -6,7 +6,7 @@ explicit partial derivative ∂ψ/∂ω. They read the state and the parameters 
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, assert_never
 
 import numpy as np
@@ -154,30 +154,38 @@ class _Integral:
     def value(self) -> float:
         return self._value() / self.size
 
-    def gradient(self) -> FloatArray:
+    # What is compiled lives as long as the output that it belongs to.
+    @cached_property
+    def _gradient(self) -> fenicsx.VectorAssembler:
+        return self._body.vector(self._body.derivative(self._density * self._body.dx))
+
+    @cached_property
+    def _partial(self) -> fenicsx.ScalarAssembler:
+        return fenicsx.ScalarAssembler(self._body.along_parameters(self._density) * self._body.dx, self._body.comm)
+
+    @cached_property
+    def _by_fields(self) -> tuple[tuple[VertexField, fenicsx.VectorAssembler], ...]:
+        """The random fields that the density depends on, with its derivative by their values at the vertices."""
         body = self._body
-        form = body.compiled(self, "gradient", lambda: body.vector(body.derivative(self._density * body.dx)))
-        return np.asarray(form()) / self.size
+        return tuple(
+            (field, fenicsx.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm))
+            for field in body.fields
+            if field.inside(self._density)
+        )
+
+    def gradient(self) -> FloatArray:
+        return np.asarray(self._gradient()) / self.size
 
     def partial(self) -> FloatArray:
         body = self._body
         slopes = np.zeros(len(body.parameters))
-        along = body.along_parameters(self._density)
-        if along is None:
+        if body.along_parameters(self._density) is None:
             return slopes
         if len(body.scalars):
-            form = body.compiled(self, "partial", lambda: fenicsx.ScalarAssembler(along * body.dx, body.comm))
-            slopes[body.scalars] = [form() for _ in body.unit_directions()]
-        for field in body.fields:
-            if field.inside(self._density):
-                form = body.compiled(self, f"by {field.field.label}", partial(self._by, field))
-                slopes[field.positions] = field.pull(form())
+            slopes[body.scalars] = [self._partial() for _ in body.unit_directions()]
+        for field, assemble in self._by_fields:
+            slopes[field.positions] = field.pull(assemble())
         return slopes / self.size
-
-    def _by(self, field: VertexField) -> fenicsx.VectorAssembler:
-        """Assemble the derivative by the values of a random field at the vertices."""
-        body = self._body
-        return fenicsx.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm)
 
 
 class _Reaction:
@@ -235,11 +243,16 @@ class _MaxVonMises:
             cell, point = here[0]
             self._selector.x.array[self._selector.function_space.dofmap.cell_dofs(cell)[point]] = 1
         self._selector.x.scatter_forward()
-        stress = body.compiled(self, "stress", lambda: _Integral(body, self._selector * self._stress, 1.0))
-        weight = body.compiled(self, "weight", lambda: fenicsx.ScalarAssembler(self._selector * body.dx, body.comm))
-        stress.size = weight()
-        assert isinstance(stress, _Integral)
-        return stress
+        self._selected.size = self._weight()
+        return self._selected
+
+    @cached_property
+    def _selected(self) -> _Integral:
+        return _Integral(self._body, self._selector * self._stress, 1.0)
+
+    @cached_property
+    def _weight(self) -> fenicsx.ScalarAssembler:
+        return fenicsx.ScalarAssembler(self._selector * self._body.dx, self._body.comm)
 
     def gradient(self) -> FloatArray:
         return self._at_place().gradient()

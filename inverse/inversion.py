@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -565,13 +565,17 @@ def _invert(
 
 
 def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert) -> Chains | None:
-    if method.chains is None:
-        return None
-    if method.chains == "emcee":
-        return ensemble(posterior, gaussian, seed=method.seed)
-    # Fewer points than that say little of a covariance.
-    enough = found.effective >= max(FEWEST, 4 * len(gaussian.mode))
-    return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
+    match method.chains:
+        case None:
+            return None
+        case "emcee":
+            return ensemble(posterior, gaussian, seed=method.seed)
+        case "pcn":
+            # Fewer points than that say little of a covariance.
+            enough = found.effective >= max(FEWEST, 4 * len(gaussian.mode))
+            return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
+        case _:
+            assert_never(method.chains)
 
 
 def _moments(posterior: Posterior, gaussian: Laplace, weights: FloatArray, points: FloatArray, look: Look) -> Record:

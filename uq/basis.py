@@ -12,13 +12,23 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import TypeVar
+from typing import TypeVar, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.distributions import Distribution, LogUniform, Triangular, TruncatedNormal
+from uq.distributions import (
+    Beta,
+    Distribution,
+    Gamma,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Triangular,
+    TruncatedNormal,
+    Uniform,
+)
 from uq.inputs import Inputs
 
 IntArray = NDArray[np.int64]
@@ -199,8 +209,10 @@ def _rule(marginal: Distribution) -> tuple[FloatArray, FloatArray] | None:
             nodes, weights = _panels([marginal.lower, *within, marginal.upper])
             exponent = -(((nodes - marginal.mean) / marginal.std) ** 2) / 2
             weights = weights * np.exp(exponent - exponent.max())
-        case _:
+        case Uniform() | Beta() | Normal() | LogNormal() | Gamma():
             return None
+        case _:
+            assert_never(marginal)
     return nodes, weights / weights.sum()
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
 
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
@@ -319,7 +319,10 @@ def _stream(method: Sampling) -> tuple[object, ...] | None:
             return ("random",)
         case Chaos():
             return "design", method.gradients
-    return None
+        case MultilevelChaos():
+            return None  # every level draws afresh
+        case _:
+            assert_never(method)
 
 
 # --- one run of a method ---------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ Points are independent scrambles of Sobol' points, and errors come from drawing 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,17 @@ from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
 from uq.basis import gauss, hyperbolic, orthonormal
-from uq.distributions import Distribution, Gamma, LogNormal, Normal, Uniform
+from uq.distributions import (
+    Beta,
+    Distribution,
+    Gamma,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Triangular,
+    TruncatedNormal,
+    Uniform,
+)
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.indices import bootstrap, bootstrap_error, shares
 from uq.inputs import Inputs
@@ -162,6 +172,13 @@ def poincare(marginal: Distribution) -> float:
         case Gamma():
             k = marginal.shape
             return float(marginal.scale**2 * ((k + 1) ** 2 / k if k > 1 else 4))
+        case LogUniform() | Triangular() | Beta() | TruncatedNormal():
+            return _by_galerkin(marginal)
+        case _:
+            assert_never(marginal)
+
+
+def _by_galerkin(marginal: Distribution) -> float:
     before = np.inf
     for degree in DEGREES:
         constant = _by_polynomials(marginal, degree)
