@@ -21,6 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from forward.geometry import AXES, Body
+from forward.location import locate
 from forward.model import FloatArray, ModelError, SolveError
 from forward.own_mesh import OwnMesh
 
@@ -35,7 +36,7 @@ import dolfinx  # noqa: E402
 import dolfinx.fem.petsc  # noqa: E402
 import ffcx.naming  # noqa: E402
 import ufl  # noqa: E402
-from dolfinx import cpp, fem, geometry, mesh, plot  # noqa: E402
+from dolfinx import cpp, fem, mesh, plot  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
 
 if TYPE_CHECKING:
@@ -426,30 +427,29 @@ def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
     return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
 
 
-def point_weights(space: Any, points: FloatArray) -> list[tuple[NDArray[np.int32], FloatArray] | None]:
-    """Return nodes and weights that interpolate at each point (n, 3) that this rank owns a cell around; collective."""
-    msh = space.mesh
-    probe = fem.Function(space)  # on every rank: making one is collective
-    if _FIVE:
-        near = geometry.compute_collisions(geometry.BoundingBoxTree(msh, 3, padding=1e-10), points)
-    else:
-        near = geometry.compute_collisions_points(geometry.bb_tree(msh, 3, padding=1e-10), points)
-    colliding = geometry.compute_colliding_cells(msh, near, points)
-    found: list[tuple[NDArray[np.int32], FloatArray] | None] = []
-    for i, position in enumerate(points):
-        cells = colliding.links(i)
-        cells = cells[cells < _cell_map(msh).size_local]
-        if len(cells) == 0:
-            found.append(None)
-            continue
-        nodes = space.dofmap.cell_dofs(cells[0])
-        weights = np.empty(len(nodes))
-        for k, node in enumerate(nodes):
-            probe.x.array[3 * node] = 1
-            weights[k] = probe.eval(position, cells[0])[0]
-            probe.x.array[3 * node] = 0
-        found.append((nodes, weights))
-    return found
+def point_weights(
+    space: Any, points: FloatArray
+) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
+    """Return nodes and weights that interpolate at each point (n, 3), on one rank each; collective.
+
+    A point in no cell has the weights of the place of the mesh that is nearest; the other array (n,) says, on every
+    rank, how far it is from there (m). The rank that is nearest, and of several the first, has the point.
+    """
+    msh, comm = space.mesh, space.mesh.comm
+    lists = msh.geometry.dofmap
+    corners = lists.array.reshape(_cell_map(msh).size_local + _cell_map(msh).num_ghosts, -1) if _FIVE else lists
+    found = locate(msh.geometry.x[np.asarray(corners)[: _cell_map(msh).size_local]], points)
+    every = np.array(comm.allgather(found.distances))
+    degree = space.ufl_element().degree() if _FIVE else space.ufl_element().degree
+    family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
+    # Nodes of degree 1 and 2 stand in the same order in every cell: none has two on an edge or a face.
+    values = basix.create_element(family, _basix_cell(space), degree, variant).tabulate(0, found.reference)[0, :, :, 0]
+    mine = every.argmin(axis=0) == comm.rank
+    here = [
+        (np.asarray(space.dofmap.cell_dofs(cell)), np.array(row)) if own else None
+        for cell, row, own in zip(found.cells, values, mine, strict=True)
+    ]
+    return here, every.min(axis=0)
 
 
 def quadrature_points(space: Any, degree: int) -> FloatArray:

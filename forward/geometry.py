@@ -18,6 +18,7 @@ AXES: tuple[Axis, ...] = ("x", "y", "z")
 Length = Annotated[float, Gt(0)]
 Count = Annotated[int, Gt(0)]
 Vector = tuple[float, float, float]
+NEARBY = 1e-3  # of the diagonal of a body: distance from it that is an inaccuracy of places
 
 
 class _SixSided(Settings):
@@ -304,3 +305,20 @@ def _box_by_default(value: Any) -> Any:
 
 
 Body = Annotated[Box | Block | OwnMesh, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+
+
+def tolerance(body: Body) -> float:
+    """How far (m) a point may lie outside a body and still be meant to lie on it: a thousandth of its diagonal."""
+    return NEARBY * float(np.linalg.norm([high - low for low, high in body.bounds]))
+
+
+def holds(body: Body, point: Vector) -> bool:
+    """Whether a point (m) lies in the undeformed body, or no farther outside than `tolerance`.
+
+    Of a mesh from a file the box around it is looked at; where the mesh is made, the point must be near a cell.
+    """
+    if body.contains(point):
+        return True
+    at = np.array([point])
+    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, OwnMesh) else body.nearest(at)
+    return bool(np.linalg.norm(place - at) <= tolerance(body))

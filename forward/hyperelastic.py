@@ -14,7 +14,7 @@ from pydantic import Field, TypeAdapter, ValidationError, create_model, field_va
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.fields import RandomField
-from forward.geometry import AXES, Body, Vector
+from forward.geometry import AXES, Body, Vector, holds
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
 from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
@@ -336,7 +336,7 @@ class Hyperelastic(Settings):
                     "nothing holds this boundary, expected one that is clamped or moved",
                     output.on,
                 )
-            if isinstance(output, PointDisplacement) and not self.body.contains(output.at):
+            if isinstance(output, PointDisplacement) and not holds(self.body, output.at):
                 yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
 
     def _mistakes_of_regions(self) -> Iterator[Mistake]:

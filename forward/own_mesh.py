@@ -299,7 +299,7 @@ class OwnMesh(Settings):
             shares = np.linalg.solve(np.stack([b - a, c - a, d - a], axis=2), (point - a)[..., None])[..., 0]
             if ((shares >= -CLOSE).all(axis=1) & (shares.sum(axis=1) <= 1 + CLOSE)).any():
                 continue
-            places = _nearest_of(triangles, point)
+            places = nearest_of(triangles, point)
             found[i] = places[((places - point) ** 2).sum(axis=1).argmin()]
         return found
 
@@ -554,8 +554,8 @@ def _area(corners: FloatArray) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
 
 
-def _nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """Return the place (n, 3) of each triangle (n, 3, 3) that is nearest to a point (3,)."""
+def nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
+    """Return the place (n, 3) of each triangle (n, 3, 3) that is nearest to a point (3,), or to one (n, 3) each."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     square = (normal**2).sum(axis=1)

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.fields import RandomField
-from forward.geometry import AXES, Body, Vector
+from forward.geometry import AXES, Body, Vector, holds, tolerance
 from forward.hyperelastic import Hyperelastic, Material, Scalar
 from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
@@ -206,7 +206,7 @@ class Specimen(Settings):
             if name not in names:
                 yield _mistake(("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name)
         for point in item.at:
-            if not self.body.contains(point):
+            if not holds(self.body, point):
                 yield _mistake(("observed", i, "at"), "outside the body", list(point))
 
 
@@ -235,6 +235,8 @@ class SpecimenModel:
         Where the parameters of each case stand among all.
     observations
         B (n, U_local) of each case, sparse.
+    distances
+        How far (n,) the places lie outside the mesh (m), where the displacements of the nearest ones are observed.
     """
 
     def __init__(self, spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> None:
@@ -288,10 +290,12 @@ class SpecimenModel:
         self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
         numbers = range(len(self.models))
         self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
-        self.observations: list[csr_matrix] = [
+        found = [
             _interpolation(model, self.places[self.cases == number], self.axes[self.cases == number])
             for number, model in zip(numbers, self.models, strict=True)
         ]
+        self.observations: list[csr_matrix] = [matrix for matrix, _ in found]
+        self.distances = np.concatenate([distances for _, distances in found])
 
     @cached_property
     def vertices(self) -> Layout:
@@ -418,37 +422,42 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
     return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
 
 
-def _interpolation(model: HyperelasticModel, places: FloatArray, axes: NDArray[np.int64]) -> csr_matrix:
-    """Return B (n, U_local) of displacement components (n,) at places (n, 3); collective.
+def _interpolation(
+    model: HyperelasticModel, places: FloatArray, axes: NDArray[np.int64]
+) -> tuple[csr_matrix, FloatArray]:
+    """Return B (n, U_local) of components (n,) at places (n, 3), and how far (n,) these lie outside; collective.
 
     Raises
     ------
     ValueError
-        If a place lies in no cell.
+        If a place is farther from the mesh than the mesh can be from the body.
     """
     from scipy.sparse import csr_matrix
 
     from forward import fenicsx
 
-    body, layout = model.body, model.layout
+    body, layout, spec = model.body, model.layout, model.body.spec.body
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
+    which = which.ravel()
     numbers = layout.nodes()
-    found = fenicsx.point_weights(body.space, different) if len(places) else []
+    found, distances = fenicsx.point_weights(body.space, different) if len(places) else ([], np.zeros(0))
+    far = np.flatnonzero(distances > max(tolerance(spec), spec.longest_edge))
+    if len(far):
+        where = ", ".join(f"{x:g}" for x in different[far[0]])
+        message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
+        raise ValueError(message)
     mine = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
     held: dict[int, Any] = {}
-    for part in reversed(body.comm.allgather(mine)):  # the first rank that has a point counts
+    for part in body.comm.allgather(mine):
         held |= part
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
     rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for row, (i, axis) in enumerate(zip(which.ravel(), axes, strict=True)):
-        if i not in held:
-            message = f"({', '.join(f'{x:g}' for x in different[i])}) lies in no cell of the mesh"
-            raise ValueError(message)
+    for row, (i, axis) in enumerate(zip(which, axes, strict=True)):
         at, w = held[i]
         owned = local[at] >= 0
         rows.append(np.full(owned.sum(), row))
         columns.append(3 * local[at][owned] + axis)
         values.append(w[owned])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(entries, shape=(len(places), body.size))
+    return csr_matrix(entries, shape=(len(places), body.size)), distances[which]

@@ -131,7 +131,7 @@ class Observations:
             where = ", ".join(f"{x:g}" for x in self.places[worst])
             mistakes.append(
                 f"{self.labels[worst]}: ({where}) lies {distance[worst]:.3g} m outside the body, expected at most "
-                f"data.tolerance = {tolerance:g} m{_others(far.size - 1)}"
+                f"data.tolerance = {tolerance:.4g} m{_others(far.size - 1)}"
             )
         if mistakes:
             raise DataError(*mistakes)

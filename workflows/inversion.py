@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from forward.geometry import tolerance
 from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
 from forward.settings import Settings, nearest
@@ -32,6 +33,7 @@ from workflows.config import Correlation, Parallel, StudyError, mistakes_of_fact
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.geometry import Body
     from forward.model import Finding, FloatArray
     from forward.specimen import SpecimenModel
     from inverse.inversion import Variables
@@ -73,7 +75,8 @@ class DataFiles(Settings):
     unit
         m per unit of the files.
     tolerance
-        How far (m) points may lie outside the body; they are taken at the nearest place of it, and counted.
+        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are taken at the
+        nearest place of it, and counted.
     truth
         By path: what is inside, where that is known beside what the files say of it.
     sets
@@ -83,9 +86,13 @@ class DataFiles(Settings):
     files: tuple[str, ...] = Field(min_length=1)
     sigma: Annotated[float, Field(gt=0)] | None = None
     unit: Annotated[float, Field(gt=0)] = 1.0
-    tolerance: Annotated[float, Field(ge=0)] = 0.0
+    tolerance: Annotated[float, Field(ge=0)] | None = None
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
+
+    def allowed(self, body: Body) -> float:
+        """How far (m) points may lie outside a body."""
+        return tolerance(body) if self.tolerance is None else self.tolerance
 
     @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
     @classmethod
@@ -237,7 +244,7 @@ class Inversion(Settings):
         found = read(path, cases, self.data.unit).with_sigma(self.data.sigma)
         body = self.model.body
         extent = max(high - low for low, high in body.bounds)
-        found, moved = found.on(body.nearest, extent, self.data.tolerance)
+        found, moved = found.on(body.nearest, extent, self.data.allowed(body))
         truth, places, stiffness = dict(self.data.truth), np.zeros((0, 3)), np.zeros(0)
         for name, text in found.truth.items():
             if name not in {"stiffness", "inclusions"}:

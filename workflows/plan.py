@@ -123,10 +123,15 @@ def _inversion(study: Inversion) -> list[str]:
         *_found(spec.body),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
-        *([f"            {sum(moved)} points outside the body are moved to its surface"] if sum(moved) else []),
+        *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
         f"time        about {_duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
+
+
+def _moved(count: int, farthest: float) -> str:
+    are = "point outside the body is" if count == 1 else "points outside the body are"
+    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m"
 
 
 def _synthesis(study: Synthesis) -> list[str]:

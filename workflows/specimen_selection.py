@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from forward.geometry import AXES, Vector
+from forward.geometry import AXES, Vector, tolerance
 from forward.hyperelastic import Mistake
 from forward.settings import Settings
 from forward.specimen import Specimen
@@ -44,13 +44,14 @@ class DisplacementFile(Settings):
     unit
         m per unit of the file.
     tolerance
-        How far (m) points may lie outside the body; they are taken at the nearest place of it.
+        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are taken at the
+        nearest place of it.
     """
 
     file: str
     sigma: Positive | None = None
     unit: Positive = 1.0
-    tolerance: Annotated[float, Field(ge=0)] = 0.0
+    tolerance: Annotated[float, Field(ge=0)] | None = None
 
     def read(self, folder: Path, specimen: Specimen) -> dict[str, Any]:
         """Return the block `data` with the displacements themselves.
@@ -66,7 +67,8 @@ class DisplacementFile(Settings):
             found = read(folder / self.file, cases, self.unit)
             if self.sigma is not None:
                 found = found.with_sigma(self.sigma)
-            found = found.on(specimen.body.nearest, extent, self.tolerance)[0]
+            allowed = tolerance(specimen.body) if self.tolerance is None else self.tolerance
+            found, moved = found.on(specimen.body.nearest, extent, allowed)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         data = found.components()
@@ -79,6 +81,7 @@ class DisplacementFile(Settings):
             "cases": [cases[case] for case in data.cases],
             "measured": data.values.tolist(),
             **({"sigma": data.sigma.tolist()} if known else {}),
+            **({"points_moved": int((moved > 0).sum()), "largest_move": float(moved.max())} if moved.any() else {}),
         }
 
 
@@ -97,6 +100,8 @@ class MeasuredDisplacements(Settings):
         Standard deviations (m) of their errors, where they are known.
     source
         Where they are from, line by line.
+    points_moved, largest_move
+        How many points lay outside the body, and how far (m) the farthest one was moved to it.
     """
 
     places: tuple[Vector, ...] = Field(min_length=1)
@@ -105,6 +110,8 @@ class MeasuredDisplacements(Settings):
     measured: tuple[float, ...]
     sigma: tuple[Positive, ...] | None = None
     source: tuple[str, ...] = ()
+    points_moved: int = 0
+    largest_move: float = 0.0
 
     @model_validator(mode="after")
     def _check_sizes(self) -> MeasuredDisplacements:

@@ -227,7 +227,7 @@ _INVERT = """
 files = ["measured.csv"]
 sigma = 2e-5          # standard deviation (m) of the errors, where a file does not say
 # unit = 1e-3         # m per unit of the files
-# tolerance = 1e-4    # how far (m) points may lie outside the body
+# tolerance = 1e-4    # how far (m) points may lie outside the body; by default a thousandth of it
 
 [method]
 """
