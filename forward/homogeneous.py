@@ -1,15 +1,15 @@
 """Material-point tests: the stress of a homogeneously deformed specimen, from the energies of the finite elements.
 
-A test prescribes one stretch (or shear) x; free faces leave the lateral stretch y. With the energy W(x, y) of the
-specimen per volume, the nominal stress that does work on x is
+A test prescribes one stretch (or shear) x, and perhaps another one z across; free faces leave the lateral stretch y.
+With the energy W(x, z, y) of the specimen per volume, the nominal stresses that do work on x and on z are
 
-    P = (1/k) dW(x, y(x))/dx,
+    P1 = (1/k) dW(x, z, y(x, z))/dx,   P2 = dW(x, z, y(x, z))/dz,
 
-with k = 2 where two equal stretches are prescribed. An incompressible specimen has y(x) from J = 1; a compressible one
-has ∂W/∂y = 0, and then dW/dx = ∂W/∂x. Fibres lie such that no shear is needed for that. SymPy reads the energy and
-differentiates it, so that stresses and their derivatives with respect to the constants are closed forms (of y, which
-Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics (2000), chapter 6; R. W. Ogden,
-Non-Linear Elastic Deformations (1984).
+with k = 2 where two equal stretches are prescribed. An incompressible specimen has y from J = 1; a compressible one has
+∂W/∂y = 0, and then dW/dx = ∂W/∂x. Cauchy stresses are P1 x/J and P2 z/J. Fibres lie such that no shear is needed for
+that. SymPy reads the energy and differentiates it, so that stresses and their derivatives with respect to the constants
+are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics
+(2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from forward.model import FloatArray, FunctionModel, FunctionSolution, Reference
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
+Component = Literal["P1", "P2", "P1-P2"]
+HELD: tuple[Mode, ...] = ("biaxial", "pure-shear")  # modes in which something acts across
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
@@ -39,28 +41,32 @@ class MaterialTest(Settings):
     Parameters
     ----------
     mode
-        "uniaxial" (tension or compression), "equibiaxial", "biaxial" (two stretches, of which the stress along the
-        first is read), "pure-shear" (planar tension: one width is held) or "simple-shear".
+        "uniaxial" (tension or compression), "equibiaxial", "biaxial" (two stretches), "pure-shear" (planar tension: one
+        width is held) or "simple-shear".
     at
         Stretches λ > 0, or amounts of shear γ.
     across
         Second stretch at each of them (biaxial only).
     stress
         "nominal" (force over undeformed area) or "cauchy".
+    component
+        Which stress is read: "P1", along `at`; in "biaxial" and "pure-shear" also "P2", across, and their difference
+        "P1-P2", which of Cauchy stresses does not depend on the pressure.
     name
-        Name of the test in the names of the outputs; by default its mode.
+        Name of the test in the names of the outputs; by default its mode, with the component where that is not P1.
     """
 
     mode: Mode
     at: tuple[float, ...] = Field(min_length=1)
     across: tuple[Positive, ...] | None = None
     stress: Literal["nominal", "cauchy"] = "nominal"
+    component: Component = "P1"
     name: str = ""
 
     @property
     def label(self) -> str:
         """The name in outputs."""
-        return self.name or self.mode
+        return self.name or named(self.mode, self.component)
 
     @model_validator(mode="after")
     def _check(self) -> MaterialTest:
@@ -70,10 +76,18 @@ class MaterialTest(Settings):
         if (self.across is not None) != (self.mode == "biaxial"):
             message = "across: is for mode = 'biaxial', and only for it"
             raise ValueError(message)
+        if self.component != "P1" and self.mode not in HELD:
+            message = f"component: {self.component} of a test '{self.mode}', expected P1: nothing acts across"
+            raise ValueError(message)
         if self.across is not None and len(self.across) != len(self.at):
             message = f"across: {len(self.across)} stretches, expected as many as in at: {len(self.at)}"
             raise ValueError(message)
         return self
+
+
+def named(test: str, component: Component) -> str:
+    """Return the name of a test with that of the stress that is read, where it is not the first one."""
+    return test if component == "P1" else f"{test} {component}"
 
 
 class HomogeneousModel:
@@ -125,7 +139,9 @@ class HomogeneousModel:
         self._values = np.array([values.get(name, np.nan) for name in self._names])
         self._varied = [self._names.index(name) for name in parameters]
         self._tests = tuple(tests)
-        self._readings = [reading(energy, test.mode, self._names, units) for test in tests]
+        self._readings = [
+            reading(energy, test.mode, self._names, units, test.component, test.stress == "cauchy") for test in tests
+        ]
         many = {test.label for test in tests if len(test.at) > 1}
         self.outputs = tuple(
             f"{test.label}[{i}]" if test.label in many else test.label for test in tests for i in range(len(test.at))
@@ -147,7 +163,7 @@ class HomogeneousModel:
         found = []
         for test, read in zip(self._tests, self._readings, strict=True):
             x, across = np.array(test.at), np.array(test.across if test.across is not None else 1.0)
-            stress, slopes = read(x, across, theta, test.stress == "cauchy", derivatives)
+            stress, slopes = read(x, across, theta, derivatives)
             found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
         return found
 
@@ -203,14 +219,14 @@ _MODES: dict[str, _Kinematics] = {
     "uniaxial": _Kinematics(lambda ops, x, z, y: (x, y, y), lambda x, z: x ** (-0.5), alike=((1, 2),)),
     "equibiaxial": _Kinematics(lambda ops, x, z, y: (x, x, y), lambda x, z: x ** (-2.0), share=2, alike=((0, 1),)),
     "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),
-    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, 1, y), lambda x, z: 1 / x),
+    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),  # z = 1
     # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
     "simple-shear": _Kinematics(
         lambda ops, x, z, y: (ops.sqrt(1 + x**2 / 4) + x / 2, ops.sqrt(1 + x**2 / 4) - x / 2, 1), None
     ),
 }
 
-Reading = Callable[[FloatArray, FloatArray, FloatArray, bool, bool], tuple[FloatArray, FloatArray]]
+Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray, FloatArray]]
 
 
 def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
@@ -237,9 +253,14 @@ def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]])
 
 @cache
 def reading(
-    energy: str, mode: Mode, names: tuple[str, ...], fibres: tuple[tuple[float, float, float], ...] = ()
+    energy: str,
+    mode: Mode,
+    names: tuple[str, ...],
+    fibres: tuple[tuple[float, float, float], ...] = (),
+    component: Component = "P1",
+    cauchy: bool = False,
 ) -> Reading:
-    """Return (x (k,), z (k,), θ (c, n, 1), cauchy, derivatives) → stresses (n, k) and dσ/dθ (c, n, k) of a mode.
+    """Return (x (k,), z (k,), θ (c, n, 1), derivatives) → stresses (n, k) and dσ/dθ (c, n, k) of a mode.
 
     Parameters
     ----------
@@ -249,6 +270,8 @@ def reading(
         The c constants θ; without D1 an energy that has it is read at J = 1.
     fibres
         Unit vectors along the families of fibres.
+    component, cauchy
+        Which stress, as of `MaterialTest`.
     """
     import sympy
 
@@ -267,7 +290,12 @@ def reading(
     W = MATERIALS[energy](_operators(), *measured(energy, stretches, J, squared).values(), **values)
     if incompressible and kinematics.incompressible is not None:
         W = W.subs(y, _exact(kinematics.incompressible(x, z)))
-    P = W.diff(x) / kinematics.share
+    along, across = W.diff(x) / kinematics.share, W.diff(z)
+    if cauchy and not confined:
+        along, across = along * x / J, across * z / J
+    P = {"P1": along, "P2": across, "P1-P2": along - across}[component]
+    if mode == "pure-shear":
+        W, P = W.subs(z, 1), P.subs(z, 1)
 
     def compiled(expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
         symbols = [x, z, y, *theta.values()]
@@ -283,7 +311,7 @@ def reading(
         others = compiled([P.diff(y), g.diff(y), *(g.diff(s) for s in theta.values())])
 
     def read(
-        at: FloatArray, across: FloatArray, constants_: FloatArray, cauchy: bool, derivatives: bool
+        at: FloatArray, across: FloatArray, constants_: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray]:
         shape = np.broadcast_shapes(at.shape, constants_.shape[1:])
         lateral = np.ones(shape)
@@ -300,16 +328,6 @@ def reading(
             if free and derivatives:
                 P_y, g_y, *g_theta = others(*arguments)
                 by_constant = by_constant - np.array([np.broadcast_to(P_y / g_y * g_t, shape) for g_t in g_theta])
-            if cauchy and not confined:
-                if free and derivatives:
-                    # σ = P x / J, and J changes with y by J'(y), y by −g_θ/g_y
-                    J, J_y = _volume(mode, at, across, lateral)
-                    dy = -np.array([np.broadcast_to(g_t / g_y, shape) for g_t in g_theta])
-                    by_constant = by_constant * at / J - stress * at * J_y / J**2 * dy
-                    stress = stress * at / J
-                else:
-                    scale = at / _volume(mode, at, across, lateral)[0] if free else at
-                    stress, by_constant = stress * scale, by_constant * scale
         return stress, by_constant
 
     return read
@@ -329,13 +347,6 @@ def _exact(expression: Any) -> Any:
     import sympy
 
     return sympy.nsimplify(expression)
-
-
-def _volume(mode: str, x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """J and ∂J/∂y."""
-    a, b, c = _MODES[mode].stretches(np, x, z, y)
-    J = np.asarray(a * b * c)
-    return J, (2 if mode == "uniaxial" else 1) * J / y
 
 
 def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:

@@ -2,9 +2,9 @@
 
 That one model is the most probable does not make it good. For that, the residuals r of each model are compared with
 those that it would have if it were true: their squares Σr² ~ χ², and their correlation between neighbours of a test,
-Σ r_i r_{i+1}/Σ r², whose distribution for independent errors is drawn once. Both are posterior predictive probabilities
-(A. Gelman, X.-L. Meng, H. Stern, Stat. Sinica 6 (1996) 733–807); the second one says something even where the
-size of the noise was inferred.
+Σ r_i r_j/Σ r² over pairs of them (`inverse.neighbours`), whose distribution for independent errors is drawn once. Both
+are posterior predictive probabilities (A. Gelman, X.-L. Meng, H. Stern, Stat. Sinica 6 (1996) 733–807); the second one
+says something even where the size of the noise was inferred.
 
 Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i) (A. Vehtari, A. Gelman, J. Gabry, Stat.
 Comput. 27 (2017) 1413–1432), or whole tests t, by ln p(y_t | other tests) = ln Z − ln Z without t: data of one test
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from inverse.evidence import Evidence
 from inverse.laplace import Laplace
+from inverse.neighbours import Neighbours, neighbours
 from inverse.posterior import Posterior
 from inverse.weights import tail_shape
 from uq.inputs import Inputs
@@ -66,15 +67,27 @@ class Data:
         Name of the test of each output (M,).
     at
         Where in the test (M,).
-    neighbours
-        Numbers of data that stand beside each other, two (k,); by default those that follow each other in a test.
+    places
+        Where the data are, (m, k), in the space in which they stand beside each other; by default `at`.
+    kinds
+        Numbers (m,) of what can be compared; by default of the tests.
     """
 
     values: FloatArray
     sigma: FloatArray | None
     tests: tuple[str, ...]
     at: FloatArray
-    neighbours: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
+    places: FloatArray | None = None
+    kinds: NDArray[np.int64] | None = None
+
+    @property
+    def sorted(self) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.int64]]:
+        """Numbers (m,) of the data in an order that is not that of the rows, and their places and kinds in it."""
+        m = self.values.size
+        places = self.at[:m, None] if self.places is None else self.places
+        kinds = np.unique(self.tests[:m], return_inverse=True)[1] if self.kinds is None else self.kinds
+        order = np.lexsort((*places.T, kinds))
+        return order, places[order], kinds[order]
 
 
 @dataclass(frozen=True)
@@ -121,28 +134,17 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
     tails = np.array([tail_shape(np.exp(column)) for column in (log_ratio - top).T])
-    neighbours = data.neighbours or _neighbours(data)
+    order, places, kinds = data.sorted
+    beside = neighbours(places, kinds)
     m = posterior.data.size
     misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
-    drawn = np.sort(agreement(errors, neighbours))
-    larger = 1 - np.searchsorted(drawn, agreement(r, neighbours)) / DRAWS
+    drawn = np.sort(agreement(errors, beside))
+    larger = 1 - np.searchsorted(drawn, agreement(r[:, order], beside)) / DRAWS
     return Criticism(scores, tails, misfit, float(w @ larger))
 
 
-def _neighbours(data: Data) -> tuple[FloatArray, FloatArray]:
-    """Numbers of data that stand beside each other in a test."""
-    m = data.values.size
-    first, second = [], []
-    for test in dict.fromkeys(data.tests[:m]):
-        members = np.array([i for i in range(m) if data.tests[i] == test])
-        members = members[np.argsort(data.at[members], kind="stable")]
-        first.append(members[:-1])
-        second.append(members[1:])
-    return np.concatenate(first), np.concatenate(second)
-
-
-def agreement(r: FloatArray, neighbours: tuple[Any, Any]) -> FloatArray:
+def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
     """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
     return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
 

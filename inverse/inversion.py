@@ -44,11 +44,12 @@ from inverse.evidence import LEAST, Evidence, evidence
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import Laplace, laplace
 from inverse.low_rank import CUTOFF, LowRankPosterior, Spectrum
+from inverse.neighbours import neighbours
 from inverse.newton_cg import Mode, find_mode
 from inverse.noise import infer_noise
 from inverse.observations import Components
 from inverse.posterior import NOISE, Posterior
-from inverse.predictive import ResidualTest, examine, neighbours, spectrum_of
+from inverse.predictive import ResidualTest, examine, spectrum_of
 from inverse.weights import resampled
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate, Recorder, Request, SerialEvaluate, Start

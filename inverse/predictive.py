@@ -21,11 +21,11 @@ from inverse.evidence import Evidence
 from inverse.field_posterior import Point
 from inverse.laplace import Laplace
 from inverse.low_rank import LowRankPosterior, Spectrum
+from inverse.neighbours import Neighbours
 from inverse.posterior import Density, Posterior
 
 LEVELS = (0.025, 0.5, 0.975)
 Map = Callable[[FloatArray], FloatArray]
-Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 # --- derived quantities ----------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def examine(
     measured
         Not zero (n,) where something was measured.
     neighbours
-        Numbers of data that are expected to agree if the model is wrong, as of `neighbours`.
+        Numbers of data that are expected to agree if the model is wrong, as of `inverse.neighbours`.
     """
     from scipy.special import chdtrc
 
@@ -201,31 +201,3 @@ def examine_few(posterior: Posterior, gaussian: Laplace, neighbours: Neighbours 
 def _scale(posterior: Posterior, x: FloatArray) -> FloatArray:
     scale = posterior.sigma
     return scale if posterior.noise is None else np.asarray(scale * posterior.physical(x)[0, -1])
-
-
-def neighbours(places: FloatArray, groups: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
-    """Pair every datum with its nearest of the same group, each pair once.
-
-    Parameters
-    ----------
-    places
-        (n, 3).
-    groups
-        Numbers (n,) of what can be compared: of load cases and components, `3 * cases + axes`.
-    measured
-        Not zero (n,) where something was measured; by default everywhere.
-    """
-    from scipy.spatial import cKDTree
-
-    seen = np.ones(len(places), dtype=bool) if measured is None else np.asarray(measured) != 0
-    pairs: set[tuple[int, int]] = set()
-    for group in np.unique(groups[seen]):
-        members = np.flatnonzero(seen & (groups == group))
-        if len(members) < 2:
-            continue
-        _, found = cKDTree(places[members]).query(places[members], k=2)
-        # A place that stands twice may be its own second neighbour: whichever of both is not the datum itself.
-        other = np.where(found[:, 0] == np.arange(len(members)), found[:, 1], found[:, 0])
-        pairs |= {(int(min(i, j)), int(max(i, j))) for i, j in zip(members, members[other], strict=True)}
-    ordered = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
-    return ordered[:, 0], ordered[:, 1]

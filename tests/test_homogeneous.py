@@ -60,6 +60,40 @@ def test_incompressible_closed_forms():
     np.testing.assert_allclose(found[3], 2 * x * (C1 + C2), rtol=1e-13)
 
 
+def test_both_stresses_of_a_biaxial_test():
+    """σ1 − σ3 = 2(λ1² − λ3²)(C1 + λ2² C2) and the same with 1 and 2 exchanged: R. S. Rivlin, D. W. Saunders (1951)."""
+    x, z, C1, C2 = np.array([1.2, 1.3, 0.8, 2.0]), np.array([1.1, 0.9, 1.0, 1.5]), 1e4, 3e4
+    for mode, across in (("biaxial", z), ("pure-shear", np.ones(4))):
+        given = {"mode": mode, "at": tuple(x), "across": tuple(across) if mode == "biaxial" else None}
+        free = (x * across) ** -2.0
+        sigma = [2 * (a**2 - free) * (C1 + b**2 * C2) for a, b in ((x, across), (across, x))]
+        for stress, scale in (("cauchy", (1, 1)), ("nominal", (x, across))):
+            first, second = (one / by for one, by in zip(sigma, scale, strict=True))
+            for component, exact in (("P1", first), ("P2", second), ("P1-P2", first - second)):
+                test = MaterialTest(**given, stress=stress, component=component)
+                found = model("mooney-rivlin", {"C1": C1, "C2": C2}, test)
+                np.testing.assert_allclose(_at(found), exact, rtol=1e-12, atol=1e-9)
+    assert MaterialTest(mode="pure-shear", at=(1.1,), component="P2").label == "pure-shear P2"
+
+
+@pytest.mark.parametrize("kind", ["mooney-rivlin", "blatz-ko"])
+def test_stresses_across_of_compressible_materials(kind):
+    """What acts across is what acts along the specimen turned by a right angle, and so are its derivatives."""
+    values = VALUES[kind] | ({"D1": 3e4} if kind == "mooney-rivlin" else {})
+    point = np.array([list(values.values())])
+    for stress in ("nominal", "cauchy"):
+        turned = MaterialTest(mode="biaxial", at=(1.1, 0.9), across=(1.2, 1.3), stress=stress)
+        along = model(kind, values, turned).stresses_and_derivatives(point)
+        here = {"mode": "biaxial", "at": (1.2, 1.3), "across": (1.1, 0.9), "stress": stress}
+        whole = [
+            model(kind, values, MaterialTest(**here, component=c)).stresses_and_derivatives(point)
+            for c in ("P1", "P2", "P1-P2")
+        ]
+        for one, two, difference, other in zip(*whole, along, strict=True):
+            np.testing.assert_allclose(two, other, rtol=1e-10)
+            np.testing.assert_allclose(difference, one - two, rtol=1e-9, atol=1e-9 * np.abs(one).max())
+
+
 def test_ogden_with_exponents_two_and_minus_two_is_mooney_rivlin():
     """W = μ1/2 (I1 − 3) − μ2/2 (I2 − 3) for exponents 2 and −2, so that C1 = μ1/2 and C2 = −μ2/2."""
     for volume in ({}, {"D1": 2e4}):
@@ -192,6 +226,7 @@ def test_mistakes_are_named():
         ({"mode": "biaxial", "at": (1.1,)}, "across"),
         ({"mode": "uniaxial", "at": (1.1,), "across": (1.0,)}, "across"),
         ({"mode": "biaxial", "at": (1.1, 1.2), "across": (1.0,)}, "1 stretches, expected as many as in at: 2"),
+        ({"mode": "uniaxial", "at": (1.1,), "component": "P2"}, "nothing acts across"),
     ):
         with pytest.raises(ValidationError, match=told):
             MaterialTest.model_validate(settings)

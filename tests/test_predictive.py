@@ -9,6 +9,7 @@ from inverse.evidence import evidence
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import laplace
 from inverse.low_rank import LowRankPosterior
+from inverse.neighbours import neighbours
 from inverse.newton_cg import find_mode
 from inverse.posterior import Posterior
 from inverse.predictive import (
@@ -17,7 +18,6 @@ from inverse.predictive import (
     derived_of_field,
     examine,
     examine_few,
-    neighbours,
     predictive_std,
     summary,
 )
@@ -129,6 +129,31 @@ def test_neighbours_are_of_the_same_group_and_measured():
     places = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [0, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
     groups = np.array([0, 0, 0, 1, 1, 1])
     first, second = neighbours(places, groups)
-    assert list(zip(first, second, strict=True)) == [(0, 1), (1, 2), (3, 4), (4, 5)]
+    assert list(zip(first, second, strict=True)) == [(0, 1), (1, 2), (3, 4), (3, 5), (4, 5)]
     first, second = neighbours(places, groups, np.array([1, 0, 1, 1, 0, 0]))
     assert list(zip(first, second, strict=True)) == [(0, 2)]
+
+
+def test_neighbours_depend_on_distances_only():
+    """No third place is nearer to both: by all pairs of 60 places, turned and in another order, with repeated ones."""
+    rng = np.random.default_rng(0)
+    for dimension in (1, 2, 3):
+        places = rng.uniform(size=(50, dimension))
+        places = np.concatenate([places, places[:10]])
+        far = np.linalg.norm(places[:, None] - places[None], axis=2)
+        larger = np.maximum(far[:, None, :], far[None, :, :])  # of the distances from i and from j to k
+        related = (larger >= far[:, :, None] * (1 - 1e-9)).all(axis=2)
+        expected = {(i, j) for i, j in np.argwhere(related).tolist() if i < j}
+        turn = np.linalg.qr(rng.standard_normal((dimension, dimension)))[0]
+        order = rng.permutation(60)
+        for moved, back in ((places, np.arange(60)), (places @ turn, np.arange(60)), (places[order], order)):
+            first, second = neighbours(moved, np.zeros(60, dtype=np.int64))
+            pairs = zip(back[first].tolist(), back[second].tolist(), strict=True)
+            assert {(min(i, j), max(i, j)) for i, j in pairs} == expected
+
+
+def test_neighbours_on_a_grid_stand_along_its_axes():
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 0.3, 4)), axis=-1).reshape(-1, 2)
+    first, second = neighbours(grid, np.zeros(28, dtype=np.int64))
+    differ = np.abs(grid[first] - grid[second]) > 1e-9
+    assert (differ.sum(axis=1) == 1).all()

@@ -298,6 +298,59 @@ def test_second_stretches_and_errors_in_a_table(small):
         load(small, columns)
 
 
+def test_both_stresses_in_a_table(small):
+    """As columns beside each other, or as rows that say which stress they hold."""
+    wide = ["mode,l1,l2,s1,s2", "uniaxial,1.1,,0.3,", "biaxial,1.1,1.2,0.4,0.6", "biaxial,1.3,1.2,,0.7"]
+    named = ["data.at='l1'", "data.across='l2'"]
+    columns = [*named, "data.measured={P1='s1', P2='s2'}"]
+    table = small.parent / "table.csv"
+    table.write_text("\n".join(wide))
+    study = load(small, columns)
+    tests = [(t.label, t.component, t.at, t.across, t.measured) for t in study.data.tests]
+    assert tests == [
+        ("uniaxial", "P1", (1.1,), None, (300.0,)),
+        ("biaxial", "P1", (1.1,), (1.2,), (400.0,)),
+        ("biaxial P2", "P2", (1.1, 1.3), (1.2, 1.2), (600.0, 700.0)),
+    ]
+    assert parse(tomllib.loads(dump(study))) == study
+    table.write_text("mode,l1,l2,which,stress\nbiaxial,1.1,1.2,P1-P2,0.4\nbiaxial,1.1,1.2,,0.5\n")
+    tests = load(small, [*named, "data.component='which'"]).data.tests
+    assert [(t.label, t.measured) for t in tests] == [("biaxial P1-P2", (400.0,)), ("biaxial", (500.0,))]
+    for row, told in (
+        ("uniaxial,1.1,,0.3,0.2", "line 5, s2: a stress across, expected an empty cell"),
+        ("biaxial,1.1,1.2,,", "line 5: no stress, expected one in s1 or s2"),
+        ("biaxial,1.1,1.2,x,", "line 5, s1: 'x', expected a number"),
+    ):
+        table.write_text("\n".join([*wide, row]))
+        with pytest.raises(StudyError, match=told):
+            load(small, columns)
+    with pytest.raises(StudyError, match="sigma: no column for P2"):
+        load(small, [*columns, "data.sigma={P1='s1'}"])
+    with pytest.raises(StudyError, match="no column 's3'; did you mean"):
+        load(small, [*named, "data.measured={P1='s3'}"])
+
+
+def test_the_order_of_rows_says_nothing_of_neighbours():
+    """Residuals that follow each other in the plane of the stretches, whichever way the rows are written."""
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.linspace(1.1, 2, 6), np.linspace(1.1, 2, 5)), axis=-1).reshape(-1, 2)
+    truth = HomogeneousModel("gent", {"mu": 4e5, "Jm": 8.0}, [_biaxial(grid)], ()).stresses(np.zeros((1, 0)))[0]
+    values = truth + 2e3 * rng.standard_normal(truth.size)
+    found = []
+    for order in (np.arange(30), rng.permutation(30), np.lexsort(grid.T)):
+        it = HomogeneousModel("neo-hookean", {}, [_biaxial(grid[order])], ("C1",))
+        data = Data(values[order], None, ("biaxial",) * 30, grid[order, 0], grid[order])
+        candidate = Candidate(Inputs({"C1": LogNormal(mean=2e5, std=1e5)}))
+        one = posterior(candidate, data, Noise(absolute=2e4, factor=FACTOR), SerialEvaluate(it))
+        found.append(criticise(evidence(one, laplace(one), 64), one, data).correlation)
+    assert found[0] < 0.01
+    np.testing.assert_allclose(found[1:], found[0], atol=1e-12)
+
+
+def _biaxial(stretches):
+    return MaterialTest(mode="biaxial", at=tuple(stretches[:, 0]), across=tuple(stretches[:, 1]))
+
+
 def test_subsets_are_of_known_tests(small):
     with pytest.raises(StudyError, match=r"method\.subsets\.x: no test has this name; did you mean 'uniaxial'"):
         load(small, ['method.subsets={x = ["uniaxal"]}'])

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from forward.geometry import Vector
-from forward.homogeneous import HomogeneousModel, MaterialTest, Mode, unfit
+from forward.homogeneous import HELD, Component, HomogeneousModel, MaterialTest, Mode, named, unfit
 from forward.hyperelastic import Mistake
 from forward.materials import MATERIALS, constants
 from forward.model import Finding, ForwardModel
@@ -28,6 +28,7 @@ from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mist
 if TYPE_CHECKING:
     import xarray as xr
 
+COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
 SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 DRAWS = 1000  # of the constants, that are left for ArviZ
@@ -69,7 +70,11 @@ class DataFile(Settings):
         The table, beside the study.
     mode, at, across, measured, sigma, group
         Names of the columns: kind of test, stretch or amount of shear, second stretch (of biaxial tests), stress and,
-        if there are any, its standard deviation and the group.
+        if there are any, its standard deviation and the group. Where rows hold both stresses, or their difference,
+        `measured` (and `sigma`) name a column for each: ``{ P1 = "force_x", P2 = "force_y" }``; empty cells are left
+        out. Each stress is a test of its own: "biaxial", "biaxial P2", "biaxial P1-P2".
+    component
+        Column that says which stress a row holds, where there is one in each: P1, P2 or P1-P2.
     modes
         What the words of the column of modes mean, where they are not modes themselves.
     unit
@@ -86,8 +91,9 @@ class DataFile(Settings):
     mode: str = "mode"
     at: str = "stretch"
     across: str | None = None
-    measured: str = "stress"
-    sigma: str | None = None
+    measured: str | dict[Component, str] = "stress"
+    sigma: str | dict[Component, str] | None = None
+    component: str | None = None
     group: str | None = None
     modes: dict[str, Mode] = Field(default={})
     unit: Annotated[float, Field(gt=0)] = 1.0
@@ -108,44 +114,100 @@ class DataFile(Settings):
             table = read_table(path)
         except DataError as error:
             raise StudyError(*(f"data.file: {line}" for line in error.args)) from None
-        columns = [self.mode, self.at, self.measured, self.across, self.sigma, self.group, *self.where]
+        stresses = self.stresses
+        columns = [self.mode, self.at, self.across, self.component, self.group, *self.where]
+        columns += [column for pair in stresses.values() for column in pair]
         for column in columns:
             if column is not None and column not in table.columns:
                 message = f"data: {path} has no column '{column}'; {nearest(column, table.columns)}"
                 raise StudyError(message)
-        tests: dict[tuple[str, str], dict[str, list[float]]] = {}
+        tests: dict[tuple[str, str, Component], dict[str, list[float]]] = {}
         for line, row in zip(table.lines, table.rows, strict=True):
             if any(row[column] != word for column, word in self.where.items()):
                 continue
             word = row[self.mode]
             mode = self.modes.get(word, word)
             sheared = mode == "simple-shear"
-            at = _number(row[self.at], f"{path}, line {line}, {self.at}", positive=not sheared)
+            place = f"{path}, line {line}"
+            at = _number(row[self.at], f"{place}, {self.at}", positive=not sheared)
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
-                message = f"data: {path}, line {line}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
+                message = f"data: {place}: unknown mode '{word}'; {nearest(word, (*MODES, *self.modes))}"
                 raise StudyError(message)
-            test = tests.setdefault((row[self.group] if self.group else WHOLE, word), {})
-            for key, column, unit, positive in (
-                ("at", self.at, 1.0, not sheared),
-                ("across", self.across, 1.0, True),
-                ("measured", self.measured, self.unit, False),
-                ("sigma", self.sigma, self.unit, True),
-            ):
-                if column is not None and (key != "across" or mode == "biaxial"):
-                    value = _number(row[column], f"{path}, line {line}, {column}", positive=positive)
-                    test.setdefault(key, []).append(unit * value)
+            across = None
+            if self.across is not None and mode == "biaxial":
+                across = _number(row[self.across], f"{place}, {self.across}", positive=True)
+            held = mode in HELD
+            for component, (measured, sigma) in self._in_row(row, place, held=held).items():
+                test = tests.setdefault((row[self.group] if self.group else WHOLE, word, component), {})
+                test.setdefault("at", []).append(at)
+                if across is not None:
+                    test.setdefault("across", []).append(across)
+                value = _number(row[measured], f"{place}, {measured}")
+                test.setdefault("measured", []).append(self.unit * value)
+                if sigma is not None:
+                    width = _number(row[sigma], f"{place}, {sigma}", positive=True)
+                    test.setdefault("sigma", []).append(self.unit * width)
         if not tests:
             message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
             raise StudyError(message)
         return {
             "source": list(table.remarks),
             "tests": [
-                {"mode": self.modes.get(word, word), "name": word, "group": group, "stress": self.stress, **columns}
-                for (group, word), columns in tests.items()
+                {
+                    "mode": self.modes.get(word, word),
+                    "name": named(word, component),
+                    "group": group,
+                    "stress": self.stress,
+                    "component": component,
+                    **columns,
+                }
+                for (group, word, component), columns in tests.items()
             ],
         }
+
+    @property
+    def stresses(self) -> dict[Component, tuple[str, str | None]]:
+        """Columns of each stress and of its standard deviation."""
+        measured: dict[Component, str] = {"P1": self.measured} if isinstance(self.measured, str) else self.measured
+        sigma = self.sigma if isinstance(self.sigma, dict) else dict.fromkeys(measured, self.sigma)
+        return {component: (column, sigma.get(component)) for component, column in measured.items()}
+
+    def _in_row(self, row: Mapping[str, str], place: str, *, held: bool) -> dict[Component, tuple[str, str | None]]:
+        """Columns of the stresses that a row holds; where something acts across, there may be two."""
+        stresses = self.stresses
+        if self.component is not None:
+            word = row[self.component] or "P1"
+            component = next((name for name in COMPONENTS if name == word), None)
+            if component is None:
+                message = f"data: {place}, {self.component}: '{word}'; {nearest(word, COMPONENTS)}"
+                raise StudyError(message)
+            return {component: next(iter(stresses.values()))}
+        found = {c: pair for c, pair in stresses.items() if len(stresses) == 1 or row[pair[0]].strip()}
+        strange = next((pair[0] for c, pair in found.items() if c != "P1" and not held), None)
+        if strange is not None:
+            message = f"data: {place}, {strange}: a stress across, expected an empty cell: nothing acts across there"
+            raise StudyError(message)
+        if not found:
+            message = f"data: {place}: no stress, expected one in {' or '.join(c for c, _ in stresses.values())}"
+            raise StudyError(message)
+        return found
+
+    @model_validator(mode="after")
+    def _check_stresses(self) -> DataFile:
+        stresses = self.stresses
+        if not stresses:
+            message = "measured: no column, expected one for each stress: { P1 = ..., P2 = ... }"
+            raise ValueError(message)
+        if self.component is not None and len(stresses) > 1:
+            message = "component: stands beside several columns of stresses, expected one column of them"
+            raise ValueError(message)
+        lacking = [c for c, (_, sigma) in stresses.items() if sigma is None]
+        if self.sigma is not None and lacking:
+            message = f"sigma: no column for {', '.join(lacking)}, expected one for each stress"
+            raise ValueError(message)
+        return self
 
 
 class Measurements(Settings):
@@ -399,11 +461,13 @@ class Selection(Comparison):
             tests = self._measured(group)
             known = all(test.sigma is not None for test in tests)
             labels = [test.label for test in self._tests(group) for _ in test.at]
+            places = [(x, z) for test in tests for x, z in zip(test.at, test.across or test.at, strict=True)]
             found[group] = Data(
                 np.concatenate([test.measured for test in tests]),
                 np.concatenate([test.sigma for test in tests if test.sigma is not None]) if known else None,
                 tuple(labels),
                 np.concatenate([test.at for test in self._tests(group)]),
+                np.array(places),
             )
         return found
 

@@ -16,7 +16,6 @@ from forward.settings import Settings
 from forward.specimen import Specimen
 from inverse.comparison import Data
 from inverse.observations import DataError, read
-from inverse.predictive import neighbours
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
@@ -210,8 +209,7 @@ class SpecimenSelection(Comparison):
             at.append(float(counted[case]))
             counted[case] += 1
         sigma = None if data.sigma is None else np.array(data.sigma)
-        beside = neighbours(np.array(data.places), kinds)
-        return {WHOLE: Data(np.array(data.measured), sigma, data.cases, np.array(at), beside)}
+        return {WHOLE: Data(np.array(data.measured), sigma, data.cases, np.array(at), np.array(data.places), kinds)}
 
     @property
     def _axes(self) -> Any:

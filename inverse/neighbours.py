@@ -1,0 +1,56 @@
+"""Which data stand beside each other: what a wrong model makes agree.
+
+Two places are neighbours where no third one is nearer to both than they are to each other (the relative neighbourhood
+graph: G. T. Toussaint, Pattern Recognit. 12 (1980) 261–268). Along a line these are the places that follow one another,
+on a grid those along its axes, and everywhere the graph is connected. It depends on distances only: not on the order of
+the data, nor on the choice of axes. Data at the same place are neighbours of each other, and of those at the next ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
+NEAREST = 16  # other places that are looked at from each
+SAME = 1e-9  # relative difference of distances that is rounding
+
+
+def neighbours(places: FloatArray, groups: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
+    """Pair the data that stand beside each other, each pair once.
+
+    Parameters
+    ----------
+    places
+        (n, k).
+    groups
+        Numbers (n,) of what can be compared: of tests and stresses, or of load cases and components.
+    measured
+        Not zero (n,) where something was measured; by default everywhere.
+    """
+    seen = np.ones(len(places), dtype=bool) if measured is None else np.asarray(measured) != 0
+    pairs: set[tuple[int, int]] = set()
+    for group in np.unique(groups[seen]):
+        members = np.flatnonzero(seen & (groups == group))
+        pairs |= {(int(members[i]), int(members[j])) for i, j in _related(places[members])}
+    ordered = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+    return ordered[:, 0], ordered[:, 1]
+
+
+def _related(points: FloatArray) -> set[tuple[int, int]]:
+    """Pairs i < j of related points (n, k)."""
+    distinct, of_point = np.unique(points, axis=0, return_inverse=True)
+    members = [np.flatnonzero(of_point.ravel() == place) for place in range(len(distinct))]
+    pairs = {(i, j) for at in members for i in at.tolist() for j in at.tolist() if i < j}
+    for p, place in enumerate(distinct):
+        far = np.linalg.norm(distinct - place, axis=1)
+        reach = np.partition(far, NEAREST)[NEAREST] if len(far) > NEAREST + 1 else np.inf
+        near = np.flatnonzero((far <= reach * (1 + SAME)) & (far > 0))
+        # Whatever is nearer to both than they are to each other is nearer to p than q is, and so among these.
+        between = np.linalg.norm(distinct[near, None] - distinct[None, near], axis=2)
+        nearer = np.maximum(far[near][:, None], between) < far[near] * (1 - SAME)
+        for q in near[~nearer.any(axis=0)].tolist():
+            pairs |= {(min(i, j), max(i, j)) for i in members[p].tolist() for j in members[q].tolist()}
+    return pairs
