@@ -5,10 +5,7 @@ UM-Bridge: L. Seelinger et al., J. Open Source Softw. 8 (2023) 4748; protocol 1.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import importlib.machinery
-import importlib.util
 import json
 import sys
 from abc import abstractmethod
@@ -23,6 +20,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from forward.hyperelastic import Scalar
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError
+from forward.own_modules import Sources, sources
 from forward.settings import Settings, nearest
 
 SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
@@ -135,7 +133,7 @@ class _External(Settings):
         return self
 
 
-_texts: dict[str, tuple[Path | None, bytes]] = {}  # files of imported modules, and what they held
+_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of what they held
 Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
 
 
@@ -143,7 +141,9 @@ class PythonModel(_External):
     """A Python function of a vector of parameters (d,) that returns the outputs (m,).
 
     Where it raises an exception, or returns what is not finite, there is no answer: the solve has failed. Modules are
-    found beside the study, in the working directory, and where Python finds them.
+    found where Python finds them, beside the study, and in the working directory; one that is found at several of these
+    is refused. All modules that they import and that are not installed count as the model's source: results are not
+    continued once one has changed. Data that they read cannot be known; change a module with them.
 
     Parameters
     ----------
@@ -165,17 +165,14 @@ class PythonModel(_External):
         return f"Python function {self.function}{f', derivatives {self.jacobian}' if self.jacobian else ''}"
 
     @property
-    def source(self) -> str:
-        """Hash of the files that hold function and Jacobian: what was solved before they changed is solved again."""
-        found = hashlib.sha256()
-        for path in filter(None, (self.function, self.jacobian)):
-            try:
-                file = _file(path.rpartition(".")[0])
-            except (ImportError, ValueError):  # whoever imports it says why
-                continue
-            if file is not None:
-                found.update(file.read_bytes())
-        return found.hexdigest()
+    def modules(self) -> tuple[str, ...]:
+        """The modules of function and Jacobian."""
+        return tuple(path.rpartition(".")[0] for path in (self.function, self.jacobian) if path)
+
+    @property
+    def sources(self) -> Sources:
+        """All modules that the model is made of: what was solved before they changed is no part of its results."""
+        return sources(self.modules)
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Import function and Jacobian."""
@@ -183,24 +180,22 @@ class PythonModel(_External):
         return function, _guarded(self.jacobian, "jacobian") if self.jacobian else None
 
 
-def _file(module: str) -> Path | None:
-    """Return the file of a module as it would be found now, whatever was imported under this name before."""
-    spec = None if "." in module else importlib.machinery.PathFinder.find_spec(module)
-    spec = spec or importlib.util.find_spec(module)
-    return None if spec is None or not spec.has_location or spec.origin is None else Path(spec.origin)
-
-
 def _imported(module: str) -> ModuleType:
-    """Import a module, again if its file is another one, or another text, than when it was imported last."""
-    file = _file(module)
-    now = (file, file.read_bytes() if file else b"")
-    known = sys.modules.get(module)
-    before = _texts.get(module, now if known is None else (Path(getattr(known, "__file__", None) or ""), now[1]))
-    if known is not None and "." not in module and file is not None and before != now:
-        del sys.modules[module]
-        importlib.invalidate_caches()
-    _texts[module] = now
-    return importlib.import_module(module)
+    """Import a module, again if it or what it imports is another file, or another text, than when it was imported."""
+    importlib.invalidate_caches()
+    now = sources([module]).files
+    for name, (file, _) in now.items():
+        known = getattr(sys.modules.get(name), "__file__", None) or file
+        if _texts.get(name, now[name]) != now[name] or (name not in _texts and Path(known).absolute() != Path(file)):
+            for changed in now.keys() & sys.modules.keys():
+                del sys.modules[changed]
+            break
+    _texts.update(now)
+    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes within a second
+    try:
+        return importlib.import_module(module)
+    finally:
+        sys.dont_write_bytecode = kept
 
 
 def _guarded(path: str, key: str) -> Callable[[FloatArray], Any]:

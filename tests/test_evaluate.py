@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
 from forward.model import FunctionModel, SolveError
-from uq.checkpoint import Checkpoint
+from uq.checkpoint import Checkpoint, DamagedError
 from uq.checkpoint import load as load_evaluations
 from uq.evaluate import BLOCKS, Request, SerialEvaluate
 
@@ -90,6 +91,50 @@ def test_a_damaged_block_is_computed_again(tmp_path):
     path.write_bytes(path.read_bytes()[:100])
     assert not checkpoint.has(key)
     assert not path.exists()
+
+
+def test_a_flipped_bit_anywhere_is_found(tmp_path, capsys):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8], tangents=True)
+    key = checkpoint.key(request)
+    whole = SerialEvaluate(MODEL)(request)
+    checkpoint.save(key, whole)
+    path = tmp_path / "evaluations" / f"{key}.h5"
+    content = path.read_bytes()
+    for place in np.random.default_rng(1).integers(8 * len(content), size=300):
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        head = 64 <= place // 8 < 512  # what nobody reads
+        assert checkpoint.has(key) == head
+        assert capsys.readouterr().err == (
+            "" if head else f"{path}: damaged, or not what it is named after; computed again\n"
+        )
+
+
+def test_exchanged_blocks_are_found(tmp_path, capsys):
+    checkpoint = Checkpoint(tmp_path, "study")
+    requests = [Request(POINTS[:8]), Request(POINTS[8:16])]
+    keys = [checkpoint.key(request) for request in requests]
+    for key, request in zip(keys, requests, strict=True):
+        checkpoint.save(key, SerialEvaluate(MODEL)(request))
+    one, two = (tmp_path / "evaluations" / f"{key}.h5" for key in keys)
+    one.rename(tmp_path / "other")
+    two.rename(one)
+    (tmp_path / "other").rename(two)
+    assert [checkpoint.has(key) for key in keys] == [False, False]
+    assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_damage_of_all_evaluations_is_found(tmp_path):
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS[:8]))
+    Checkpoint(tmp_path, "study").consolidate({"a/b": evaluations, "c": evaluations})
+    path = tmp_path / "evaluations.h5"
+    assert load_evaluations(path, "c").failures == evaluations.failures
+    with h5py.File(path, "r+") as file:
+        file["a/b/outputs"][0, 0] += 1e-12
+    with pytest.raises(DamagedError, match=r"evaluations.h5: damaged"):
+        load_evaluations(path, "c")
 
 
 def test_a_block_is_found_by_what_was_asked(tmp_path):

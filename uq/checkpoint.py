@@ -2,7 +2,8 @@
 
 A file is written under another name and renamed into place, so that whatever carries its final name is whole. A block
 is found by what was asked, not by who asked: its name is a hash of the points and of everything else that decides the
-answer.
+answer. It carries a checksum of its content together with its name, so that neither damage nor an exchange of files
+passes for an answer.
 """
 
 from __future__ import annotations
@@ -11,16 +12,36 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Protocol
 
 import h5py
 import numpy as np
 
-from forward.model import WORK
+from forward.model import WORK, ModelError
 from uq.evaluate import Evaluations, Failure, Request
+
+_HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
+
+
+class DamagedError(OSError):
+    """A file of evaluations is not as it was written."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: damaged, or not what it is named after")
+
+
+class Code(Protocol):
+    """What of the user's code was loaded in the course of a run, beyond what the identity of the study covers."""
+
+    def note(self) -> str:
+        """Say what it is, to be kept with a block."""
+
+    def objection(self, note: str) -> str | None:
+        """Say why a block with a note is no longer valid, if it is not."""
 
 
 class Checkpoint:
@@ -32,37 +53,53 @@ class Checkpoint:
         The results directory; blocks are kept in its folder `evaluations`.
     identity
         Text that decides the answers besides the request (the study, the version of the program).
+    code
+        Knows what of the user's code was loaded in the course of the run.
     """
 
-    def __init__(self, directory: Path, identity: str) -> None:
+    def __init__(self, directory: Path, identity: str, code: Code | None = None) -> None:
         self._directory = directory
         self._folder = directory / "evaluations"
         self._identity = identity.encode()
+        self._code = code
 
     def key(self, block: Request) -> str:
         """Return the name of a block."""
         return digest(block, self._identity).hex()[:24]
 
     def has(self, key: str) -> bool:
-        """Whether a block is finished; a file that cannot be read is removed."""
+        """Whether a block is finished; one that is damaged, or that answers another request, is removed.
+
+        Raises
+        ------
+        ModelError
+            If a file of the user's from which it follows has changed.
+        """
         path = self._path(key)
         if not path.exists():
             return False
         try:
-            with h5py.File(path, "r"):
-                return True
-        except OSError:
-            path.unlink()
+            _check(path, key)
+            with h5py.File(path, "r") as file:
+                note = str(file.attrs["note"])
+        except DamagedError as error:
+            sys.stderr.write(f"{error}; computed again\n")
+            path.unlink(missing_ok=True)
             return False
+        objection = self._code.objection(note) if self._code is not None else None
+        if objection is not None:
+            message = f"{self._directory}: {objection}"
+            raise ModelError(message)
+        return True
 
     def save(self, key: str, block: Evaluations) -> None:
         """Write a finished block and rename it into place."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        _write(self._path(key), {"/": block})
+        _write(self._path(key), {"/": block}, key, "" if self._code is None else self._code.note())
 
     def load(self, key: str) -> Evaluations:
-        """Read a finished block."""
-        return load(self._path(key))
+        """Read a finished block, as `has` has found it."""
+        return _read(self._path(key), "/")
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.h5"
@@ -96,9 +133,14 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(repr(value).encode())
 
 
-def _write(path: Path, blocks: Mapping[str, Evaluations]) -> None:
+def _write(
+    path: Path,
+    blocks: Mapping[str, Evaluations],
+    key: str = "",
+    note: str = "",
+) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    with h5py.File(partial, "w") as file:
+    with h5py.File(partial, "w", userblock_size=_HEAD) as file:
         for name, block in blocks.items():
             group = file.require_group(name)
             group["points"] = block.points
@@ -113,28 +155,76 @@ def _write(path: Path, blocks: Mapping[str, Evaluations]) -> None:
                 group["tangents"] = block.tangents
             if block.fields.size:
                 group["fields"] = block.fields
+            group.attrs["note"] = note
         file.flush()
-    with partial.open("rb") as written:
+    with partial.open("r+b") as written:
+        checksum = _checksum(written, key).encode()
+        written.seek(0)
+        written.write(checksum)
+        written.flush()
         os.fsync(written.fileno())
     partial.replace(path)
 
 
+def _checksum(file: BinaryIO, key: str) -> str:
+    """Return a hash of what follows the head of a file, and of what the file was asked for."""
+    file.seek(_HEAD)
+    return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()  # type: ignore[arg-type]
+
+
+def _check(path: Path, key: str) -> None:
+    """Raise `DamagedError` unless all is as it was written, before HDF5, which a bit can crash, sees it."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            if _checksum(file, key).encode() == head[:64]:
+                return
+            if not key and head.startswith(b"\x89HDF"):  # of a version that wrote none
+                return
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedError(path) from error
+    raise DamagedError(path)
+
+
 def load(path: Path, name: str = "/") -> Evaluations:
-    """Read evaluations, such as those of an `evaluations.h5`, which has several under their names if there were."""
-    with h5py.File(path, "r") as whole:
-        file = whole[name]
-        failures = tuple(
-            Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))
-            for f in json.loads(file["failures"][()])
-        )
-        return Evaluations(
-            np.asarray(file["points"]),
-            np.asarray(file["outputs"]),
-            np.asarray(file["tangents"]) if "tangents" in file else None,
-            failures,
-            np.asarray(file["seconds"]),
-            np.asarray(file["work"]),
-            np.asarray(file["residuals"]),
-            np.asarray(file["converged"]),
-            np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
-        )
+    """Read evaluations, such as those of an `evaluations.h5`, which has several under their names if there were.
+
+    Parameters
+    ----------
+    path, name
+        The file, and the group in it.
+
+    Raises
+    ------
+    DamagedError
+        If the file cannot be read, or its content is not what was written.
+    FileNotFoundError
+        If there is none.
+    """
+    _check(path, "")
+    return _read(path, name)
+
+
+def _read(path: Path, name: str) -> Evaluations:
+    try:
+        with h5py.File(path, "r") as whole:
+            file = whole[name]
+            failures = tuple(
+                Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))
+                for f in json.loads(file["failures"][()])
+            )
+            return Evaluations(
+                np.asarray(file["points"]),
+                np.asarray(file["outputs"]),
+                np.asarray(file["tangents"]) if "tangents" in file else None,
+                failures,
+                np.asarray(file["seconds"]),
+                np.asarray(file["work"]),
+                np.asarray(file["residuals"]),
+                np.asarray(file["converged"]),
+                np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
+            )
+    except (OSError, KeyError, ValueError) as error:
+        raise DamagedError(path) from error

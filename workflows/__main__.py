@@ -103,11 +103,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _load(options: argparse.Namespace) -> AnyStudy:
-    """Read the study; modules of its model are found beside it and in the working directory."""
-    from workflows.config import load
+    """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
+    from forward.external import PythonModel
+    from workflows.config import Study, load
 
     study = load(options.study, options.set)
-    sys.path[:0] = [str(options.study.resolve().parent), str(Path.cwd())]
+    if isinstance(study, Study) and isinstance(study.model, PythonModel):
+        from forward.own_modules import make_visible
+
+        make_visible(study.model.modules, [options.study.resolve().parent, Path.cwd()])
     return study
 
 

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.external import PythonModel
+from forward.own_modules import Loaded
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.findings import add, findings
 from uq.sampling import random_points
-from workflows import verdict
+from workflows import own_code, verdict
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
 from workflows.results import (
@@ -94,15 +94,8 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
 
     world = MPI.COMM_WORLD
     begin = time.monotonic()
-    refusal, finished = None, None
-    if world.rank == 0:
-        try:
-            finished = _prepare(study, directory, world.size)
-        except StudyError as error:
-            refusal = error
-    refusal, finished = world.bcast((refusal, finished))
-    if refusal is not None:
-        raise refusal
+    loaded = Loaded() if own_code.python(study) is not None else None
+    finished = _agreed(world, lambda: _prepare(study, directory, world.size))
     if finished is not None:
         if world.rank == 0:
             if not (directory / "report.html").exists():
@@ -116,9 +109,11 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     progress = Progress(study.planned, quiet=quiet or world.rank > 0)
-    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]))
+    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]), loaded)
     try:
         job = _job(study, ensemble, name)
+        if world.rank == 0:
+            own_code.keep(directory, study, loaded)
         kept = checkpoint if job.costly else None
         dataset = ensemble.run(
             job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
@@ -134,6 +129,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
+    own_code.keep(directory, study, loaded)
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
     if isinstance(study, Study) and len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, job.recorders["/"])
@@ -147,6 +143,20 @@ def exit_code(summary: Mapping[str, Any]) -> int:
     """Return the exit code of a finished study: 3 where solves failed, or where a number cannot be trusted."""
     doubtful = any(one["severity"] == "error" for one in summary.get("findings", ()))
     return PARTIAL if summary["failed"] or doubtful else DONE
+
+
+def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
+    """Return on all ranks what rank 0 finds, or raise there what it raises."""
+    refusal, found = None, None
+    if world.rank == 0:
+        try:
+            found = prepare()
+        except StudyError as error:
+            refusal = error
+    refusal, found = world.bcast((refusal, found))
+    if refusal is not None:
+        raise refusal
+    return found  # type: ignore[no-any-return]
 
 
 def _leave(
@@ -371,17 +381,12 @@ def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
 def _identity(study: AnyStudy) -> dict[str, Any]:
     """Return what decides on evaluations."""
     blocks = {key: value for key, value in document(study).items() if key != "parallel"}
-    source = _source(study)
+    source = own_code.digest(study)
     if source is not None:
         blocks["source"] = source
     if isinstance(study, Study) and study.body is not None:
         blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
     return blocks
-
-
-def _source(study: AnyStudy) -> str | None:
-    """Return the hash of the files of a Python model."""
-    return study.model.source if isinstance(study, Study) and isinstance(study.model, PythonModel) else None
 
 
 def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
@@ -421,19 +426,19 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     except OSError as error:
         message = f"{directory}: cannot be written: {error.strerror}"
         raise StudyError(message) from None
+    own_code.refuse_other(directory, study)
     summary = read_summary(directory)
     if summary is None:
         return None
-    if summary["provenance"].get("source") != _source(study):
-        message = f"{directory}: holds results of other code: the function's file has changed; choose another --out"
-        raise StudyError(message)
     return exit_code(summary)
 
 
 def _withdraw(directory: Path) -> None:
     """Remove what `_prepare` has made, if nothing else is there: the study, corrected, may go to the same place."""
-    if [path.name for path in directory.iterdir()] == ["study.toml"]:
-        (directory / "study.toml").unlink()
+    made = ("study.toml", own_code.FILE)
+    if {path.name for path in directory.iterdir()} <= set(made):
+        for name in made:
+            (directory / name).unlink(missing_ok=True)
         directory.rmdir()
 
 
@@ -469,7 +474,7 @@ def _summary(
     every = evaluations.values()
     failed = sum(len(found.failures) for found in every)
     names = {label: _parameters(study, label) for label in evaluations}
-    source = _source(study)
+    source = own_code.digest(study)
     return {
         "study": name,
         "method": study.method.kind,
