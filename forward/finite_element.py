@@ -17,7 +17,7 @@ from forward.acceleration import Inverse, block_galerkin
 from forward.discretisation import Discretisation
 from forward.functionals import functional
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, Reference, SolveError, Work
+from forward.model import FloatArray, InadmissibleError, Reference, Work
 from forward.newton import Found, solve
 from forward.own_mesh import OwnMesh
 from forward.reference import ReferenceFactor, turn
@@ -54,6 +54,7 @@ class HyperelasticModel:
                 raise ValueError(message)
         self.spec = spec
         self.parameters = parameters
+        self._materials = spec.materials(parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
         self.body = Discretisation(spec, comm, parameters)
         self.layout = self.body.layout
@@ -103,7 +104,10 @@ class HyperelasticModel:
                 objection = None if np.isfinite(value) else "input should be a finite number"
             if objection is not None:
                 message = f"{path} = {value:.6g} is not admissible: {objection}"
-                raise SolveError(message)
+                raise InadmissibleError(message)
+        objection = self._materials.objection(dict(zip(self.parameters, map(float, parameters), strict=True)))
+        if objection is not None:
+            raise InadmissibleError(objection)
         if self.spec.solver.kind == "newton" or start is None:
             reference = None
         if reference is not None:

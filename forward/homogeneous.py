@@ -23,8 +23,9 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import Field, model_validator
 
+from forward.admissible import objection
 from forward.materials import MATERIALS, constants, measured, measures
-from forward.model import FloatArray, FunctionModel, FunctionSolution, Reference, SolveError
+from forward.model import FloatArray, FunctionModel, FunctionSolution, InadmissibleError, Reference, SolveError
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
@@ -136,6 +137,8 @@ class HomogeneousModel:
             raise ValueError(message)
         self.parameters = tuple(parameters)
         self._names = tuple(name for name in known if name in given)
+        self._energy = energy
+        self._free = "D1" not in known or "D1" in given  # faces move as they like, and where to has to be found
         self._values = np.array([values.get(name, np.nan) for name in self._names])
         self._varied = [self._names.index(name) for name in parameters]
         self._tests = tuple(tests)
@@ -178,18 +181,27 @@ class HomogeneousModel:
 
         Raises
         ------
+        InadmissibleError
+            Where the constants are of no material, or an incompressible one has no energy in a test.
         SolveError
-            Where a test has no stress.
+            Where a test of a compressible one has no stress.
         """
         return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
 
     def _one(self, parameters: FloatArray) -> FloatArray:
+        here = dict(zip(self._names, self._values, strict=True))
+        said = objection(self._energy, here | dict(zip(self.parameters, map(float, parameters), strict=True)))
+        if said is not None:
+            raise InadmissibleError(said)
         values = np.asarray(self.stresses(parameters[None, :])[0])
-        if not np.isfinite(values).all():
-            name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
+        if np.isfinite(values).all():
+            return values
+        name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
+        if self._free:
             message = f"no stress in the test {name}: the material has no energy, or no equilibrium, there"
             raise SolveError(message)
-        return values
+        message = f"no stress in the test {name}: the material has no energy there"
+        raise InadmissibleError(message)
 
     def _jacobian(self, parameters: FloatArray) -> FloatArray:
         return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])

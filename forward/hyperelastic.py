@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
 
@@ -13,6 +13,7 @@ from annotated_types import Ge, Gt, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.admissible import Materials
 from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector, holds
 from forward.inclusions import Inclusion
@@ -121,6 +122,23 @@ def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]
             yield Finding("warning", text)
 
 
+def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], parameters: Collection[str]) -> Materials:
+    """Return the materials of a body and of its regions as functions of some of its numbers, by their paths."""
+    energy = str(getattr(material, "kind"))  # noqa: B009 - every material has a kind
+
+    def own(place: str, values: Mapping[str, float]) -> dict[str, float | str]:
+        paths = {name: f"{place}.{name}" for name in values}
+        return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
+
+    names = constants(MATERIALS[energy])
+    shared = own("material", {name: getattr(material, name) for name in names})
+    found = {"material": shared}
+    for region, numbers in regions.items():
+        place = f"regions.{region}"
+        found[place] = shared | own(place, {name: value for name, value in numbers.items() if name in names})
+    return Materials(energy, found)
+
+
 class Hyperelastic(Settings):
     """A hyperelastic body under loads, solved by finite elements.
 
@@ -199,6 +217,10 @@ class Hyperelastic(Settings):
             for axis, value in displacement.components.items():
                 found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
         return found
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials:
+        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
+        return materials(self.material, self.regions, parameters)
 
     @property
     def coefficients(self) -> tuple[str, ...]:
@@ -306,7 +328,7 @@ class Hyperelastic(Settings):
             if not self.body.contains(centre):
                 message = f"its centre lies outside the body, which lies in {self._bounds}"
                 yield ("inclusions", i), message, list(centre)
-        yield from self._mistakes_of_regions()
+        yield from self._mistakes_of_materials()
         yield from self._mistakes_of_fields()
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
@@ -338,6 +360,13 @@ class Hyperelastic(Settings):
                 )
             if isinstance(output, PointDisplacement) and not holds(self.body, output.at):
                 yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
+
+    def _mistakes_of_materials(self) -> Iterator[Mistake]:
+        wrong = list(self._mistakes_of_regions())
+        yield from wrong
+        if not wrong:
+            for where, objection in self.materials().objections({}):
+                yield tuple(where.split(".", 1)), objection, {}
 
     def _mistakes_of_regions(self) -> Iterator[Mistake]:
         known = (*(name for name in type(self.material).model_fields if name != "kind"), CONTRAST)

@@ -3,7 +3,8 @@
 A function takes the operators `ops` (``ln``, ``exp``, ``sqrt``, ``positive``: the larger of x and 0), measures of the
 deformation by their names in `measures`, and its constants as keyword-only arguments. UFL reads it for finite elements,
 SymPy for closed forms. The names of the keyword-only arguments *are* the names of the parameters in studies and
-results, and their annotations are the admissible values and their units. All energies are in J/m³ and vanish, with
+results, and their annotations are the units, and the values with which there is an energy; which ones together make a
+material that is stable at rest is said in `forward.admissible`. All energies are in J/m³ and vanish, with
 their stress, in the undeformed body.
 
 An energy that splits into an isochoric and a volumetric part has a constant called D1, and its volumetric part is
@@ -23,12 +24,11 @@ from annotated_types import Ge, Gt, Unit
 
 Number = Annotated[Any, Unit("Pa")]
 NonNegative = Annotated[Any, Ge(0), Unit("Pa")]
-Positive = Annotated[Any, Gt(0), Unit("Pa")]
 Ratio = Annotated[Any, Unit("1")]
 PositiveRatio = Annotated[Any, Gt(0), Unit("1")]
 
 
-def mooney_rivlin(ops: Any, I1: Any, I2: Any, J: Any, *, C1: NonNegative, C2: NonNegative, D1: Positive) -> Any:
+def mooney_rivlin(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Number, C2: Number, D1: Number) -> Any:
     """Compressible Mooney–Rivlin: W = C1(Ī1−3) + C2(Ī2−3) + D1(J−1)².
 
     Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2; C1, C2, D1 in Pa. Small strain: μ = 2(C1+C2), κ = 2 D1.
@@ -37,7 +37,7 @@ def mooney_rivlin(ops: Any, I1: Any, I2: Any, J: Any, *, C1: NonNegative, C2: No
     return C1 * (J ** (-2 / 3) * I1 - 3) + C2 * (J ** (-4 / 3) * I2 - 3) + D1 * (J - 1) ** 2
 
 
-def neo_hookean(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Positive, D1: Positive) -> Any:
+def neo_hookean(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Number, D1: Number) -> Any:
     """Neo-Hookean with isochoric split: W = C1(Ī1−3) + D1(J−1)².
 
     C1, D1 in Pa. Small strain: μ = 2 C1, κ = 2 D1.
@@ -45,7 +45,7 @@ def neo_hookean(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Positive, D1: Positiv
     return C1 * (J ** (-2 / 3) * I1 - 3) + D1 * (J - 1) ** 2
 
 
-def neo_hookean_coupled(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, lmbda: NonNegative) -> Any:
+def neo_hookean_coupled(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number, lmbda: Number) -> Any:
     """Coupled compressible neo-Hookean: W = μ/2 (I1−3) − μ ln J + λ/2 (ln J)².
 
     mu, lmbda: the Lamé constants in Pa.
@@ -54,7 +54,7 @@ def neo_hookean_coupled(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, lmb
     return mu / 2 * (I1 - 3) - mu * ops.ln(J) + lmbda / 2 * ops.ln(J) ** 2
 
 
-def yeoh(ops: Any, I1: Any, I2: Any, J: Any, *, C10: Positive, C20: Number, C30: NonNegative, D1: Positive) -> Any:
+def yeoh(ops: Any, I1: Any, I2: Any, J: Any, *, C10: Number, C20: Number, C30: Number, D1: Number) -> Any:
     """Yeoh: W = C10(Ī1−3) + C20(Ī1−3)² + C30(Ī1−3)³ + D1(J−1)².
 
     C10, C20, C30, D1 in Pa; C20 is negative for materials that soften before they stiffen. Small strain: μ = 2 C10,
@@ -65,7 +65,7 @@ def yeoh(ops: Any, I1: Any, I2: Any, J: Any, *, C10: Positive, C20: Number, C30:
     return C10 * shear + C20 * shear**2 + C30 * shear**3 + D1 * (J - 1) ** 2
 
 
-def gent(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, Jm: PositiveRatio, D1: Positive) -> Any:
+def gent(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number, Jm: PositiveRatio, D1: Number) -> Any:
     """Gent: W = −(μ Jm/2) ln(1 − (Ī1−3)/Jm) + D1(J−1)².
 
     mu, D1 in Pa; Jm is what Ī1−3 stays below: there the chains are stretched out, and beyond there is no energy (finite
@@ -77,7 +77,7 @@ def gent(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive, Jm: PositiveRatio,
     return -mu * Jm * ops.ln(left) + D1 * (J - 1) ** 2
 
 
-def demiray(ops: Any, I1: Any, I2: Any, J: Any, *, a: Positive, b: PositiveRatio, D1: Positive) -> Any:
+def demiray(ops: Any, I1: Any, I2: Any, J: Any, *, a: Number, b: PositiveRatio, D1: Number) -> Any:
     """Demiray (isotropic Fung): W = a/(2b) (exp(b(Ī1−3)) − 1) + D1(J−1)².
 
     a, D1 in Pa; b is dimensionless. Small strain: μ = a, κ = 2 D1.
@@ -86,7 +86,7 @@ def demiray(ops: Any, I1: Any, I2: Any, J: Any, *, a: Positive, b: PositiveRatio
     return a / (2 * b) * (ops.exp(b * (J ** (-2 / 3) * I1 - 3)) - 1) + D1 * (J - 1) ** 2
 
 
-def saint_venant_kirchhoff(ops: Any, I1: Any, I2: Any, J: Any, *, lmbda: NonNegative, mu: Positive) -> Any:
+def saint_venant_kirchhoff(ops: Any, I1: Any, I2: Any, J: Any, *, lmbda: Number, mu: Number) -> Any:
     """Saint Venant–Kirchhoff: W = λ/2 (tr E)² + μ E:E with E = (C − I)/2.
 
     lmbda, mu: the Lamé constants in Pa. tr E = (I1−3)/2 and E:E = (tr C² − 2 tr C + 3)/4 with tr C² = I1² − 2 I2.
@@ -96,7 +96,7 @@ def saint_venant_kirchhoff(ops: Any, I1: Any, I2: Any, J: Any, *, lmbda: NonNega
     return lmbda / 8 * (I1 - 3) ** 2 + mu / 4 * (I1**2 - 2 * I2 - 2 * I1 + 3)
 
 
-def blatz_ko(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Positive) -> Any:
+def blatz_ko(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number) -> Any:
     """Blatz–Ko foam: W = μ/2 (I2/J² + 2J − 5).
 
     mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4.
@@ -118,7 +118,7 @@ def ogden(
     alpha2: Ratio,
     mu3: Number,
     alpha3: Ratio,
-    D1: Positive,
+    D1: Number,
 ) -> Any:
     """Ogden with three terms: W = Σ_k μ_k/α_k (λ̄₁^α_k + λ̄₂^α_k + λ̄₃^α_k − 3) + D1(J−1)².
 
@@ -134,7 +134,7 @@ def ogden(
 
 
 def holzapfel_gasser_ogden(
-    ops: Any, I1: Any, I2: Any, J: Any, I4: Any, *, c: Positive, k1: NonNegative, k2: PositiveRatio, D1: Positive
+    ops: Any, I1: Any, I2: Any, J: Any, I4: Any, *, c: Number, k1: NonNegative, k2: PositiveRatio, D1: Number
 ) -> Any:
     """Holzapfel–Gasser–Ogden: W = c/2 (Ī1−3) + Σ_f k1/(2 k2) (exp(k2 ⟨I4_f−1⟩²) − 1) + D1(J−1)².
 

@@ -54,6 +54,10 @@ class SolveError(Exception):
         self.work = work or Work()
 
 
+class InadmissibleError(SolveError):
+    """There is no such material, or it has no energy there: nothing to solve for, and no likelihood of any data."""
+
+
 Severity = Literal["note", "warning", "error"]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward.admissible import Materials
 from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector, holds, tolerance
-from forward.hyperelastic import Hyperelastic, Material, Scalar
+from forward.hyperelastic import Hyperelastic, Material, Scalar, materials
 from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
 from forward.model import Finding, FloatArray, Reference, SolveError, Work
@@ -142,6 +143,10 @@ class Specimen(Settings):
         for case in self.cases:
             found |= self.loaded(case).scalars
         return found
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials:
+        """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
+        return materials(self.material, self.regions, parameters)
 
     @property
     def coefficients(self) -> tuple[str, ...]:
@@ -344,7 +349,7 @@ class SpecimenModel:
                 solutions.append(model.solve(parameters[where], begin, near, iterations))
             except SolveError as error:
                 message = f"load case '{case.name}': {error.reason}"
-                raise SolveError(message, error.history, error.work) from error
+                raise type(error)(message, error.history, error.work) from error
         return SpecimenSolution(self, tuple(solutions))
 
     def states(self, rows: FloatArray) -> list[FloatArray]:

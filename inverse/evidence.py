@@ -118,7 +118,9 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     misfit = np.abs(_from_gaussian(gaussian, pilot.density))
     even = pilot.effective / quarter
     share = f"the first {quarter} points are worth {pilot.effective:.0f}"
-    if (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
+    # Where there is no model there is no likelihood, and so no Gaussian; ∞ is not below ∞ by rounding.
+    everywhere = np.isfinite(pilot.density.log_posterior).all()
+    if everywhere and (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
         near = misfit[pilot.weights > 1e-6 / quarter]
         whole = _continued(posterior, mixture, first, seed, quarter)
         why = "the posterior is a Gaussian at every point that was tried"

@@ -9,6 +9,9 @@ depend on the model, so that evidences of different models compare:
 
     Z = ∫ p(y | x) N(x; 0, I) dx.
 
+Where only a part A of the prior is of materials (`Inputs.admissible`), the prior is N(x; 0, I)/P(A) in A and zero
+elsewhere: outside A the model has no answer, and what is called p(y | x) here is divided by P(A).
+
 Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
 multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
 Wright, Numerical Optimization (2006), section 10.2.
@@ -154,7 +157,7 @@ class Posterior:
         scale = s[:, None] * self.sigma
         residual = (outputs - self.data) / scale
         squares = (residual**2).sum(axis=1)
-        misfit = squares / 2 + np.log(scale).sum(axis=1) + m / 2 * np.log(2 * np.pi)
+        misfit = squares / 2 + np.log(scale).sum(axis=1) + m / 2 * np.log(2 * np.pi) + np.log(self.inputs.admitted)
         log_likelihood = np.where(found.ok, -misfit, -np.inf)
         if not derivatives:
             empty = np.zeros((n, 0))

@@ -248,6 +248,8 @@ def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior
 
 def _rescaled(found: Evidence, posterior: Posterior, width: float) -> tuple[float, float]:
     """Return ln Z and its error with priors of another width, by the points that were solved."""
-    x = found.density.x[:, : len(posterior.inputs.names)]
+    inputs = posterior.inputs
+    x = found.density.x[:, : len(inputs.names)]
     change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
+    change += np.log(inputs.admitted / inputs.admitted_at(width))
     return found.reweighted(change)

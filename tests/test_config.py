@@ -148,7 +148,10 @@ def put(*way):
             "parameters: not a number of the model",
         ),
         (put("model", "clamp", []), "model.clamp: nothing holds the body along x, y, z"),
-        (put("model", "material", "D1", -1.0), "model.material.D1: input should be greater than 0; given -1.0"),
+        (
+            put("model", "material", "D1", -1.0),
+            "model.material: not stable at rest: κ = 2 D1 = -2 Pa, expected more than 0",
+        ),
         (put("model", "material", "D2", 1.0), "model.material.D2: unknown key; did you mean"),
         (put("model", "body", "size", [0.28, 0.0, 0.087]), "model.body.size[1]: input should be greater than 0"),
         (put("model", "body", "degree", 3), "model.body.degree: input should be 1 or 2; given 3"),
@@ -157,8 +160,8 @@ def put(*way):
             "did you mean 'material.D1'",
         ),
         (
-            put("parameters", "material.D1", {"kind": "normal", "mean": 1e5, "std": 1e5}),
-            "parameters.material.D1: reaches -",
+            put("parameters", "material.D1", {"kind": "normal", "mean": -1e5, "std": 1e5}),
+            "parameters: 84.1 % of the values are impossible; at the medians, material: not stable at rest: κ = 2 D1",
         ),
         (
             put("parameters", "loads.gravity.density", {"kind": "uniform", "lower": -1.0, "upper": 2.0}),
@@ -295,7 +298,7 @@ def test_starters_and_dumps_fit_the_schema(validator, kind):
     [
         put("method", "sampels", 5),
         put("model", "body", "degree", 3),
-        put("model", "material", "D1", -1.0),
+        put("model", "material", "D1", "stiff"),
         put("model", "material", "kind", "jelly"),
         put("parameters", "material.D1", {"kind": "uniform", "lower": 0.0}),
         put("model", {"kind": "python", "function": "f", "parameters": {}, "outputs": []}),

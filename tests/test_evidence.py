@@ -1,14 +1,19 @@
 """Evidence: closed forms, brute force, nested sampling, and whether the stated errors are honest."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
+from forward.admissible import Materials
+from forward.homogeneous import HomogeneousModel, MaterialTest
 from forward.model import FunctionModel, SolveError
 from inverse.evidence import evidence
 from inverse.laplace import laplace
 from inverse.nested import nested
 from inverse.posterior import Posterior
+from inverse.selection import _rescaled
 from inverse.selection import posterior as assemble
 from inverse.surrogate import fit
 from inverse.weights import tail_shape
@@ -194,3 +199,41 @@ def test_nested_sampling_agrees_on_brain():
         found = evidence(whole, laplace(whole), 256)
         value, error = nested(whole)
         assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_evidence_of_priors_with_inadmissible_tails(correlated):
+    """Gaussian priors of C1 and C2 reach where C1 + C2 < 0: ln Z is that of quadrature over what is left of them.
+
+    The widened and narrowed priors are restricted anew.
+    """
+    priors = {"C1": Normal(mean=100.0, std=200.0), "C2": Normal(mean=0.0, std=200.0)}
+    pairs = (("C1", "C2", 0.6),) if correlated else ()
+    materials = Materials("mooney-rivlin", {"material": {"C1": "C1", "C2": "C2"}})
+    inputs = Inputs(priors, pairs, materials)
+    tests = [MaterialTest(mode="uniaxial", at=(0.8, 1.2, 1.5))]
+    model = HomogeneousModel("mooney-rivlin", {}, tests, ("C1", "C2"))
+    data, sigma = model.stresses(np.array([[80.0, -20.0]]))[0], np.full(3, 150.0)
+    x = np.linspace(-8, 8, 1601)
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = inputs.from_normals(grid)[0]
+    good = points.sum(axis=1) > 0
+    misfit = (((model.stresses(points) - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
+    exact = {}
+    for width in (1.0, 0.5, 2.0):
+        prior = -((grid / width) ** 2).sum(axis=1) / 2
+        exact[width] = logsumexp((prior - misfit)[good]) - logsumexp(prior[good])
+    whole = Posterior(inputs, SerialEvaluate(model), data, sigma)
+    share = np.exp(logsumexp(-(grid[good] ** 2).sum(axis=1) / 2) - logsumexp(-(grid**2).sum(axis=1) / 2))
+    assert inputs.admitted == pytest.approx(share, abs=2e-3)
+    found = evidence(whole, laplace(whole), 1024)
+    assert found.route != "closed form"
+    assert abs(found.log_evidence - exact[1.0]) < max(4 * found.error, 5e-3)
+    assert found.error < 0.05
+    for width in (0.5, 2.0):
+        value, error = _rescaled(found, whole, width)
+        assert abs(value - exact[width]) < max(4 * error, 5e-3)
+    assert not found.weights[found.density.parameters.sum(axis=1) <= 0].any()
+    if not correlated and find_spec("dynesty"):
+        value, error = nested(whole, live=200)
+        assert abs(value - exact[1.0]) < 4 * error

@@ -1,6 +1,7 @@
 """Model selection: what is recovered, what is criticised, and the studies from the command line."""
 
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -249,7 +250,11 @@ def small(tmp_path):
         ("mean = 500", 'mean = "soft"', "candidates.neo-hookean.parameters.C1.mean"),
         ("C2 = 10", "C1 = 10", "stands in material and in parameters"),
         (", C2 = 10", "", "missing: C2"),
-        ('"log-normal", mean = 500', '"normal", mean = 500', "reaches .* where the material is impossible"),
+        (
+            '"log-normal", mean = 500',
+            '"normal", mean = -500',
+            "parameters C1: 95.2 % of the values are impossible; at the medians, .* μ = 2 C1 = -1000 Pa",
+        ),
         ("samples = 32", "samples = 8", "method.samples: input should be greater than or equal to 32"),
         ("{ relative = 0.1, absolute = 20 }", "{}", "no sigma with the data"),
         ("weight = 2", "weight = 0", "candidates.mooney-rivlin.weight"),
@@ -349,6 +354,41 @@ def test_the_order_of_rows_says_nothing_of_neighbours():
 
 def _biaxial(stretches):
     return MaterialTest(mode="biaxial", at=tuple(stretches[:, 0]), across=tuple(stretches[:, 1]))
+
+
+def test_priors_with_inadmissible_tails_are_no_failures(small):
+    """C2 may be negative, and what makes no material has no weight: said by `check` and the run, which exits with 0."""
+    text = SMALL.replace('"mooney-rivlin", C2 = 10 }', '"mooney-rivlin" }').replace("held_out = true\n", "")
+    text = text.replace('"log-normal", mean = 500', '"normal", mean = 250')
+    text = text.replace("weight = 2", 'parameters.C2 = { kind = "normal", mean = -20, std = 100 }\nweight = 2')
+    small.write_text(text)
+    told = "note *mooney-rivlin: 23 % of the prior is of materials that are not stable at rest"
+    assert re.search(told, "\n".join(plan(load(small))))
+    out = small.parent / "out"
+    done = run(None, TISSUQ, "run", small, "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "complete"
+    assert summary["failed"] == 0
+    assert summary["failures"] == []
+    assert summary["zero_likelihood"] > 0
+    texts = [one["text"] for one in summary["findings"]]
+    assert any("their likelihood is zero" in text for text in texts)
+    assert any(text.startswith("mooney-rivlin: 23 % of the prior") for text in texts)
+
+
+def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
+    """Gent's energy ends at I1 − 3 = Jm: points of the prior that do not reach the data are weighted by nothing."""
+    text = SMALL.replace('"neo-hookean" }', '"gent" }').replace("parameters.C1", "parameters.mu", 1)
+    text = text.replace("weight = 2", "").replace(
+        "[candidates.mooney", 'parameters.Jm = { kind = "log-uniform", lower = 1e-3, upper = 1 }\n[candidates.mooney'
+    )
+    small.write_text(text)
+    out = small.parent / "out"
+    assert run(None, TISSUQ, "run", small, "--out", out).returncode == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["failed"] == 0 < summary["zero_likelihood"]
+    assert any("no stress in the test" in one["text"] for one in summary["findings"])
 
 
 def test_subsets_are_of_known_tests(small):

@@ -212,7 +212,7 @@ def _read(path: Path, name: str) -> Evaluations:
         with h5py.File(path, "r") as whole:
             file = whole[name]
             failures = tuple(
-                Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]))
+                Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]), f["inadmissible"])
                 for f in json.loads(file["failures"][()])
             )
             return Evaluations(

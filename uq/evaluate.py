@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import WORK, FloatArray, ForwardModel, Reference, Solution, SolveError
+from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
 
 TOGETHER = 16  # realisations whose part of a compact sum is formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
@@ -22,12 +22,13 @@ BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless anoth
 
 @dataclass(frozen=True)
 class Failure:
-    """A point without an answer, and why."""
+    """A point without an answer, and why; whether there is no model there at all, or only no solution was found."""
 
     index: int
     parameters: tuple[float, ...]
     reason: str
     history: tuple[str, ...] = ()
+    inadmissible: bool = False
 
 
 @dataclass(frozen=True)
@@ -355,7 +356,8 @@ class BlockSolver:
                     tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
                 row = None
-                failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history))
+                lost = isinstance(error, InadmissibleError)
+                failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history, lost))
                 work[i] = error.work.as_array()
             else:
                 outputs[i] = solution.outputs

@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.distributions import Distribution
+from uq.sampling import sobol_points
+
+CORNERS = 12  # parameters up to which all corners of a box are looked at
+FARTHEST = 6.0  # standard deviations: beyond are 2e-9
+POINTS = 2**16
+
+
+class Restriction(Protocol):
+    """A part of the space of the parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that it depends on."""
+
+    def admissible(self, values: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
+        """Return which of these parameters, arrays (n,) by name, are in it (n,)."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +42,10 @@ class Inputs:
         Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
         mapped through the marginals. Pairs that are left out are uncorrelated.
 
+    admissible
+        Where there is a model: the distribution is restricted to it where that is asked for (`admitted`), points are
+        not.
+
     Raises
     ------
     ValueError
@@ -32,6 +54,7 @@ class Inputs:
 
     marginals: dict[str, Distribution]
     correlations: tuple[tuple[str, str, float], ...] = ()
+    admissible: Restriction | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for a, b, rho in self.correlations:
@@ -125,6 +148,37 @@ class Inputs:
         columns = zip(self.marginals.values(), (normals @ factor.T).T, strict=True)
         values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
         return np.column_stack(values), np.column_stack(slopes)[:, :, None] * factor
+
+    def within(self, admissible: Restriction) -> Inputs:
+        """Return the same parameters, restricted."""
+        return replace(self, admissible=admissible)
+
+    @cached_property
+    def admitted(self) -> float:
+        """Probability of parameters for which there is a model."""
+        return self.admitted_at(1.0)
+
+    def admitted_at(self, width: float) -> float:
+        """Return that probability where the standard normal coordinates are wider by a factor.
+
+        It is 1 where no corner of the box of these coordinates is beyond what is admissible: the moduli of materials
+        are linear in each constant, and least at a corner. Else it is the share of scrambled Sobol' points.
+        """
+        if self.admissible is None or not self.admissible.names:
+            return 1.0
+        from scipy.special import ndtri
+
+        names = [name for name in self.names if name in self.admissible.names]
+        pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)
+        few = Inputs({name: self.marginals[name] for name in names}, pairs)
+        if len(names) <= CORNERS:
+            z = width * np.array([-FARTHEST, FARTHEST])
+            ends = [marginal.from_normal(z)[0] for marginal in few.marginals.values()]
+            corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
+            if self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all():
+                return 1.0
+        points = few.from_normals(width * ndtri(sobol_points(0, 0, 0, POINTS, len(names))))[0]
+        return float(self.admissible.admissible(dict(zip(names, points.T, strict=True))).mean())
 
 
 @runtime_checkable

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -24,6 +24,7 @@ from uq.linearisation import LocalSensitivity
 from uq.multilevel import MultilevelMonteCarlo
 from uq.multilevel_chaos import MultilevelChaos
 from uq.sobol import Sobol
+from workflows.priors import findings_of_draws, mistakes_of_materials
 
 if TYPE_CHECKING:
     from workflows.inversion import Inversion, Synthesis
@@ -105,6 +106,11 @@ class Study(Settings):
         return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
+    def _restricted(self) -> Inputs:
+        """The random parameters, of which some may be of no material."""
+        return self.inputs if self.body is None else self.inputs.within(self.body.materials(self.inputs.names))
+
+    @property
     def body(self) -> Hyperelastic | None:
         """The model, if it is a body."""
         return self.model if isinstance(self.model, Hyperelastic) else None
@@ -138,7 +144,7 @@ class Study(Settings):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the study before anything is solved."""
-        return () if self.body is None else self.body.findings
+        return () if self.body is None else (*self.body.findings, *findings_of_draws(self._restricted))
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -160,6 +166,8 @@ class Study(Settings):
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
         else:
+            if self.body is not None:
+                yield from mistakes_of_materials(self._restricted, self.body.materials(inputs.names))
             objection = self.method.objection(inputs) if isinstance(self.method, Restricted) else None
             if objection is not None:
                 yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
@@ -186,7 +194,8 @@ class Study(Settings):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        yield from mistakes_of_parameters(scalars, self.parameters)
+        constants = () if self.body is None else self.body.materials(self.parameters).names
+        yield from mistakes_of_parameters(scalars, self.parameters, constants)
 
     def _mistakes_without_body(self) -> Iterator[Mistake]:
         """What only a body has: meshes, a solver, ranks that share it."""
@@ -237,11 +246,18 @@ def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mist
         yield place, message, prior.model_dump()
 
 
-def mistakes_of_parameters(scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution]) -> Iterator[Mistake]:
-    """Find parameters that are no numbers of a model, or that reach where it is impossible."""
+def mistakes_of_parameters(
+    scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution], constants: Collection[str] = ()
+) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible.
+
+    Constants of materials are left out: they are judged together, by `workflows.priors`.
+    """
     for path, distribution in parameters.items():
         if path not in scalars:
             yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        if path in constants:
             continue
         ends = distribution.support
         if ends is None:

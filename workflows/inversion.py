@@ -29,6 +29,7 @@ from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
+from workflows.priors import findings_of_materials, mistakes_of_materials
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -162,7 +163,7 @@ class Inversion(Settings):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimen before anything is solved."""
-        return self.model.findings
+        return (*self.model.findings, *findings_of_materials(self.inputs))
 
     @property
     def field(self) -> bool:
@@ -173,7 +174,8 @@ class Inversion(Settings):
     def inputs(self) -> Inputs:
         """The unknown parameters; nothing for a field of nodal values."""
         standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
-        return Inputs(self.parameters | standard, tuple((*c.between, c.value) for c in self.correlations))
+        pairs = tuple((*c.between, c.value) for c in self.correlations)
+        return Inputs(self.parameters | standard, pairs, self.model.materials(self.parameters))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -274,16 +276,19 @@ class Inversion(Settings):
                 yield ("method", "chains"), message, self.method.chains
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
-        yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        materials = self.model.materials(self.parameters)
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters, materials.names)
         yield from mistakes_of_factor(self.method.noise, "method", "noise")
         for name, value in self.data.truth.items():
             if name not in self.model.scalars:
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
         try:
-            self.inputs  # noqa: B018 - checks the correlations
+            inputs = self.inputs
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            yield from mistakes_of_materials(inputs, materials)
 
 
 class Synthesis(Settings):
@@ -341,11 +346,14 @@ class Synthesis(Settings):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        yield from mistakes_of_parameters(self.model.scalars, self.parameters)
+        materials = self.model.materials(self.parameters)
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters, materials.names)
         try:
-            self.inputs  # noqa: B018 - checks the correlations
+            inputs = self.inputs
         except ValueError as error:
             yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            yield from mistakes_of_materials(inputs.within(materials), materials)
 
 
 def made(blocks: Mapping[str, Any], folder: Path) -> Inversion | Synthesis:

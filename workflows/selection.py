@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from forward.admissible import Materials
 from forward.geometry import Vector
 from forward.homogeneous import HELD, Component, HomogeneousModel, MaterialTest, Mode, named, unfit
 from forward.hyperelastic import Mistake
@@ -23,7 +24,8 @@ from inverse.selection import Select
 from inverse.weights import resampled
 from uq.distributions import Distribution
 from uq.inputs import Inputs
-from workflows.config import NEGLIGIBLE, Correlation, Parallel, StudyError, mistakes_of_factor, refused
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, refused
+from workflows.priors import findings_of_materials, mistakes_of_materials
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -259,7 +261,13 @@ class CandidateModel(Settings):
     @property
     def inputs(self) -> Inputs:
         """The random constants."""
-        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+        pairs = tuple((*c.between, c.value) for c in self.correlations)
+        return Inputs(self.parameters, pairs, self.materials)
+
+    @property
+    def materials(self) -> Materials:
+        """The material as a function of the random constants."""
+        return Materials(self.kind, {"material": {**self.fixed, **{name: name for name in self.parameters}}})
 
     @property
     def fixed(self) -> dict[str, float]:
@@ -295,15 +303,13 @@ class CandidateModel(Settings):
         if missing:
             message = f"missing: {', '.join(missing)}, expected in material or parameters"
             raise ValueError(message)
-        for name, distribution in self.parameters.items():
-            ends = distribution.support or (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
-            for end in ends:
-                try:
-                    TypeAdapter(Annotated[(float, *known[name].__metadata__)]).validate_python(end)
-                except ValidationError as error:
-                    reason = str(error.errors()[0]["msg"]).lower()
-                    message = f"parameters.{name}: reaches {end:.4g}, where the material is impossible ({reason})"
-                    raise ValueError(message) from None
+        try:
+            wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
+        except ValueError:  # correlations, which are told elsewhere
+            return self
+        if wrong is not None:
+            message = f"parameters {', '.join(wrong[2])}: {wrong[1]}"
+            raise ValueError(message)
         return self
 
 
@@ -329,7 +335,8 @@ class Comparison(Settings):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the study before anything is solved."""
-        return ()
+        of_all = (findings_of_materials(one.inputs, f"{name}: ") for name, one in self.models.items())
+        return tuple(finding for found in of_all for finding in found)
 
     def described(self, name: str) -> str:
         """What a candidate is, in words."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -14,13 +15,14 @@ from forward.geometry import AXES, Vector, tolerance
 from forward.hyperelastic import Mistake
 from forward.settings import Settings
 from forward.specimen import Specimen
-from inverse.comparison import Data
+from inverse.comparison import Candidate, Data
 from inverse.observations import DataError, read
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.stopping import seconds_per_solve
 from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+from workflows.priors import mistakes_of_materials
 from workflows.selection import WHOLE, Comparison
 
 if TYPE_CHECKING:
@@ -148,6 +150,10 @@ class SpecimenCandidate(Settings):
         """The random parameters."""
         return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
 
+    def within(self, specimen: Specimen) -> Inputs:
+        """The random parameters, restricted to those that make materials."""
+        return self.inputs.within(specimen.materials(self.inputs.names))
+
 
 class SpecimenSelection(Comparison):
     """What to compare.
@@ -186,7 +192,16 @@ class SpecimenSelection(Comparison):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimens before anything is solved, each once."""
-        return tuple(dict.fromkeys(finding for one in self.specimens.values() for finding in one.findings))
+        of_specimens = (finding for one in self.specimens.values() for finding in one.findings)
+        return tuple(dict.fromkeys([*of_specimens, *super().findings]))
+
+    @property
+    def models(self) -> dict[str, Candidate]:
+        """The candidates as the method wants them."""
+        return {
+            name: Candidate(candidate.within(self.specimens[name]), candidate.weight)
+            for name, candidate in self.candidates.items()
+        }
 
     @property
     def source(self) -> tuple[str, ...]:
@@ -257,7 +272,7 @@ class SpecimenSelection(Comparison):
                 for line in error.errors(include_url=False):
                     yield (*place, "model", *line["loc"]), line["msg"], line["input"]
                 continue
-            for where, message, given in mistakes_of_parameters(specimen.scalars, candidate.parameters):
+            for where, message, given in _of_candidate(specimen, candidate):
                 yield (*place, *where), message, given
             if specimen.fields:
                 message = "random fields, expected numbers only: evidences are of few parameters"
@@ -267,6 +282,14 @@ class SpecimenSelection(Comparison):
             if strange is not None:
                 yield (*place, "model", "cases"), f"no load case '{strange}', of which there are data", known
         yield from self.mistakes_of_method()
+
+
+def _of_candidate(specimen: Specimen, candidate: SpecimenCandidate) -> Iterator[Mistake]:
+    materials = specimen.materials(candidate.parameters)
+    yield from mistakes_of_parameters(specimen.scalars, candidate.parameters, materials.names)
+    if all(path in specimen.scalars for path in candidate.parameters):
+        with suppress(ValueError):  # correlations, which are told elsewhere
+            yield from mistakes_of_materials(candidate.within(specimen), materials)
 
 
 def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:

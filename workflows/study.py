@@ -130,6 +130,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     own_code.keep(directory, study, loaded)
+    add(dataset, *(verdict.findings_of_solves(evaluations.values()) if _explains(study) else ()))
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
     if isinstance(study, Study) and len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, job.recorders["/"])
@@ -472,7 +473,9 @@ def _summary(
     from forward.model import WORK
 
     every = evaluations.values()
-    failed = sum(len(found.failures) for found in every)
+    explains = _explains(study)
+    unlikely = sum(failure.inadmissible for found in every for failure in found.failures) if explains else 0
+    failed = sum(len(found.failures) for found in every) - unlikely
     names = {label: _parameters(study, label) for label in evaluations}
     source = own_code.digest(study)
     return {
@@ -484,6 +487,7 @@ def _summary(
         "findings": [one._asdict() for one in findings(dataset)],
         "evaluations": sum(len(found.points) for found in every),
         "failed": failed,
+        **({"zero_likelihood": unlikely} if explains else {}),
         "failures": [
             {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
             for label, point, reason in islice(
@@ -491,6 +495,7 @@ def _summary(
                     (label, dict(zip(names[label], f.parameters, strict=True)), f.reason)
                     for label, found in evaluations.items()
                     for f in found.failures
+                    if not (explains and f.inadmissible)
                 ),
                 LISTED,
             )
@@ -510,6 +515,11 @@ def _summary(
             "versions": {"python": platform.python_version(), **_versions()},
         },
     }
+
+
+def _explains(study: AnyStudy) -> bool:
+    """Whether data are explained: then parameters without a model have no likelihood, which is an answer too."""
+    return not isinstance(study, Study) and study.method.kind != "synthesize"
 
 
 def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,8 @@ from workflows.words import number, with_error
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from uq.evaluate import Evaluations
 
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
 GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
@@ -104,6 +107,20 @@ def findings_of_inversion(dataset: xr.Dataset) -> list[Finding]:
         text = f"{name}: {words}" if ok else f"{name} could not be inverted: {words}"
         said.append(Finding("note" if ok and int(one["trust"]) == 0 else "warning", text))
     return said
+
+
+def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
+    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail."""
+    every = list(evaluations)
+    lost = [failure for found in every for failure in found.failures if failure.inadmissible]
+    if not lost:
+        return []
+    solves = sum(len(found.points) for found in every)
+    text = (
+        f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
+        f"({lost[0].reason}): their likelihood is zero, and they count as answered."
+    )
+    return [Finding("note", text)]
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:
