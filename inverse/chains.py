@@ -39,7 +39,7 @@ from inverse.low_rank import LowRankPosterior
 from inverse.newton_cg import Mode
 from inverse.posterior import Posterior
 from inverse.predictive import ResidualTest
-from inverse.weights import effective_number, normalised, tail_shape, trustworthy
+from inverse.weights import effective_number, normalised, tail_shape, trustworthy, worth
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -453,7 +453,6 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
 
 SHIFT = 0.25  # of the mean from the mode, in standard deviations, that is tolerated of Laplace's Gaussian
 WIDTH = 0.2  # relative difference of standard deviations that is
-FEWEST = 20.0  # effective samples below which weights say nothing
 
 
 @dataclass(frozen=True)
@@ -488,16 +487,16 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
         return objection
     if found.route == "closed form":
         return Verdict("laplace", found.why)
-    worth = f"weights worth {found.effective:.0f} of {len(found.log_weights)} points, k̂ = {found.tail:.2f}"
-    if not found.trusted or found.effective < FEWEST:
-        return _by_chains(worth, chains)
+    said = worth(found.tail, found.effective, len(found.log_weights))
+    if not found.trusted:
+        return _by_chains(said, chains)
     w, x = found.weights, found.density.x
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())
     ratio = np.log(np.sqrt(w @ (x - mean) ** 2) / width)
     chance = 2 / np.sqrt(found.effective)
     worst = float(np.exp(ratio[np.abs(ratio).argmax()]))
-    far = f"means are {shift:.2f} standard deviations from the mode, widths {worst:.2f} of the Gaussian's; {worth}"
+    far = f"means are {shift:.2f} standard deviations from the mode, widths {worst:.2f} of the Gaussian's; {said}"
     if shift <= SHIFT + chance and np.abs(ratio).max() <= WIDTH + chance / np.sqrt(2):
         return Verdict("laplace", far)
     return Verdict("corrected", far)
@@ -538,10 +537,10 @@ def verdict_on_field(
         if not chains.mixed or values is None:
             return _by_chains("no weighted samples", chains)
         return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.worth, _said(chains))
-    worth = f"weights worth {found.effective:.0f} of {len(found.log_weights)} samples, k̂ = {found.tail:.2f}"
-    if not found.trusted or found.effective < FEWEST:
-        return _by_chains(worth, chains)
-    return _compared(gaussian, found.mean, found.std, found.effective, worth)
+    said = worth(found.tail, found.effective, len(found.log_weights))
+    if not found.trusted:
+        return _by_chains(said, chains)
+    return _compared(gaussian, found.mean, found.std, found.effective, said)
 
 
 def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, effective: float, worth: str) -> Verdict:

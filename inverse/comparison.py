@@ -26,7 +26,7 @@ from inverse.evidence import Evidence
 from inverse.laplace import Laplace
 from inverse.neighbours import Neighbours, neighbours
 from inverse.posterior import Posterior
-from inverse.weights import tail_shape
+from inverse.weights import effective_number, normalised, tail_shape, trustworthy
 from uq.inputs import Inputs
 
 if TYPE_CHECKING:
@@ -105,7 +105,9 @@ class Criticism:
     Attributes
     ----------
     scores
-        ln p(y_j | other data) (m,), and `tails`, the k̂ (m,) of the weights.
+        ln p(y_j | other data) (m,), with `tails`, the k̂ (m,) of the weights, and `trusted` (m,), what they are worth.
+    pointwise
+        ln p(y_j | x_i) (n, m) at the points.
     misfit
         Posterior predictive probability of residuals as large as these, or larger.
     correlation
@@ -114,6 +116,8 @@ class Criticism:
 
     scores: FloatArray
     tails: FloatArray
+    trusted: NDArray[np.bool_]
+    pointwise: FloatArray
     misfit: float
     correlation: float
 
@@ -133,7 +137,13 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     log_ratio = np.log(w)[:, None] - pointwise
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
-    tails = np.array([tail_shape(np.exp(column)) for column in (log_ratio - top).T])
+    left_out = [normalised(column) for column in log_ratio.T]
+    tails = [tail_shape(column) for column in left_out]
+    trusted = [
+        trustworthy(k, effective_number(column), found.weights.size) for k, column in zip(tails, left_out, strict=True)
+    ]
+    whole = np.full((found.weights.size, posterior.data.size), -np.inf)
+    whole[used] = pointwise
     order, places, kinds = data.sorted
     beside = neighbours(places, kinds)
     m = posterior.data.size
@@ -141,7 +151,7 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
     drawn = np.sort(agreement(errors, beside))
     larger = 1 - np.searchsorted(drawn, agreement(r[:, order], beside)) / DRAWS
-    return Criticism(scores, tails, misfit, float(w @ larger))
+    return Criticism(scores, np.array(tails), np.array(trusted), whole, misfit, float(w @ larger))
 
 
 def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
@@ -222,6 +232,7 @@ def comparison(
         "score_behind": ("model", behind.sum(axis=1)),
         "score_behind_error": ("model", np.sqrt(count) * behind.std(axis=1)),
         "score_tail": ("model", [max(critics[name, group].tails.max() for group in groups) for name in names]),
+        "score_trusted": ("model", [all(critics[name, group].trusted.all() for group in groups) for name in names]),
     }
     if checks:
         variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
@@ -241,6 +252,7 @@ def comparison(
     for name, (dims, _) in columns[0].items():
         variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
     parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
+    variables["point_log_likelihood"] = _pointwise(names, groups, critics)
     variables |= _constants(names, list(groups), parameters, posteriors, stated)
     coordinates = {"model": names, "group": list(groups), "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
@@ -334,6 +346,19 @@ def _constants(
         "constant_std": (dims, std),
         "constant_quantiles": (("quantile", *dims), bands),
     }
+
+
+def _pointwise(names: list[str], groups: Mapping[str, Data], critics: Mapping[Pair, Criticism]) -> tuple[Any, Any]:
+    """Ln of the density of every datum at every point of its group; NaN where nothing was measured."""
+    count = max(critic.pointwise.shape[0] for critic in critics.values())
+    parts = []
+    for group, data in groups.items():
+        part = np.full((len(names), count, len(data.tests)), np.nan)
+        for k, name in enumerate(names):
+            found = critics[name, group].pointwise
+            part[k, : found.shape[0], : found.shape[1]] = found
+        parts.append(part)
+    return ("model", "point", "output"), np.concatenate(parts, axis=2)
 
 
 def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:

@@ -26,7 +26,6 @@ from forward.model import FloatArray, ForwardModel, FunctionModel, FunctionSolut
 from forward.settings import Settings
 from inverse.chains import (
     FEW,
-    FEWEST,
     FIELD,
     Chains,
     FieldWeights,
@@ -50,7 +49,7 @@ from inverse.noise import infer_noise
 from inverse.observations import Components
 from inverse.posterior import NOISE, Posterior
 from inverse.predictive import ResidualTest, examine, spectrum_of
-from inverse.weights import resampled
+from inverse.weights import FEWEST, resampled
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate, Recorder, Request, SerialEvaluate, Start
 from uq.inputs import Inputs
@@ -681,7 +680,7 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
     drawn = None if whole is None else whole.flat[:, 1:]
     verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains, drawn)
     error = np.nan
-    if log_evidence is None and weighed is not None and weighed.trusted and weighed.effective >= FEWEST:
+    if log_evidence is None and weighed is not None and weighed.trusted:
         log_evidence, error = weighed.log_evidence, weighed.error
     scale = data.sigma * factor
     cases = int(data.cases.max()) + 1

@@ -1,7 +1,8 @@
 """Weights of points in a density: their normalisation, what they are worth, and draws by them.
 
 The worth is told by the effective number (Σw)²/Σw² and the shape k̂ of the tail (A. Vehtari et al., J. Mach. Learn. Res.
-25 (2024) 72).
+25 (2024) 72). `trustworthy` is the one rule by which weights are trusted, in evidences, posteriors, left-out scores and
+all that is said of them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,11 @@ from forward.model import FloatArray
 
 TRUSTED = 0.7  # k̂ up to which weights are worth what they say
 ALIKE = 0.8  # effective share from which on weights are equal for all that matters
+FEWEST = 20.0  # effective points below which weights say nothing
+RULE = (
+    f"Weights are to be trusted where they are worth {FEWEST:.0f} points or more, and k̂ is {TRUSTED:g} or less or more "
+    f"than {100 * ALIKE:.0f} % of the points count."
+)
 
 
 def normalised(log_weights: FloatArray) -> FloatArray:
@@ -29,7 +35,13 @@ def effective_number(weights: FloatArray) -> float:
 def trustworthy(tail: float, effective: float, count: int) -> bool:
     """Whether weights of `count` points are worth what they say."""
     # The tail of weights that are all but equal says nothing.
-    return tail <= TRUSTED or effective > ALIKE * count
+    return effective >= FEWEST and (tail <= TRUSTED or effective > ALIKE * count)
+
+
+def worth(tail: float, effective: float, count: int) -> str:
+    """Say what weights of `count` points are worth."""
+    shape = "∞" if np.isinf(tail) else f"{tail:.2f}"
+    return f"weights worth {effective:.0f} of {count} points, k̂ = {shape}"
 
 
 def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:

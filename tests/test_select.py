@@ -17,6 +17,7 @@ from inverse.evidence import evidence
 from inverse.laplace import laplace
 from inverse.posterior import Posterior
 from inverse.selection import Noise, Select, posterior
+from inverse.weights import FEWEST, RULE, trustworthy
 from tests.launch import run, run_script
 from tests.rubber import CONFIGS, FACTOR, treloar
 from uq.distributions import LogNormal, LogUniform, Normal, Uniform
@@ -391,6 +392,38 @@ def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
     assert any("no stress in the test" in one["text"] for one in summary["findings"])
 
 
+def test_arviz_reads_results_as_they_are(small):
+    """Groups `prior` and `log_likelihood`: leave-one-out scores and their comparison are those of the program."""
+    arviz = pytest.importorskip("arviz")
+    small.write_text(SMALL.replace("held_out = true", "").replace("samples = 32", "samples = 512"))
+    rows = "".join(f"uniaxial,{x},{2 * 0.5 * (x - x**-2):.3f}\n" for x in (1.3, 1.5, 1.7, 1.9))
+    (small.parent / "table.csv").write_text(TABLE + rows)
+    out = small.parent / "out"
+    assert run(None, TISSUQ, "run", small, "--out", out).returncode == 0
+    found = xr.load_dataset(out / "results.nc", engine="h5netcdf")
+    data = arviz.from_netcdf(out / "results.nc")
+    assert {"posterior", "prior", "log_likelihood", "observed_data"} <= set(data.groups())
+    assert set(data.prior.data_vars) == set(data.posterior.data_vars)
+    names = [str(name) for name in found.model.values]
+    scores = {name: arviz.loo(data, var_name=name, pointwise=True) for name in names}
+    for name in names:
+        assert scores[name].elpd_loo == pytest.approx(float(found["score"].sel(model=name)), abs=0.3)
+    ranked = [str(found.model.values[i]) for i in np.argsort(-found["score"].to_numpy())]
+    assert arviz.compare(scores).index.tolist() == ranked
+
+
+def test_one_rule_for_weights():
+    """Few points, long tails, or nearly all of them equal: said by the same rule wherever weights are used."""
+    assert trustworthy(0.5, 100.0, 256)
+    assert not trustworthy(0.5, FEWEST - 1, 256)
+    assert not trustworthy(0.75, 100.0, 256)
+    assert trustworthy(0.75, 230.0, 256)
+    assert not trustworthy(np.inf, 10.0, 10)
+    assert "20 points" in RULE
+    assert "0.7" in RULE
+    assert "80 %" in RULE
+
+
 def test_subsets_are_of_known_tests(small):
     with pytest.raises(StudyError, match=r"method\.subsets\.x: no test has this name; did you mean 'uniaxial'"):
         load(small, ['method.subsets={x = ["uniaxal"]}'])
@@ -433,7 +466,7 @@ def test_a_study_from_the_command_line(small):
     summary = json.loads((small.parent / "one" / "summary.json").read_text())
     assert set(summary["models"]) == {"neo-hookean", "mooney-rivlin"}
     for found in summary["models"].values():
-        assert set(found) == {"log_evidence", "log_evidence_error", "probability"}
+        assert set(found) == {"log_evidence", "log_evidence_error", "probability", "trusted"}
     assert sum(found["probability"] for found in summary["models"].values()) == pytest.approx(1)
     done = run(2, TISSUQ, "run", small, "--out", small.parent / "two")
     assert done.returncode == 0, done.stderr

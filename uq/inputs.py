@@ -153,6 +153,12 @@ class Inputs:
         """Return the same parameters, restricted."""
         return replace(self, admissible=admissible)
 
+    def allowed(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Return at which points (n, d) there is a model, (n,)."""
+        if self.admissible is None:
+            return np.ones(len(points), dtype=bool)
+        return np.broadcast_to(self.admissible.admissible(dict(zip(self.names, points.T, strict=True))), len(points))
+
     @cached_property
     def admitted(self) -> float:
         """Probability of parameters for which there is a model."""

@@ -92,9 +92,11 @@ def summarise(dataset: xr.Dataset) -> dict[str, Any]:
         return {"data": int(np.isfinite(dataset["values"]).sum())}
     if "log_evidence" in dataset:
         shown = ("log_evidence", "log_evidence_error", "probability")
+        trusted = dataset["trusted"].all("group")
         return {
             "models": {
                 str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
+                | {"trusted": bool(trusted.sel(model=model))}
                 for model in dataset.model.values
             }
         }

@@ -16,10 +16,11 @@ from forward.geometry import Vector
 from forward.homogeneous import HELD, Component, HomogeneousModel, MaterialTest, Mode, named, unfit
 from forward.hyperelastic import Mistake
 from forward.materials import MATERIALS, constants
-from forward.model import Finding, ForwardModel
+from forward.model import Finding, FloatArray, ForwardModel
 from forward.settings import Settings, nearest
 from inverse.comparison import Candidate, Data
 from inverse.observations import DataError, read_table
+from inverse.posterior import NOISE
 from inverse.selection import Select
 from inverse.weights import resampled
 from uq.distributions import Distribution
@@ -565,19 +566,52 @@ def _number(text: str, place: str, *, positive: bool = False) -> float:
     return value
 
 
-def groups(found: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return ArviZ's groups: draws of the constants of every model, in each group of data, and the data."""
+def groups(study: Comparison, found: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`.
+
+    Draws of the constants of every model before and after the data, in each group of data; ln of the density of each
+    datum at these draws, one variable for each model; the data.
+    """
     import xarray as xr
 
-    drawn: dict[str, Any] = {}
-    for model in found.model.values:
-        points = found["point"].sel(model=model)
-        weights = found["point_weight"].sel(model=model)
-        chosen = [resampled(weights.sel(group=group).to_numpy(), DRAWS, 0) for group in found.group.values]
+    drawn, dense, before = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    measured = np.isfinite(found["measured"].to_numpy())
+    of_group = found["output_group"].to_numpy()[measured]
+    dims = ("chain", "draw", "group")
+    for model in map(str, found.model.values):
+        one = found.sel(model=model)
+        chosen = {
+            str(group): resampled(one["point_weight"].sel(group=group).to_numpy(), DRAWS, 0)
+            for group in found.group.values
+        }
         for parameter in found.parameter.values:
-            columns = points.sel(parameter=parameter).transpose("group", "point").to_numpy()
-            values = np.array([column[which] for column, which in zip(columns, chosen, strict=True)])
+            points = one["point"].sel(parameter=parameter)
+            values = np.array([points.sel(group=group).to_numpy()[which] for group, which in chosen.items()])
             if np.isfinite(values).all():
-                drawn[f"{model}.{parameter}"] = (("chain", "draw", "group"), values.T[None])
-    posterior = xr.Dataset(drawn, {"group": found.group.values})
-    return {"posterior": posterior, "observed_data": xr.Dataset({found.attrs["quantity"]: found["measured"]})}
+                drawn[f"{model}.{parameter}"] = (dims, values.T[None])
+        dense_at = one["point_log_likelihood"].to_numpy()[:, measured]
+        columns = [dense_at[chosen[group], j] for j, group in enumerate(of_group)]
+        dense[model] = (("chain", "draw", "output"), np.array(columns).T[None])
+        before |= {
+            f"{model}.{name}": (dims, np.broadcast_to(values[None, :, None], (1, DRAWS, len(chosen))))
+            for name, values in _before(study, model).items()
+        }
+    where = {"group": found.group.values}
+    return {
+        "posterior": xr.Dataset(drawn, where),
+        "prior": xr.Dataset(before, where),
+        "log_likelihood": xr.Dataset(dense),
+        "observed_data": xr.Dataset({found.attrs["quantity"]: found["measured"].isel(output=measured)}),
+    }
+
+
+def _before(study: Comparison, model: str) -> dict[str, FloatArray]:
+    """Draws of the constants of a model before the data, and of the size of the errors where that is inferred."""
+    inputs, factor = study.models[model].inputs, study.method.noise.factor
+    rng = np.random.default_rng(study.method.seed)
+    kept = np.zeros((0, len(inputs.names)))
+    while len(kept) < DRAWS:
+        points = inputs.from_normals(rng.standard_normal((DRAWS, len(inputs.names))))[0]
+        kept = np.concatenate([kept, points[inputs.allowed(points)]])
+    found = dict(zip(inputs.names, kept[:DRAWS].T, strict=True))
+    return found if factor is None else found | {NOISE: factor.from_normal(rng.standard_normal(DRAWS))[0]}

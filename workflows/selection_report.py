@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from inverse.weights import RULE
 from workflows import plots
 from workflows.tables import Table
 from workflows.verdict import bayes_factor, conflicts, grade, ranking
@@ -25,6 +26,7 @@ UNITS = {"stress": "Pa", "displacement": "m"}
 def context(dataset: xr.Dataset, study: Comparison) -> dict[str, Any]:
     """Return what the template shows beside what all reports have."""
     return {
+        "rule": RULE,
         "source": study.source,
         "priors": priors(study),
         "evidences": evidences(dataset),
@@ -168,6 +170,7 @@ def criticism(dataset: xr.Dataset) -> Table:
                 with_error(float(one["score"]), float(one["score_error"])),
                 with_error(behind, float(one["score_behind_error"])) if behind else NONE,
                 number(float(one["score_tail"]), 2),
+                "yes" if bool(one["score_trusted"]) else "no",
                 number(float(one["misfit_probability"].min()), 2),
                 number(float(one["correlation_probability"].min()), 2),
                 "; ".join(conflicts(dataset, model)) or "none",
@@ -178,11 +181,12 @@ def criticism(dataset: xr.Dataset) -> Table:
         "Σ ln p(left-out datum)",
         "behind the best",
         "largest k̂",
+        "to be trusted",
         "p of larger residuals",
         "p of more alike neighbours",
         "conflict",
     )
-    return Table(head, rows, text=frozenset({0, 6}), long=frozenset({6}))
+    return Table(head, rows, text=frozenset({0, 4, 7}), long=frozenset({7}))
 
 
 def held_out(dataset: xr.Dataset) -> Table:

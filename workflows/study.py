@@ -285,7 +285,9 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
         add(found, *verdict.findings(found))
         return found
 
-    return _Job(makers[0](), list(makers[1:]), task, recorders, labelled, groups=groups, costly=study.costly)
+    return _Job(
+        makers[0](), list(makers[1:]), task, recorders, labelled, groups=partial(groups, study), costly=study.costly
+    )
 
 
 def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding
+from inverse.weights import worth
 from workflows.words import number, with_error
 
 if TYPE_CHECKING:
@@ -85,17 +86,24 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
             said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
-    doubtful = [
-        f"{model}" + (f" ({group})" if dataset.sizes["group"] > 1 else "")
-        for model in order
-        for group in dataset.group.values
-        if not bool(dataset["trusted"].sel(model=model, group=group))
-    ]
+    doubtful = _doubtful(dataset, order)
     if doubtful:
-        said.append(
-            Finding("warning", f"Evidences not to be trusted, by the tail of their weights: {', '.join(doubtful)}.")
-        )
+        text = f"Evidences not to be trusted: {', '.join(doubtful)}; more points may help (method.samples)."
+        said.append(Finding("warning", text))
     return said
+
+
+def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
+    """Evidences that cannot be trusted, each with what its weights are worth."""
+    found = []
+    for model in order:
+        for group in dataset.group.values:
+            one = dataset.sel(model=model, group=group)
+            if not bool(one["trusted"]):
+                where = f"{model} in {group}" if dataset.sizes["group"] > 1 else model
+                count = int(np.isfinite(one["point"].to_numpy()).any(axis=-1).sum())
+                found.append(f"{where} ({worth(float(one['tail']), float(one['effective']), count)})")
+    return found
 
 
 def findings_of_inversion(dataset: xr.Dataset) -> list[Finding]:
