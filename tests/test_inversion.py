@@ -331,6 +331,22 @@ def test_two_ranks_give_the_same_bytes(folder):
     assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("study", "tasks"),
+    [("field.toml", 1), ("made.toml", 2)],
+)
+def test_fewer_tasks_than_ranks(folder, study, tasks):
+    one, two = (folder / f"{study}-{ranks}" for ranks in (1, tasks + 1))
+    done = [
+        run_script(ranks, WITHOUT_REPORT, "run", folder / study, "--out", out, "--quiet")
+        for ranks, out in ((None, one), (tasks + 1, two))
+    ]
+    assert [each.returncode for each in done] == [0, 0], done[1].stderr
+    assert f"{tasks + 1} groups of ranks were started for {tasks} tasks: 1 have nothing to do" in done[1].stderr
+    assert (one / "results.nc").read_bytes() == (two / "results.nc").read_bytes()
+
+
 def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
     assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']") == 0

@@ -399,7 +399,11 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
     groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
-    if groups > blocks:
+    if groups > blocks and not isinstance(
+        study, Study
+    ):  # tasks that each take minutes: someone who waits is no mistake
+        _note(f"{groups} groups of ranks were started for {blocks} tasks: {groups - blocks} have nothing to do")
+    elif groups > blocks:
         message = (
             f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
             f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
@@ -434,6 +438,11 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
     if summary is None:
         return None
     return exit_code(summary)
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(f"note: {text}\n")
+    sys.stderr.flush()
 
 
 def _withdraw(directory: Path) -> None:
