@@ -51,6 +51,18 @@ def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
     return f"did you mean '{close[0]}'?" if close else f"expected one of: {', '.join(known)}"
 
 
+LONGEST = 80  # letters of a value in a message
+
+
+def shown(value: Any) -> str:
+    """Return a value for a message, cut where it is long."""
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, lists nested as deep
+        return f"a long {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
 def _freeze(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_freeze(item) for item in value)

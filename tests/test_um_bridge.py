@@ -3,11 +3,14 @@
 import json
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tomllib
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Barrier
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -150,6 +153,12 @@ def test_answers_are_those_of_the_protocol(beam):
         ({"sens": [1.0], "vec": [1.0]}, "InvalidInput"),
         ({"config": {"lewel": 1}}, "InvalidInput"),
         ({"config": {"level": -1}}, "InvalidInput"),
+        ({"config": {"level": True}}, "InvalidInput"),
+        ({"config": {"level": 6}}, "InvalidInput"),
+        ({"config": {"level": 10**9}}, "InvalidInput"),
+        ({"config": {"tolerance": "x" * 5000}}, "InvalidInput"),
+        ({"name": ["x" * 5000]}, "ModelNotFound"),
+        ({"input": [[10**400, 1.0]]}, "InvalidInput"),
     ],
 )
 def test_what_is_wrong_is_refused(beam, what, change, kind):
@@ -161,6 +170,112 @@ def test_what_is_wrong_is_refused(beam, what, change, kind):
         return
     jsonschema.validate(answer, ERROR)
     assert (status, answer["error"]["type"]) == (400, kind)
+    assert len(answer["error"]["message"]) < 300
+    assert "\n" not in answer["error"]["message"]
+
+
+def raw(url, text, *, wait=10.0):
+    """Send bytes as they are, and return the status and the answer."""
+    host, port = url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=wait) as connection:
+        with suppress(ConnectionError):
+            connection.sendall(text)
+        answer = b""
+        while part := connection.recv(65536):
+            answer += part
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]), json.loads(body)
+
+
+def post(body, *headers, length=None, what="Evaluate"):
+    lines = [f"POST /{what} HTTP/1.1", f"Content-Length: {len(body) if length is None else length}", *headers, "", ""]
+    return "\r\n".join(lines).encode() + body
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "words"),
+    [
+        (post(b"[" * 100_000), 400, "nested too deeply, expected at most 32 levels"),
+        (post(b'{"a":' * 5000 + b"1" + b"}" * 5000), 400, "nested too deeply"),
+        (post(b'{"a": [NaN, Infinity]}'), 400, "NaN is not a number of JSON"),
+        (post(b'{"a": ' + b"9" * 6000 + b"}"), 400, "not a JSON object"),
+        (post(b"\xff\xfe"), 400, "not a JSON object"),
+        (post(b"[]"), 400, "not a JSON object"),
+        (post(b"{}", length=10**12), 413, "too long, expected at most 16777216 bytes"),
+        (post(b"x" * (17 * 2**20)), 413, "too long"),
+        (post(b"{}", length="9" * 5000), 413, "too long"),
+        (post(b"{}", length=-1), 400, "Content-Length: expected a number of bytes"),
+        (post(b"{}", length="two"), 400, "Content-Length: expected a number of bytes"),
+        (post(b"", "Transfer-Encoding: chunked"), 411, "has no length"),
+        (post(b"{}", "Host: evil.example:4242"), 403, "this server answers this machine only"),
+        (post(b"{}", "Host: 192.168.0.7"), 403, "this server answers this machine only"),
+        (post(b"{}", "Host: localhost", "Origin: http://evil.example"), 403, "answers no pages of browsers"),
+        (post(b"{}", "Host: localhost", "Origin: null"), 403, "answers no pages of browsers"),
+        (b"GET /Info HTTP/1.1\r\nHost: rebound.example\r\n\r\n", 403, "this machine only"),
+        (b"PUT /Evaluate HTTP/1.1\r\n\r\n", 501, "Unsupported method"),
+        (b"POST /" + b"x" * 70_000 + b" HTTP/1.1\r\n\r\n", 414, "Too Long"),
+        (b"POST /" + b"x" * 5000 + b" HTTP/1.1\r\n\r\n", 404, "is not of the protocol"),
+        (post(b"{}", *(f"A{i}: b" for i in range(300))), 431, "headers"),
+    ],
+    ids=lambda value: "" if isinstance(value, bytes) else value,
+)
+def test_bounds_of_requests(function, text, status, words):
+    found, answer = raw(function, text)
+    jsonschema.validate(answer, ERROR)
+    assert (found, words in answer["error"]["message"]) == (status, True), answer
+    assert len(answer["error"]["message"]) < 300
+    assert ask(function, "Info")[0] == 200
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:80", "127.0.0.1:4242", "[::1]:4242"])
+def test_hosts_that_are_this_machine(function, host):
+    body = json.dumps({"name": "forward", "input": [[1.0, 1.0]]}).encode()
+    assert raw(function, post(body, f"Host: {host}"))[0] == 200
+    assert raw(function, post(body, f"Host: {host}", f"Origin: http://{host}"))[0] == 200
+
+
+def test_fifty_clients_at_once_clients_that_leave_and_one_that_dawdles(tmp_path):
+    path = tmp_path / "function.toml"
+    path.write_text(FUNCTION.format("beam"))
+    impatient = "import sys, workflows.http; workflows.http.SECONDS_TO_SEND = 1.0; "
+    script = impatient + "from workflows.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    body = json.dumps({"name": "forward", "input": [[1.0, 1.0]]}).encode()
+    with command(sys.executable, "-c", script, "serve", path, "--port", 0) as (url, process):
+        port = int(url.split(":")[-1])
+        everyone = Barrier(50)
+
+        def client(_):
+            everyone.wait()
+            return [raw(url, post(body), wait=60) for _ in range(10)]
+
+        def leaves(i):
+            everyone.wait()
+            for _ in range(10):
+                with socket.create_connection(("127.0.0.1", port)) as connection:
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", i % 2, 0))
+                    connection.sendall(post(body) if i % 3 else post(body)[:40])
+
+        with ThreadPoolExecutor(50) as pool:
+            answers = [answer for each in pool.map(client, range(50)) for answer in each]
+            assert {status for status, _ in answers} == {200}
+            assert len({json.dumps(answer) for _, answer in answers}) == 1
+            list(pool.map(leaves, range(50)))
+        assert raw(url, post(body[:-1], length=len(body)), wait=60)[0] == 408
+        assert ask(url, "Info")[0] == 200
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 0
+        assert process.stderr.read() == ""
+
+
+def test_a_model_that_returns_what_is_none_is_one_line(tmp_path):
+    path = tmp_path / "function.toml"
+    path.write_text(FUNCTION.format("short"))
+    with command(TISSUQ, "serve", path, "--port", 0) as (url, process):
+        status, answer = ask(url, "Evaluate", {"name": "forward", "input": [[1.0, 1.0]]})
+        assert (status, answer["error"]["type"]) == (500, "ModelError")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 0
+        assert process.stderr.read() == ""
 
 
 @pytest.mark.fem

@@ -13,21 +13,21 @@ import sys
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from queue import SimpleQueue
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
 
 from forward.external import PROTOCOL
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, Reference, Solution, SolveError
-from forward.settings import nearest
+from forward.model import FloatArray, ModelError, Reference, Solution, SolveError
+from forward.settings import nearest, shown
 from uq.evaluate import SerialEvaluate
 from uq.linearisation import linearise
 from workflows.config import Study, StudyError
+from workflows.http import RefusalError, Server
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel
@@ -35,15 +35,8 @@ if TYPE_CHECKING:
 NAME = "forward"
 OPTIONS = ("level", "tolerance")
 KEPT = 4  # models of different options
+MOST_UNKNOWNS = 2_000_000  # of a mesh that a request may ask for
 STEP = 1e-3  # of differences of gradients, in standard deviations of the parameters
-
-
-class RefusalError(Exception):
-    """A request that cannot be answered: the kind of error in the words of the protocol, and what is wrong."""
-
-    def __init__(self, kind: str, message: str, status: int = 400) -> None:
-        super().__init__(message)
-        self.kind, self.status = kind, status
 
 
 class Service:
@@ -80,10 +73,10 @@ class Service:
             "ApplyHessian": self._hessian,
         }
         if what not in {*answers, "ModelInfo", "InputSizes", "OutputSizes"}:
-            message = f"'{what}' is not of the protocol"
+            message = f"{shown(what)} is not of the protocol"
             raise RefusalError("UnsupportedFeature", message, 404)
         if question.get("name") != NAME:
-            message = f"there is no model '{question.get('name')}', expected '{NAME}'"
+            message = f"there is no model {shown(question.get('name'))}, expected '{NAME}'"
             raise RefusalError("ModelNotFound", message)
         if what == "ModelInfo":
             return {"support": {"Evaluate": True} | dict.fromkeys(list(answers)[1:], self._differentiable)}
@@ -141,7 +134,7 @@ class Service:
             raise RefusalError("InvalidInput", message)
         for option in options:
             if option not in OPTIONS:
-                message = f"config.{option}: unknown option; {nearest(option, OPTIONS)}"
+                message = f"config.{option[:40]}: unknown option; {nearest(option[:40], OPTIONS)}"
                 raise RefusalError("InvalidInput", message)
         key = json.dumps(options, sort_keys=True)
         if key not in self._made:
@@ -160,15 +153,22 @@ class Service:
             message = f"config: a model of kind '{model.kind}' has no options"
             raise RefusalError("InvalidInput", message)
         level, tolerance = options.get("level", 0), options.get("tolerance", model.solver.tolerance)
-        if not isinstance(level, int) or level < 0 or (level > 0 and model.fields):
-            message = f"config.level: {level!r}, expected a number of refinements, and 0 where there are random fields"
+        if type(level) is not int or level < 0 or (level > 0 and model.fields):
+            message = (
+                f"config.level: {shown(level)}, expected a number of refinements, and 0 where there are random fields"
+            )
             raise RefusalError("InvalidInput", message)
         try:
+            if level > 0 and 8 ** min(level, 20) * model.unknowns > MOST_UNKNOWNS:
+                message = f"config.level: {shown(level)}, expected a mesh of at most {MOST_UNKNOWNS:,} unknowns"
+                raise RefusalError("InvalidInput", message)
             solver = type(model.solver).model_validate(model.solver.model_dump() | {"tolerance": tolerance})
             return model.refined(level).model_copy(update={"solver": solver})
         except ValidationError as error:
             message = f"config: {error.errors()[0]['msg']}"
-            raise RefusalError("InvalidInput", message) from None
+        except ModelError as error:  # a mesh from a file has no finer ones
+            message = f"config.level: {error}"
+        raise RefusalError("InvalidInput", message)
 
 
 class _Solver:
@@ -210,9 +210,12 @@ def _vector(question: dict[str, Any], key: str, length: int) -> FloatArray:
 
 
 def _numbers(given: Any, key: str, length: int) -> FloatArray:
-    found = np.array([x for x in given if type(x) in {int, float}] if isinstance(given, list) else [], dtype=float)
-    if not isinstance(given, list) or not len(given) == len(found) == length:
-        message = f"{key}: expected {length} numbers"
+    try:
+        found = np.array([x for x in given if type(x) in {int, float}] if isinstance(given, list) else [], dtype=float)
+    except OverflowError:
+        found = np.zeros(0)
+    if not isinstance(given, list) or not len(given) == len(found) == length or not np.isfinite(found).all():
+        message = f"{key}: expected {length} finite numbers"
         raise RefusalError("InvalidInput", message)
     return found
 
@@ -221,49 +224,8 @@ def _first(question: dict[str, Any], *keys: str) -> None:
     """Refuse other vectors than the first: there is only one of parameters, and one of outputs."""
     for key in keys:
         if question.get(key) != 0:
-            message = f"{key}: {question.get(key)!r}, expected 0"
+            message = f"{key}: {shown(question.get(key))}, expected 0"
             raise RefusalError("InvalidInput", message)
-
-
-class _Handler(BaseHTTPRequestHandler):
-    """Passes requests on to the thread that solves, and sends what it answers."""
-
-    ask: Callable[[str, dict[str, Any]], dict[str, Any]]
-
-    def do_GET(self) -> None:
-        self._reply({})
-
-    def do_HEAD(self) -> None:
-        """Say that the server is there."""
-        self.send_response(200)
-        self.end_headers()
-
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        try:
-            question = json.loads(body or b"{}")
-        except ValueError:
-            question = None
-        self._reply(question)
-
-    def _reply(self, question: Any) -> None:
-        status = 200
-        try:
-            if not isinstance(question, dict):
-                message = "the request is not a JSON object"
-                raise RefusalError("InvalidInput", message)  # noqa: TRY301 - all refusals are sent alike
-            answer = type(self).ask(self.path.strip("/"), question)
-        except RefusalError as refusal:
-            answer, status = {"error": {"type": refusal.kind, "message": str(refusal)}}, refusal.status
-        body = json.dumps(answer).encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of single requests."""
 
 
 def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
@@ -290,20 +252,18 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
     ModelError
         If the model cannot be made.
     """
-    jobs: SimpleQueue[tuple[Future[dict[str, Any]], str, dict[str, Any]]] = SimpleQueue()
+    jobs: SimpleQueue[_Job] = SimpleQueue()
 
     def ask(what: str, question: dict[str, Any]) -> dict[str, Any]:
-        future: Future[dict[str, Any]] = Future()
-        jobs.put((future, what, question))
-        return future.result()
+        job = _Job(Future(), what, question)
+        jobs.put(job)
+        return job.future.result()
 
-    handler = type("Handler", (_Handler,), {"ask": staticmethod(ask)})
     try:
-        server = ThreadingHTTPServer((host, port), handler)
+        server = Server(host, port, ask)
     except (OSError, OverflowError) as error:
         message = f"--port {port}: cannot be used on {host}: {getattr(error, 'strerror', None) or error}"
         raise StudyError(message) from None
-    server.daemon_threads = True
     previous = signal.signal(signal.SIGTERM, _interrupt)
     answered, listening = 0, None
     try:
@@ -317,17 +277,19 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
         listening = Thread(target=server.serve_forever, daemon=True)
         listening.start()
         while True:
-            future, what, question = jobs.get()
+            job = jobs.get()
             try:
-                future.set_result(service.answer(what, question))
+                job.future.set_result(service.answer(job.what, job.question))
             except KeyboardInterrupt:
-                future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
+                job.future.set_exception(RefusalError("Interrupted", "the server was interrupted", 503))
                 raise
             except RefusalError as refusal:
-                future.set_exception(refusal)
+                job.future.set_exception(refusal)
+            except ModelError as error:
+                job.future.set_exception(RefusalError("ModelError", str(error), 500))
             except Exception as error:  # the next request may do better
                 traceback.print_exc()
-                future.set_exception(RefusalError(type(error).__name__, str(error), 500))
+                job.future.set_exception(RefusalError(type(error).__name__, str(error), 500))
             answered += 1
     except KeyboardInterrupt:
         if not quiet:
@@ -338,6 +300,14 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
     finally:
         server.server_close()
         signal.signal(signal.SIGTERM, previous)
+
+
+class _Job(NamedTuple):
+    """A request on its way to the thread that solves."""
+
+    future: Future[dict[str, Any]]
+    what: str
+    question: dict[str, Any]
 
 
 def _interrupt(*_: Any) -> None:

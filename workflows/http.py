@@ -1,0 +1,240 @@
+"""The way of requests to a server: what is read of a client, for how long, and from whom.
+
+Everything that is refused is answered by one line of JSON, in the form of UM-Bridge.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import ipaddress
+import json
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import urlsplit
+
+SECONDS_TO_SEND = 30.0  # in which a client has to send its whole request, and to take the answer
+LARGEST = 16 * 2**20  # bytes of a request
+DEEPEST = 32  # levels of lists and tables in a request
+MOST_WAITING = 1024  # requests that wait to be answered
+
+
+class RefusalError(Exception):
+    """A request that cannot be answered: the kind of error in the words of the protocol, and what is wrong."""
+
+    def __init__(self, kind: str, message: str, status: int = 400) -> None:
+        super().__init__(message)
+        self.kind, self.status = kind, status
+
+
+Ask = Callable[[str, dict[str, Any]], dict[str, Any]]  # what, with which fields
+
+
+class _Deadline(io.RawIOBase):
+    """What comes from a socket until some time."""
+
+    def __init__(self, connection: socket.socket, seconds: float) -> None:
+        self._connection, self._until = connection, time.monotonic() + seconds
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        left = self._until - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._connection.settimeout(left)
+        return self._connection.recv_into(buffer)
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Reads a request, passes it on, and sends the answer."""
+
+    server: Server
+
+    def setup(self) -> None:
+        """Give the client a time to send its request in."""
+        super().setup()
+        self._unread = True
+        self.rfile = io.BufferedReader(_Deadline(self.connection, SECONDS_TO_SEND))
+
+    def do_GET(self) -> None:
+        """Answer a question without fields."""
+        self._unread = False
+        self._reply(dict)
+
+    def do_HEAD(self) -> None:
+        """Say that the server is there."""
+        self.send_response(200)
+        self.end_headers()
+
+    def do_POST(self) -> None:
+        """Answer a question."""
+        self._reply(self._question)
+
+    def _question(self) -> dict[str, Any]:
+        if self.headers.get("Transfer-Encoding"):
+            message = "the request has no length, expected a header Content-Length"
+            raise RefusalError("InvalidInput", message, 411)
+        length = self.headers.get("Content-Length") or "0"
+        if not (length.isascii() and length.isdecimal()):
+            message = "Content-Length: expected a number of bytes"
+            raise RefusalError("InvalidInput", message)
+        if len(length) > 18 or int(length) > LARGEST:
+            message = f"the request is too long, expected at most {LARGEST} bytes"
+            raise RefusalError("InvalidInput", message, 413)
+        try:
+            body = self.rfile.read(int(length))
+            self._unread = False
+        except TimeoutError:
+            message = f"the request did not come within {SECONDS_TO_SEND:.0f} s"
+            raise RefusalError("InvalidInput", message, 408) from None
+        return parsed(body or b"{}")
+
+    def _reply(self, read: Callable[[], dict[str, Any]]) -> None:
+        status = 200
+        try:
+            self._check_origin()
+            answer = self.server.ask(self.path.strip("/"), read())
+        except RefusalError as refusal:
+            answer, status = {"error": {"type": refusal.kind, "message": str(refusal)}}, refusal.status
+        body = json.dumps(answer).encode()
+        self.connection.settimeout(SECONDS_TO_SEND)
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+        if self._unread:
+            self._linger()
+
+    def _linger(self) -> None:
+        """Read on for a moment: a connection that is closed with unread bytes takes the answer with it."""
+        self.wfile.flush()
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+            rest = _Deadline(self.connection, 2.0)
+            while rest.readinto(bytearray(2**16)):
+                pass
+
+    def _check_origin(self) -> None:
+        """Refuse what the page of a browser asks, also under a name that was made to stand for this host."""
+        host, origin = self.headers.get("Host"), self.headers.get("Origin")
+        if self.server.local and host is not None and not _is_local(host, self.server.called):
+            message = f"Host: {host[:80]!r}, expected localhost: this server answers this machine only"
+            raise RefusalError("Forbidden", message, 403)
+        if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
+            message = f"Origin: {origin[:80]!r}, expected none: this server answers no pages of browsers"
+            raise RefusalError("Forbidden", message, 403)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Say what is wrong with the head of a request."""
+        del explain
+        body = json.dumps({"error": {"type": "InvalidInput", "message": message or HTTPStatus(code).phrase}}).encode()
+        self.send_response_only(code)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of single requests."""
+
+
+class Server(ThreadingHTTPServer):
+    """A server whose requests are answered by a function, in the threads of their connections.
+
+    Parameters
+    ----------
+    host, port
+        Where it listens.
+    ask
+        Answers a request, given what it asks and its fields.
+    """
+
+    request_queue_size = (
+        MOST_WAITING  # the system's own bound is often lower: connections that it drops are tried again
+    )
+    daemon_threads = True
+
+    def __init__(self, host: str, port: int, ask: Ask) -> None:
+        self.ask = ask
+        self.called = host.lower()
+        self._free = threading.BoundedSemaphore(MOST_WAITING)
+        super().__init__((host, port), Handler)
+        self.local = ipaddress.ip_address(str(self.server_address[0])).is_loopback
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, if there are not too many of these."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer in this thread."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say what went wrong in a line, unless the client has just left."""
+        error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
+        if not isinstance(error, ConnectionError | TimeoutError):
+            sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
+
+
+def parsed(body: bytes) -> dict[str, Any]:
+    """Return the fields of a request.
+
+    Raises
+    ------
+    RefusalError
+        If it is no JSON object, is nested too deeply, or holds numbers that are none.
+    """
+
+    def refuse(word: str) -> float:
+        message = f"{word} is not a number of JSON"
+        raise RefusalError("InvalidInput", message)
+
+    if nesting(body) > DEEPEST:
+        message = f"the request is nested too deeply, expected at most {DEEPEST} levels"
+        raise RefusalError("InvalidInput", message)
+    try:
+        question = json.loads(body, parse_constant=refuse)
+    except (ValueError, RecursionError):
+        question = None
+    if not isinstance(question, dict):
+        message = "the request is not a JSON object"
+        raise RefusalError("InvalidInput", message)
+    return question
+
+
+def nesting(body: bytes) -> int:
+    """Return a bound of how deep lists and tables of a JSON text are nested; brackets in strings count too."""
+    deepest = level = 0
+    for byte in body.translate(None, delete=bytes(set(range(256)) - set(b"[]{}"))):
+        level += 1 if byte in b"[{" else -1
+        deepest = max(deepest, level)
+    return deepest
+
+
+def _is_local(host: str, called: str) -> bool:
+    """Whether the name in a header, with or without a port, is one of this machine for itself."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    if name in {"localhost", called}:
+        return True
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
