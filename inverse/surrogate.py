@@ -19,6 +19,7 @@ from inverse.laplace import Laplace
 from inverse.posterior import Density, Posterior
 from inverse.weights import effective_number, normalised
 from uq.basis import Basis, hyperbolic
+from uq.coordinates import Coordinates
 from uq.distributions import Normal
 from uq.evaluate import Evaluations, Failure, Request
 from uq.inputs import Inputs
@@ -80,7 +81,7 @@ class Surrogate:
         tangents = None
         if request.tangents:
             slopes = self.basis.derivatives(points) @ self.coefficients
-            tangents = np.swapaxes(slopes / self.basis.scale[:, None], 1, 2)
+            tangents = np.swapaxes(slopes / self.basis.coordinates.scale[:, None], 1, 2)
             tangents[outside] = np.nan
         failures = tuple(Failure(int(i), (), BEYOND) for i in np.flatnonzero(outside))
         work = np.zeros((n, len(WORK)), dtype=np.int64)
@@ -161,7 +162,7 @@ def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
 def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basis:
     beta = np.maximum(np.arange(degree + 1.0), 1.0)
     indices = hyperbolic(d, degree, 1.0)
-    return Basis(centre, scale, np.zeros((d, degree + 1)), np.tile(beta, (d, 1)), indices)
+    return Basis(Coordinates.linear(centre, scale), np.zeros((d, degree + 1)), np.tile(beta, (d, 1)), indices)
 
 
 def _tempered(log_density: FloatArray, least: float) -> FloatArray:

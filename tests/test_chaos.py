@@ -71,8 +71,8 @@ def test_polynomials_are_orthonormal_and_their_derivatives_exact(kind):
     # The rule itself against the marginal's own quantiles: its first moments are those of the distribution.
     middle = inputs.points((np.arange(20000)[:, None] + 0.5) / 20000)
     np.testing.assert_allclose(basis.values(middle)[:, :3].mean(axis=0), [1, 0, 0], atol=0.02)
-    step = 1e-5 * inputs.std
-    slopes = (basis.values(points + step) - basis.values(points - step)) / 2e-5
+    t, at = inputs.coordinates.of(points), inputs.coordinates.points
+    slopes = (basis.values(at(t + 1e-5)) - basis.values(at(t - 1e-5))) / 2e-5
     exact = basis.derivatives(points)[:, 0]
     np.testing.assert_allclose(slopes, exact, atol=1e-6 * np.abs(exact).max())
 
@@ -88,10 +88,10 @@ def test_hyperbolic_sets():
 def test_a_polynomial_is_recovered(kind, gradients):
     marginal = MARGINALS[kind]
     inputs = Inputs({"x": marginal, "y": Uniform(lower=-1.0, upper=1.0)})
-    mean, std = marginal.moments
+    mean, std = marginal.of_coordinate
 
     def function(p):
-        t = (p[0] - mean) / std
+        t = ((np.log(p[0]) if marginal.logarithmic else p[0]) - mean) / std
         return 2 + t - 0.3 * t**2 * p[1] + 0.1 * p[1] ** 3
 
     data = run(

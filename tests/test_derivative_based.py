@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import j0, y0
 
 from forward.model import FunctionModel, SolveError
+from uq import findings
 from uq.derivative_based import DerivativeBased, poincare
 from uq.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.evaluate import SerialEvaluate
@@ -46,16 +47,25 @@ def by_finite_differences(density, lower, upper, cells=4000):
     return 1 / eigh_tridiagonal(diagonal, beside, select="i", select_range=(1, 1))[0][0]
 
 
+def constant(marginal):
+    return poincare(marginal, logarithm=False)
+
+
 def test_poincare_constants_in_closed_form():
-    assert poincare(Normal(mean=3.0, std=2.0)) == 4
-    assert poincare(Uniform(lower=1.0, upper=3.0)) == pytest.approx(4 / np.pi**2, rel=1e-15)
+    assert constant(Normal(mean=3.0, std=2.0)) == 4
+    assert constant(Uniform(lower=1.0, upper=3.0)) == pytest.approx(4 / np.pi**2, rel=1e-15)
     # The general way, where there are closed forms: beta(1, 1), and a normal distribution cut where it is nothing.
-    assert poincare(Beta(a=1, b=1, lower=1.0, upper=3.0)) == pytest.approx(4 / np.pi**2, rel=1e-9)
-    assert poincare(TruncatedNormal(mean=0.0, std=2.0, lower=-20.0, upper=20.0)) == pytest.approx(4, rel=1e-9)
+    assert constant(Beta(a=1, b=1, lower=1.0, upper=3.0)) == pytest.approx(4 / np.pi**2, rel=1e-9)
+    assert constant(TruncatedNormal(mean=0.0, std=2.0, lower=-20.0, upper=20.0)) == pytest.approx(4, rel=1e-9)
     for upper in (10.0, 1e3):
         condition = lambda k, b=upper: j0(k) * y0(k * b) - j0(k * b) * y0(k)  # noqa: E731
         root = brentq(condition, 2 / upper, 4.7 / upper, xtol=1e-15)
-        assert poincare(LogUniform(lower=1.0, upper=upper)) == pytest.approx(1 / root**2, rel=1e-5)
+        assert constant(LogUniform(lower=1.0, upper=upper)) == pytest.approx(1 / root**2, rel=1e-5)
+        logarithm = poincare(LogUniform(lower=1.0, upper=upper), logarithm=True)
+        assert logarithm == pytest.approx((np.log(upper) / np.pi) ** 2, rel=1e-12)
+    assert poincare(LogNormal(mean=2.0, std=1.0), logarithm=True) == pytest.approx(np.log(1.25), rel=1e-14)
+    assert constant(LogNormal(mean=2.0, std=1.0)) == np.inf  # no bound by derivatives along itself
+    assert poincare(Gamma(shape=4.0, scale=3.0), logarithm=True) == pytest.approx(1 / 3, rel=1e-14)
 
 
 def test_poincare_constants_against_finite_differences():
@@ -66,18 +76,55 @@ def test_poincare_constants_against_finite_differences():
         (TruncatedNormal(mean=0.0, std=1.0, lower=-1.0, upper=1.0), lambda x: np.exp(-((2 * x - 1) ** 2) / 2)),
     ):
         length = marginal.upper - marginal.lower
-        assert poincare(marginal) == pytest.approx(length**2 * by_finite_differences(density, 0.0, 1.0), rel=2e-5)
+        assert constant(marginal) == pytest.approx(length**2 * by_finite_differences(density, 0.0, 1.0), rel=2e-5)
 
 
 @pytest.mark.parametrize("shape", [0.7, 1.0, 1.5, 4.0])
 def test_poincare_constant_of_gamma(shape):
-    constant = poincare(Gamma(shape=shape, scale=2.0, shift=1.0))
+    bound = constant(Gamma(shape=shape, scale=2.0, shift=1.0))
     # Cut off far out, the constant is smaller, and the less so the farther out.
     near, far = (
         4 * by_finite_differences(lambda x: x ** (shape - 1) * np.exp(-x), 0.0, end, cells=8000) for end in (30.0, 80.0)
     )
-    assert near < far < constant * (1 + 1e-3)
-    assert far > 0.95 * constant
+    assert near < far < bound * (1 + 1e-3)
+    assert far > 0.95 * bound
+
+
+def test_poincare_constants_of_logarithms_against_finite_differences():
+    truncated = TruncatedNormal(mean=1.0, std=0.5, lower=0.01, upper=9.0)
+    triangular = Triangular(lower=0.01, mode=0.01, upper=1.0)
+    for marginal, density in (
+        (truncated, lambda x: np.exp(x - ((np.exp(x) - 1) ** 2) / 0.5)),
+        (triangular, lambda x: np.exp(x) * (1 - np.exp(x))),
+    ):
+        exact = by_finite_differences(density, np.log(0.01), np.log(min(marginal.upper, 4.5)) - 1e-9)
+        assert poincare(marginal, logarithm=True) == pytest.approx(exact, rel=1e-4)
+    far = TruncatedNormal(mean=0.0, std=1.0, lower=8.0, upper=50.0)
+    exact = by_finite_differences(lambda x: np.exp(-x * (8 + x / 2)), 0.0, 3.0, cells=20000)
+    assert constant(far) == pytest.approx(exact, rel=1e-3)
+
+
+def test_a_constant_that_does_not_settle_is_bounded_from_above():
+    marginal = Beta(a=0.3, b=5000.0, lower=0.0, upper=1.0)  # as gamma of this shape and scale 1/5000, of constant 4θ²
+    assert 4 / 5000**2 * 0.9 < constant(marginal) < 4 * 4 / 5000**2
+
+
+@pytest.mark.parametrize("cv", [0.5, 1.0, 2.0])
+def test_an_inert_log_normal_parameter_has_no_index(cv):
+    """It had one of 1, from polynomials of itself, beside a bound of 0."""
+    inputs = Inputs({"a": Normal(mean=1.0, std=0.3), "inert": LogNormal(mean=1.0, std=cv)})
+    data = run(DerivativeBased(samples=128), inputs, lambda p: np.exp(p[0]) + 1e-6 * np.log(p[1]))
+    assert data["sobol_total"][0, 1] < 1e-6
+    assert data["total_bound"][0, 1] < 1e-6
+    assert findings.findings(data) == []
+
+
+def test_an_index_above_its_own_bound_is_an_error(monkeypatch):
+    monkeypatch.setattr("uq.derivative_based.poincare", lambda _, *, logarithm: np.inf if logarithm else 0.01)
+    data = run(DerivativeBased(samples=64), ISHIGAMI, ishigami)
+    (first, *_) = findings.findings(data)
+    assert first.severity == "error"
+    assert "above its bound" in first.text
 
 
 def test_measures_of_ishigami():

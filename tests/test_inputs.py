@@ -50,10 +50,12 @@ def test_log_normal_is_given_by_its_own_moments():
 
 def test_copula_gives_the_correlation_of_normals():
     inputs = Inputs({"a": Normal(mean=1.0, std=2.0), "b": Normal(mean=0.0, std=3.0)}, (("a", "b", 0.6),))
-    np.testing.assert_allclose(inputs.covariance, [[4, 3.6], [3.6, 9]], rtol=1e-10)
+    np.testing.assert_allclose(inputs.correlation, [[1, 0.6], [0.6, 1]], rtol=1e-10)
+    logarithms = Inputs(dict.fromkeys("ab", LogNormal(mean=1.0, std=2.0)), (("a", "b", 0.6),))
+    np.testing.assert_allclose(logarithms.correlation, [[1, 0.6], [0.6, 1]], rtol=1e-10)
 
 
-def test_covariance_is_that_of_the_points():
+def test_correlation_is_that_of_the_coordinates_of_points():
     marginals = {
         "a": LogNormal(mean=2.0, std=1.0),
         "b": Beta(a=2.0, b=2.0, lower=0.0, upper=1.0),
@@ -61,7 +63,7 @@ def test_covariance_is_that_of_the_points():
     }
     inputs = Inputs(marginals, (("a", "b", 0.7), ("b", "c", -0.4)))
     points = inputs.points(random_points(3, 0, 400_000, 3))
-    np.testing.assert_allclose(np.cov(points.T), inputs.covariance, atol=4e-3)
+    np.testing.assert_allclose(np.cov(inputs.coordinates.of(points).T), inputs.correlation, atol=6e-3)
     np.testing.assert_allclose(points.mean(axis=0), inputs.mean, rtol=4e-3)
 
 

@@ -1,9 +1,9 @@
 """Orthonormal polynomials of independent random parameters, and their derivatives.
 
-Every parameter is standardised, t = (ω − E ω)/σ, so that a derivative along t is one "per standard deviation". The
-orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} = (t − α_k) p_k − √β_k p_{k−1} (W. Gautschi, Orthogonal
-Polynomials (2004), section 1.3); p_0 = 1 and p_1 = t. Basis functions are products ψ_a(t) = Π_i p_{a_i}(t_i) over a
-set of multi-indices a.
+They are polynomials of standardised coordinates t, of the parameters or of logarithms (`uq.coordinates`), so that a
+derivative along t is one "per standard deviation". The orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} =
+(t − α_k) p_k − √β_k p_{k−1} (W. Gautschi, Orthogonal Polynomials (2004), section 1.3); p_0 = 1 and p_1 = t. Basis
+functions are products ψ_a(t) = Π_i p_{a_i}(t_i) over a set of multi-indices a.
 """
 
 from __future__ import annotations
@@ -11,30 +11,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
-from typing import TypeVar, assert_never
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.distributions import (
-    Beta,
-    Distribution,
-    Gamma,
-    LogNormal,
-    LogUniform,
-    Normal,
-    Triangular,
-    TruncatedNormal,
-    Uniform,
-)
+from uq.coordinates import Coordinates
+from uq.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
 from uq.inputs import Inputs
 
 IntArray = NDArray[np.int64]
 Real = TypeVar("Real", float, FloatArray)
-PANEL = 200  # Gauss points of a panel on which a density is smooth
-FAR = 12  # standard deviations beyond which a normal density is nothing
 
 
 @dataclass(frozen=True)
@@ -43,16 +31,15 @@ class Basis:
 
     Attributes
     ----------
-    centre, scale
-        Expected values and standard deviations (d,) of the parameters.
+    coordinates
+        What they are polynomials of.
     alpha, beta
-        Recurrence coefficients (d, N + 1) of the standardised parameters, for degrees up to N.
+        Recurrence coefficients (d, N + 1) of the standardised coordinates, for degrees up to N.
     indices
         Multi-indices (P, d): degree of each function in each parameter.
     """
 
-    centre: FloatArray
-    scale: FloatArray
+    coordinates: Coordinates
     alpha: FloatArray
     beta: FloatArray
     indices: IntArray
@@ -65,14 +52,14 @@ class Basis:
     def at(self, point: FloatArray) -> FloatArray:
         """Return ψ (P,) at one point (d,), without the overhead of arrays."""
         result = np.ones(len(self.indices))
-        t = ((point - self.centre) / self.scale).tolist()
+        t = self.coordinates.of(point).tolist()
         for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
             table, _ = _recur(t[i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
             result *= np.array(table)[self.indices[:, i]]
         return result
 
     def derivatives(self, points: FloatArray) -> FloatArray:
-        """Return σ_i ∂ψ/∂ω_i (n, d, P) at points (n, d): the derivatives per standard deviation."""
+        """Return ∂ψ/∂t_i (n, d, P) at points (n, d): the derivatives per standard deviation of the coordinates."""
         tables, slopes = self._tables(points, derivatives=True)
         d = len(tables)
         columns = [self._products([(slopes if j == i else tables)[j] for j in range(d)]) for i in range(d)]
@@ -84,7 +71,7 @@ class Basis:
 
     def _tables(self, points: FloatArray, *, derivatives: bool) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return p_k(t_i) and p_k'(t_i), each a list over i of (n, N + 1)."""
-        t = (np.asarray(points, dtype=float) - self.centre) / self.scale
+        t = self.coordinates.of(points)
         values, slopes = [], []
         for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
             columns = _recur(t[:, i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=derivatives)
@@ -117,25 +104,29 @@ def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
     degree = int(indices.max(initial=1))
     pairs = [recurrence(marginal, degree) for marginal in inputs.marginals.values()]
     alpha, beta = (np.array(column) for column in zip(*pairs, strict=True))
-    return Basis(inputs.mean, inputs.std, alpha, beta, indices)
+    return Basis(inputs.coordinates, alpha, beta, indices)
 
 
 @cache
 def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return α and β (degree + 1,) of the standardised parameter, with β_0 = 1; not to be written to.
+    """Return α and β (degree + 1,) of the standardised coordinate, with β_0 = 1; not to be written to.
 
-    Chaospy knows them in closed form for uniform, beta, normal, log-normal and gamma parameters. For the others its
-    numbers hold to six digits only; theirs come from the Stieltjes procedure with Gauss–Legendre panels.
+    Where they have no closed form they come from the Stieltjes procedure with the rule of the distribution.
     """
-    mean, std = marginal.moments
-    rule = _rule(marginal)
-    if rule is None:
-        pair = marginal.recurrence(degree)
-        alpha, beta = (pair[0] - mean) / std, pair[1] / std**2
-        beta[0] = 1.0
+    match marginal:
+        case LogNormal():
+            marginal = Normal(mean=0.0, std=1.0)
+        case LogUniform():
+            marginal = Uniform(lower=0.0, upper=1.0)
+        case _:
+            pass
+    if marginal.closed and not marginal.logarithmic:
+        alpha, beta = marginal.recurrence(degree)
         return alpha, beta
-    nodes, weights = rule
-    t = (nodes - mean) / std
+    origin, offsets, weights = marginal.rule
+    x = np.log(origin + offsets) if marginal.logarithmic else offsets
+    t = x - weights @ x
+    t = t / np.sqrt(weights @ t**2)
     alpha, beta = np.zeros(degree + 1), np.ones(degree + 1)
     before, p = np.zeros_like(t), np.ones_like(t)
     for k in range(degree + 1):
@@ -147,21 +138,25 @@ def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatAr
     return alpha, beta
 
 
-def gauss(inputs: Inputs, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the points (countᵈ, d) and weights of the tensor product of Gauss rules with `count` points each.
+def gauss_rule(marginal: Distribution, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return points (count,) of the standardised coordinate and weights of the Gauss rule of a distribution.
 
-    Points and weights are eigenvalues and squared first components of eigenvectors of the Jacobi matrices
-    (G. H. Golub, J. H. Welsch, Math. Comp. 23 (1969) 221–230).
+    The points are eigenvalues of the Jacobi matrix (G. H. Golub, J. H. Welsch, Math. Comp. 23 (1969) 221–230), the
+    weights 1/Σ p_k², which has small ones to all digits, other than the components of its eigenvectors.
     """
-    from scipy.linalg import eigh_tridiagonal
+    from scipy.linalg import eigvalsh_tridiagonal
 
-    points, weights = [], []
-    for marginal, mean, std in zip(inputs.marginals.values(), inputs.mean, inputs.std, strict=True):
-        alpha, beta = recurrence(marginal, count - 1)
-        t, vectors = eigh_tridiagonal(alpha, np.sqrt(beta[1:]))
-        points.append(mean + std * t)
-        weights.append(vectors[0] ** 2)
-    grid = np.stack(np.meshgrid(*points, indexing="ij"), axis=-1).reshape(-1, len(points))
+    alpha, beta = recurrence(marginal, count - 1)
+    t = eigvalsh_tridiagonal(alpha, np.sqrt(beta[1:]))
+    values, _ = _recur(t, alpha.tolist(), beta.tolist(), count - 1, derivatives=False)
+    weights = 1 / (np.array(values) ** 2).sum(axis=0)
+    return t, weights / weights.sum()
+
+
+def gauss(inputs: Inputs, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the points (countᵈ, d) and weights of the tensor product of Gauss rules with `count` points each."""
+    nodes, weights = zip(*(gauss_rule(marginal, count) for marginal in inputs.marginals.values()), strict=True)
+    grid = inputs.coordinates.points(np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes)))
     products = np.ones(1)
     for w in weights:
         products = np.outer(products, w).ravel()
@@ -191,33 +186,3 @@ def hyperbolic(dimension: int, order: int, q: float) -> IntArray:
 def by_degree(index: tuple[int, ...]) -> tuple[int, ...]:
     """Return the key that sorts multi-indices by total degree, and those of one degree by the first parameters."""
     return (sum(index), *(-k for k in index))
-
-
-def _rule(marginal: Distribution) -> tuple[FloatArray, FloatArray] | None:
-    """Points and weights (of sum 1) that integrate polynomials against a density; nothing where chaospy is exact."""
-    match marginal:
-        case LogUniform():
-            logs, weights = _panels([np.log(marginal.lower), np.log(marginal.upper)])
-            return np.exp(logs), weights / weights.sum()
-        case Triangular():
-            nodes, weights = _panels([marginal.lower, marginal.mode, marginal.upper])
-            inside = (marginal.lower, marginal.mode, marginal.upper)
-            weights = weights * np.interp(nodes, inside, (0.0, 1.0, 0.0))
-        case TruncatedNormal():
-            steps = marginal.mean + marginal.std * np.arange(-FAR, FAR + 1)
-            within = steps[(steps > marginal.lower) & (steps < marginal.upper)].tolist()
-            nodes, weights = _panels([marginal.lower, *within, marginal.upper])
-            exponent = -(((nodes - marginal.mean) / marginal.std) ** 2) / 2
-            weights = weights * np.exp(exponent - exponent.max())
-        case Uniform() | Beta() | Normal() | LogNormal() | Gamma():
-            return None
-        case _:
-            assert_never(marginal)
-    return nodes, weights / weights.sum()
-
-
-def _panels(breaks: list[float]) -> tuple[FloatArray, FloatArray]:
-    """Composite Gauss–Legendre rule between breakpoints."""
-    x, w = np.polynomial.legendre.leggauss(PANEL)  # type: ignore[no-untyped-call]
-    parts = [(a + (b - a) * (x + 1) / 2, w * (b - a) / 2) for a, b in pairwise(breaks) if b > a]
-    return np.concatenate([nodes for nodes, _ in parts]), np.concatenate([weights for _, weights in parts])

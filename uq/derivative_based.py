@@ -8,24 +8,30 @@ distribution, the smallest with Var g(ω_i) ≤ C_i E[g'(ω_i)²] for every g, t
 (I. M. Sobol', S. Kucherenko, Math. Comput. Simul. 79 (2009) 3009–3017; M. Lamboni, B. Iooss, A.-L. Popelin, F. Gamboa,
 Math. Comput. Simul. 87 (2013) 45–54). C is σ² for a normal and (b − a)²/π² for a uniform distribution. For a gamma
 distribution of shape k and scale θ it is θ²(k + 1)²/k where k > 1 (g = (1 − x/(k + 1)) exp(x/(k + 1)) with x = ω/θ
-attains it) and 4θ² otherwise. A log-normal parameter has none: there the bound is that of its logarithm, of which the
-standard deviation is s: s² E[(ω ∂ψ/∂ω)²]/Var ψ.
+attains it) and 4θ² otherwise.
+
+The same holds of ln ω with its own constant, S_Ti ≤ C_i' E[(ω_i ∂ψ/∂ω_i)²]/Var ψ: s² for a log-normal parameter, of
+which the logarithm has the standard deviation s and which has no C; ln²(b/a)/π² for a log-uniform one; 1/(k − 1) for a
+gamma distribution with k > 2 (g = 1/ω attains it). Where polynomials are of the logarithm (`uq.coordinates`) both
+bounds are computed, and the smaller one is taken.
 
 The active subspace (P. G. Constantine, Active Subspaces, SIAM (2015)) are the leading eigenvectors of E[∇ψ∇ψᵀ] in
-standardised coordinates (ω_i − E ω_i)/σ_i: the directions along which ψ changes most.
+standardised coordinates (`uq.coordinates`): the directions along which ψ changes most.
 
 Points are independent scrambles of Sobol' points, and errors come from drawing whole scrambles again (`uq.indices`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ModelError, SolveError
+from forward.model import Finding, FloatArray, ModelError, SolveError
+from uq import findings
 from uq.basis import gauss, hyperbolic, orthonormal
 from uq.distributions import (
     Beta,
@@ -55,6 +61,8 @@ SETTLED = 1e-5  # relative change of a Poincaré constant from one degree to twi
 DEGREES = (8, 16, 32, 64)
 ORDER = 6  # largest of the expansion that total indices come from
 RANGE = (0.025, 0.975)
+SIGMAS = 4.0  # standard errors that an index may be above its bound
+ROUNDED = 1e-6  # what an index may be above it besides
 
 
 class DerivativeBased(Amount):
@@ -150,52 +158,63 @@ class DerivativeBased(Amount):
 # --- Poincaré constants --------------------------------------------------------------------------------------------
 
 
-def poincare(marginal: Distribution) -> float:
-    """Return the Poincaré constant of a distribution, in the square of its unit; of its logarithm if it is log-normal.
+def poincare(marginal: Distribution, *, logarithm: bool) -> float:
+    """Return the Poincaré constant of a distribution in the square of its unit, or of its logarithm; inf for none.
 
     Where there is no closed form it is 1/λ with the smallest positive eigenvalue of −(p f')' = λ p f with f' = 0 at the
     ends (O. Roustant, F. Barthe, B. Iooss, Electron. J. Stat. 11 (2017) 3081–3119), by Galerkin's method in the
-    orthonormal polynomials of the distribution, of which the mass matrix is one.
-
-    Raises
-    ------
-    ValueError
-        If it does not settle with 64 polynomials.
+    orthonormal polynomials of the distribution, of which the mass matrix is one. Where that does not settle, Cheeger's
+    upper bound 4 sup (min(F, 1 − F)/p)² of it is taken (S. Bobkov, C. Houdré, Ann. Probab. 25 (1997) 184–205).
     """
+    if logarithm and not marginal.logarithmic:
+        return np.inf
     match marginal:
         case Normal():
             return float(marginal.std**2)
         case LogNormal():
-            return float(np.log1p((marginal.std / marginal.mean) ** 2))
-        case Uniform():
+            return float(marginal.of_coordinate[1] ** 2) if logarithm else np.inf
+        case Uniform() if not logarithm:
             return float(((marginal.upper - marginal.lower) / np.pi) ** 2)
+        case LogUniform() if logarithm:
+            return float((np.log(marginal.upper / marginal.lower) / np.pi) ** 2)
         case Gamma():
-            k = marginal.shape
-            return float(marginal.scale**2 * ((k + 1) ** 2 / k if k > 1 else 4))
-        case LogUniform() | Triangular() | Beta() | TruncatedNormal():
-            return _by_galerkin(marginal)
+            k, theta = marginal.shape, marginal.scale
+            if logarithm:
+                return 1 / (k - 1)  # k > 2
+            return float(theta**2 * ((k + 1) ** 2 / k if k > 1 else 4))
+        case Uniform() | LogUniform() | Triangular() | Beta() | TruncatedNormal():
+            return _by_galerkin(marginal, logarithm=logarithm)
         case _:
             assert_never(marginal)
 
 
-def _by_galerkin(marginal: Distribution) -> float:
+def _by_galerkin(marginal: Distribution, *, logarithm: bool) -> float:
     before = np.inf
     for degree in DEGREES:
-        constant = _by_polynomials(marginal, degree)
+        constant = _by_polynomials(marginal, degree, logarithm=logarithm)
         if abs(constant - before) <= SETTLED * constant:
             return constant
         before = constant
-    message = f"the Poincaré constant of {marginal!r} does not settle: {before:g}"
-    raise ValueError(message)
+    p = np.concatenate([np.geomspace(1e-12, 0.5, 2000), 1 - np.geomspace(0.5, 1e-12, 2000)])
+    values = marginal.quantile(p)
+    density = marginal.density(values) * (values if logarithm else 1.0)
+    return float(4 * (np.minimum(p, 1 - p)[density > 0] / density[density > 0]).max() ** 2)
 
 
-def _by_polynomials(marginal: Distribution, degree: int) -> float:
-    """Largest ratio of Var f and E[f'²] over polynomials f of a degree."""
+def _by_polynomials(marginal: Distribution, degree: int, *, logarithm: bool) -> float:
+    """Largest ratio of Var f and E[f'²] over polynomials f of a degree in the coordinate, by ω or by ln ω."""
     alone = Inputs({"": marginal})
-    points, weights = gauss(alone, degree + 1)
-    slopes = orthonormal(alone, hyperbolic(1, degree, 1.0)).derivatives(points)[:, 0, 1:]
+    if marginal.closed:
+        points, weights = gauss(alone, degree + 1)
+    else:
+        origin, offsets, weights = marginal.rule
+        points = (origin + offsets)[:, None]
+    basis = orthonormal(alone, hyperbolic(1, degree, 1.0))
+    slopes = basis.derivatives(points)[:, 0, 1:] / basis.coordinates.steps(points)
+    if logarithm:
+        slopes = slopes * points
     stiffness = slopes.T @ (weights[:, None] * slopes)
-    return float(alone.std[0] ** 2 / np.linalg.eigvalsh(stiffness)[0])
+    return float(1 / np.linalg.eigvalsh(stiffness)[0])
 
 
 # --- estimates -----------------------------------------------------------------------------------------------------
@@ -214,7 +233,10 @@ class _Samples:
 
     def __init__(self, method: DerivativeBased, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
         self._method, self._inputs, self._evaluate, self._centre = method, inputs, evaluate, centre
-        self._constants = np.array([poincare(m) for m in inputs.marginals.values()])
+        # By ω and by ln ω (2, d).
+        self._constants = np.array(
+            [[poincare(m, logarithm=logarithm) for m in inputs.marginals.values()] for logarithm in (False, True)]
+        )
         R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
         self.each = 0
         self.points = np.empty((R, 0, d))
@@ -250,33 +272,38 @@ class _Samples:
             message = f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}"
             raise SolveError(message)
         ok = ok[some]
-        logarithmic = np.array([isinstance(m, LogNormal) for m in self._inputs.marginals.values()])
-        deviation = np.where(ok[..., None], self.outputs[some, :each] - self._centre.outputs, 0.0)
+        centre, points = self._centre, self.points[some, :each]
+        deviation = np.where(ok[..., None], self.outputs[some, :each] - centre.middle, 0.0)
         tangents = np.where(ok[..., None, None], self.tangents[some, :each], 0.0)
-        bounding = tangents * np.where(logarithmic, self.points[some, :each], 1.0)[:, :, None, :]
-        scaled = tangents * self._inputs.std
+        scaled = tangents * centre.coordinates.steps(points)[:, :, None, :]
         d = scaled.shape[-1]
         first, second = deviation, deviation**2
         if ok.all():
             # The tangent at the mean parameters is a control variate of both, as in `uq.moments`.
-            prediction = (self.points[some, :each] - self._centre.point) @ self._centre.tangents.T
-            variance = ((self._centre.tangents * self._inputs.std) ** 2).sum(axis=1)
+            prediction = centre.coordinates.of(points) @ centre.output_slopes.T
+            variance = (centre.output_slopes**2).sum(axis=1)
             first, second = deviation - prediction, second - prediction**2 + variance
         parts = [
             first[..., None],
             second[..., None],
             tangents**2,
-            bounding**2,
+            (tangents * points[:, :, None, :]) ** 2,
             (scaled[..., :, None] * scaled[..., None, :]).reshape(*deviation.shape, d * d),
         ]
         return np.swapaxes(np.concatenate(parts, axis=-1).sum(axis=1), 1, 2), ok.sum(axis=1).astype(float)
 
     def _from_means(self, means: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Measures and bounds (…, m, d) and matrices (…, m, d, d) from means (J, …, m)."""
-        d = len(self._constants)
+        d = self._constants.shape[1]
         rows = np.moveaxis(means, 0, -1)
         variance = rows[..., 1] - rows[..., 0] ** 2
-        bounds = shares(self._constants * rows[..., 2 + d : 2 + 2 * d], variance[..., None])
+        by_parameter, by_logarithm = (
+            np.where(np.isfinite(constants), constants, 0.0) * measures + np.where(np.isfinite(constants), 0.0, np.inf)
+            for constants, measures in zip(
+                self._constants, (rows[..., 2 : 2 + d], rows[..., 2 + d : 2 + 2 * d]), strict=True
+            )
+        )
+        bounds = shares(np.minimum(by_parameter, by_logarithm), variance[..., None])
         return rows[..., 2 : 2 + d], bounds, rows[..., 2 + 2 * d :].reshape(*variance.shape, d, d)
 
     def measures(self) -> dict[str, FloatArray]:
@@ -306,7 +333,7 @@ class _Samples:
     def _moments(self, each: int) -> Estimates:
         sums, counts = self._sums(each)
         means = sums / counts[:, None, None]
-        return estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.outputs)
+        return estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.middle)
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
         """Flatten (R, n, …) to (n R, …), the first points of all scrambles first: a shorter study is the beginning."""
@@ -321,7 +348,8 @@ class _Samples:
         rounds = [1 << k for k in range(self.each.bit_length()) if self.ok[:, : 1 << k].any(axis=1).sum() > 1]
         moments = {method.scrambles * each: self._moments(each) for each in rounds}
         last = moments[method.scrambles * self.each]
-        local = (self._centre.tangents * inputs.std) ** 2
+        local = self._centre.output_slopes**2
+        logarithmic = inputs.coordinates.logarithmic
         dataset = local_dataset(inputs, self._evaluate, self._centre, fields=method.fields)
         dataset = dataset.assign_coords(quantile=list(method.quantiles), round=list(moments)).assign(
             {
@@ -336,7 +364,7 @@ class _Samples:
                     f"running_{name}": (("round", "output"), np.array([getattr(e, name) for e in moments.values()]))
                     for name in ("mean", "mean_error")
                 },
-                "poincare": (("parameter",), self._constants),
+                "poincare": (("parameter",), np.where(logarithmic, self._constants[1], self._constants[0])),
                 "local_share": (("output", "parameter"), shares(local, local.sum(axis=1, keepdims=True))),
                 **{
                     name: (("output", "direction" if "eigenvalue" in name else "parameter"), value)
@@ -344,6 +372,7 @@ class _Samples:
                 },
             }
         )
+        found_out: list[Finding] = []
         try:
             regression = Regression.of(inputs, points[ok], values[ok], self._in_order(self.tangents)[ok], ORDER)
         except SolveError:
@@ -354,9 +383,26 @@ class _Samples:
                 for end in ("", "_error"):
                     dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
             dataset["loo_error"] = (("output",), regression.fit.relative)
+            found_out = list(_above_bounds(dataset))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
+        findings.add(dataset, *found_out)
         return dataset
+
+
+def _above_bounds(dataset: xr.Dataset) -> Iterator[Finding]:
+    """Say which total indices exceed their own bounds by more than their errors explain."""
+    error = np.hypot(dataset["sobol_total_error"], dataset["total_bound_error"])
+    above = dataset["sobol_total"] - dataset["total_bound"] > SIGMAS * error + ROUNDED
+    for output, parameter in zip(*(axis.tolist() for axis in np.nonzero(above.to_numpy())), strict=True):
+        at = {"output": output, "parameter": parameter}
+        index, bound = (float(dataset[name].isel(at)) for name in ("sobol_total", "total_bound"))
+        yield Finding(
+            "error",
+            f"the total index {index:.3g} of {dataset['parameter'].values[parameter]} for "
+            f"{dataset['output'].values[output]} is above its bound {bound:.3g}: the expansion that it comes from is "
+            "wrong; take the bound, or more samples",
+        )
 
 
 def _descending(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

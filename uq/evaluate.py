@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
+from uq.coordinates import Coordinates
 
 TOGETHER = 16  # realisations whose part of a compact sum is formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
@@ -120,7 +121,7 @@ class Start(Protocol):
 
 @dataclass(frozen=True)
 class Prediction:
-    """A linear prediction of the state, with the factor at `point`.
+    """A prediction of the state that is linear in the coordinates, with the factor at `point`.
 
     Attributes
     ----------
@@ -129,19 +130,26 @@ class Prediction:
     state
         State (U,) there, in canonical order.
     slopes
-        Derivatives (d, U) of the state, or none (0, U): then the solver starts from the state at `point`.
+        Derivatives (d, U) of the state along the coordinates, or none (0, U): then the solver starts from the state at
+        `point`.
+    coordinates
+        The coordinates.
     """
 
     point: FloatArray
     state: FloatArray
     slopes: FloatArray
+    coordinates: Coordinates
 
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
         if len(slopes) == 0:
             return lambda _: state, Reference(self.point, state)
-        return lambda parameters: state + (parameters - self.point) @ slopes, Reference(self.point, state)
+        here = self.coordinates.of(self.point)
+        return lambda parameters: state + (self.coordinates.of(parameters) - here) @ slopes, Reference(
+            self.point, state
+        )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from uq.basis import Basis
+from uq.coordinates import Coordinates
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -53,8 +54,9 @@ class Expansion:
 
     def tangents(self, points: FloatArray) -> FloatArray:
         """Return the derivatives dψ/dω (n, m, d) at points (n, d)."""
-        slopes = self.basis.derivatives(self._checked(points)) @ self.coefficients
-        return np.asarray(np.swapaxes(slopes, 1, 2) / self.basis.scale)
+        points = self._checked(points)
+        slopes = self.basis.derivatives(points) @ self.coefficients
+        return np.asarray(np.swapaxes(slopes, 1, 2) / self.basis.coordinates.steps(points)[:, None, :])
 
     def displacements(self, points: FloatArray) -> FloatArray:
         """Return the displacement fields (n, nodes, 3) at points (n, d), in m.
@@ -107,8 +109,7 @@ def load(source: str | Path | xr.Dataset) -> Expansion:
         raise ValueError(message)
     arrays = {str(name): variable.to_numpy() for name, variable in source.data_vars.items()}
     basis = Basis(
-        arrays["parameter_mean"],
-        arrays["parameter_std"],
+        Coordinates(arrays["coordinate_logarithmic"].astype(bool), arrays["coordinate_mean"], arrays["coordinate_std"]),
         arrays["recurrence_alpha"],
         arrays["recurrence_beta"],
         arrays["multi_index"],

@@ -50,11 +50,13 @@ class Projections:
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → y_z of one group's model."""
         state = model.scatter(self.state[None, :])[0]
-        directions = np.diag(self.basis.scale)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            deviation = (solution.state - state)[None, :]
-            return np.vstack([deviation, solution.state_tangent(directions)]) if self.gradients else deviation
+            deviation: FloatArray = (solution.state - state)[None, :]
+            if not self.gradients:
+                return deviation
+            directions = np.diag(self.basis.coordinates.steps(parameters))
+            return np.vstack([deviation, solution.state_tangent(directions)])
 
         return rows
 

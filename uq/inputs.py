@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from uq.coordinates import Coordinates
 from uq.distributions import Distribution
 from uq.sampling import sobol_points
 
@@ -111,19 +112,30 @@ class Inputs:
         return matrix
 
     @cached_property
-    def covariance(self) -> FloatArray:
-        """Covariance (d, d) of the parameters, by Gauss–Hermite quadrature for correlated pairs."""
-        covariance = np.diag(self.std**2)
+    def coordinates(self) -> Coordinates:
+        """What outputs are taken for polynomials of."""
+        centre, scale = np.array([m.of_coordinate for m in self.marginals.values()]).reshape(-1, 2).T
+        return Coordinates(np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale)
+
+    @cached_property
+    def correlation(self) -> FloatArray:
+        """Correlation (d, d) of the coordinates, by Gauss–Hermite quadrature for correlated pairs."""
+        correlation = np.eye(len(self.marginals))
         nodes, weights = np.polynomial.hermite_e.hermegauss(64)  # type: ignore[no-untyped-call]
         weights = weights / weights.sum()
-        marginals = list(self.marginals.values())
+        marginals, d = list(self.marginals.values()), len(self.marginals)
+
+        def coordinate(i: int, normals: FloatArray) -> FloatArray:
+            points = np.ones((normals.size, d))
+            points[:, i] = marginals[i].from_normal(normals.ravel())[0]
+            return self.coordinates.of(points)[:, i].reshape(normals.shape)
+
         for a, b, rho in self.correlations:
             i, j = self.names.index(a), self.names.index(b)
-            x = marginals[i].from_normal(nodes)[0] - self.mean[i]
             second = rho * nodes[:, None] + np.sqrt(1 - rho**2) * nodes[None, :]
-            y = marginals[j].from_normal(second)[0] - self.mean[j]
-            covariance[i, j] = covariance[j, i] = float(np.einsum("i,j,i,ij->", weights, weights, x, y))
-        return covariance
+            x, y = coordinate(i, nodes), coordinate(j, second)
+            correlation[i, j] = correlation[j, i] = float(np.einsum("i,j,i,ij->", weights, weights, x, y))
+        return correlation
 
     def points(self, uniforms: FloatArray) -> FloatArray:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""

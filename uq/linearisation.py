@@ -10,6 +10,7 @@ import numpy as np
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from forward.settings import Settings
+from uq.coordinates import Coordinates
 from uq.evaluate import Evaluate, Prediction, Request
 from uq.inputs import Inputs
 
@@ -35,6 +36,8 @@ class Linearisation:
         ū (U,) in canonical order.
     slopes
         dū/dω (d, U); empty (0, U) for a model without derivatives or of more than `MANY` parameters.
+    coordinates
+        What predictions are linear in.
     """
 
     point: FloatArray
@@ -42,13 +45,43 @@ class Linearisation:
     tangents: FloatArray
     state: FloatArray
     slopes: FloatArray
+    coordinates: Coordinates
 
     @property
     def prediction(self) -> Prediction | None:
-        """The prediction of the state, linear where there are slopes; nothing for a model without derivatives."""
+        """The prediction of the state, linear where there are slopes; None for a model without derivatives."""
         if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
-        return Prediction(self.point, self.state, self.slopes)
+        return Prediction(self.point, self.state, self.state_slopes, self.coordinates)
+
+    @property
+    def output_slopes(self) -> FloatArray:
+        """Derivatives dψ/dt (m, d) of the outputs along the coordinates."""
+        return self.tangents * self.coordinates.steps(self.point)
+
+    @property
+    def state_slopes(self) -> FloatArray:
+        """Derivatives dū/dt (d, U) of the state along the coordinates, or none (0, U)."""
+        if len(self.slopes) == 0:
+            return self.slopes
+        return self.slopes * self.coordinates.steps(self.point)[:, None]
+
+    @property
+    def middle(self) -> FloatArray:
+        """What the tangents predict for the outputs (m,) at the mean coordinates: the mean of their prediction.
+
+        The mean parameters are there, but where coordinates are logarithms. Without derivatives it is the outputs.
+        """
+        if np.isnan(self.tangents).all():
+            return self.outputs
+        return np.asarray(self.outputs - self.output_slopes @ self.coordinates.of(self.point))
+
+    @property
+    def state_middle(self) -> FloatArray:
+        """The same for the state (U,); the state itself where it has no slopes."""
+        if len(self.slopes) == 0:
+            return self.state
+        return np.asarray(self.state - self.coordinates.of(self.point) @ self.state_slopes)
 
 
 @dataclass(frozen=True)
@@ -82,7 +115,7 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     m, d = len(evaluate.outputs), len(evaluate.parameters)
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
-    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:])
+    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates)
 
 
 class LocalSensitivity(Settings):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from uq.coordinates import Coordinates
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
@@ -111,9 +112,9 @@ class SensitivityMonteCarlo(MonteCarlo):
 
 @dataclass(frozen=True)
 class _JointMoments:
-    """Sum of the monomials of the state's deviation and of its tangent prediction."""
+    """Sum of the monomials of the state's deviation and of its tangent prediction, which is linear in coordinates."""
 
-    point: FloatArray
+    coordinates: Coordinates
     state: FloatArray
     slopes: FloatArray | None
 
@@ -122,7 +123,7 @@ class _JointMoments:
         slopes = None if self.slopes is None else model.scatter(self.slopes)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            prediction = None if slopes is None else (parameters - self.point) @ slopes
+            prediction = None if slopes is None else self.coordinates.of(parameters) @ slopes
             return monomials(solution.state - state, prediction)
 
         return rows
@@ -133,8 +134,9 @@ def _sample(
 ) -> xr.Dataset:
     evaluate = Recorder(evaluate)
     centre = linearise(inputs, evaluate)
-    slopes = centre.slopes if control and len(centre.slopes) else None
-    fields = _JointMoments(centre.point, centre.state, slopes) if method.fields and centre.state.size else None
+    slopes = centre.state_slopes if control and len(centre.slopes) else None
+    state = centre.state if slopes is None else centre.state_middle
+    fields = _JointMoments(centre.coordinates, state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
     limit = method.limit
     target = min(limit, FIRST_ROUND) if method.open_ended else limit
@@ -169,12 +171,12 @@ def _scalar_moments(
         reasons = sorted({failure.reason for failure in evaluations.failures})
         message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {'; '.join(reasons[:3])}"
         raise SolveError(message)
-    deviations = evaluations.outputs[ok] - centre.outputs
     if control is None:
-        return estimate(monomials(deviations, None).sum(axis=1), n, centre.outputs)
-    predictions = (evaluations.points[ok] - centre.point) @ centre.tangents.T
-    variance = np.einsum("mi,ij,mj->m", centre.tangents, inputs.covariance, centre.tangents)
-    return estimate(monomials(deviations, predictions).sum(axis=1), n, centre.outputs, variance, *control)
+        return estimate(monomials(evaluations.outputs[ok] - centre.outputs, None).sum(axis=1), n, centre.outputs)
+    deviations, slopes = evaluations.outputs[ok] - centre.middle, centre.output_slopes
+    predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
+    variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
+    return estimate(monomials(deviations, predictions).sum(axis=1), n, centre.middle, variance, *control)
 
 
 def _field_moments(
@@ -186,8 +188,9 @@ def _field_moments(
     n = int(evaluations.ok.sum())
     if control is None or len(centre.slopes) == 0:
         return estimate(evaluations.fields, n, centre.state)
-    variance = np.einsum("iu,ij,ju->u", centre.slopes, inputs.covariance, centre.slopes)
-    return estimate(evaluations.fields, n, centre.state, variance, *control)
+    slopes = centre.state_slopes
+    variance = np.einsum("iu,ij,ju->u", slopes, inputs.correlation, slopes)
+    return estimate(evaluations.fields, n, centre.state_middle, variance, *control)
 
 
 def _dataset(

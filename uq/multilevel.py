@@ -329,15 +329,20 @@ class _Mesh:
         return self.cost_of_finer * self.measured_cost / self.cost <= left / 2
 
     @property
-    def reference(self) -> FloatArray:
+    def nominal(self) -> FloatArray:
         """Difference (m,) of the outputs at the mean parameters."""
         return self.centre.outputs - (0 if self._coarser is None else self._coarser.centre.outputs)
 
+    @property
+    def reference(self) -> FloatArray:
+        """Difference (m,) of what the deviations are from."""
+        return self.centre.middle - (0 if self._coarser is None else self._coarser.centre.middle)
+
     def deviations(self, outputs: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return w and T (n, m) of outputs on this mesh, and E[T²] (m,)."""
-        slopes = self.centre.tangents
-        variance = np.einsum("mi,ij,mj->m", slopes, self._inputs.covariance, slopes)
-        return outputs - self.centre.outputs, (points - self.centre.point) @ slopes.T, variance
+        slopes = self.centre.output_slopes
+        variance = np.einsum("mi,ij,mj->m", slopes, self._inputs.correlation, slopes)
+        return outputs - self.centre.middle, self.centre.coordinates.of(points) @ slopes.T, variance
 
     def _moments(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return w_l − w_{l−1}, the second moment's term, and their controls (n, m) with expectation zero."""
@@ -372,7 +377,7 @@ class _Mesh:
     def single(self) -> Moments:
         """Moments on this mesh alone."""
         w, T, V = self.deviations(self.fine[self.ok], self.points[self.ok])
-        n, reference = len(w), self.centre.outputs
+        n, reference = len(w), self.centre.middle
         if self._method.control == "none":
             return estimate(monomials(w, None).sum(axis=1), n, reference)
         return estimate(monomials(w, T).sum(axis=1), n, reference, V)
@@ -403,12 +408,12 @@ class _Found:
     @classmethod
     def of(cls, meshes: Sequence[_Mesh]) -> _Found:
         terms = [mesh.term for mesh in meshes]
-        by_mesh = tuple(combine(mesh.centre.outputs, terms[: k + 1]) for k, mesh in enumerate(meshes))
+        by_mesh = tuple(combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
         differences = np.array([mesh.reference + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
         # The differences at the mean parameters converge at the same rate, and have no noise.
-        nominal = np.array([mesh.reference for mesh in meshes])[1:]
+        nominal = np.array([mesh.nominal for mesh in meshes])[1:]
         alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
         return cls(by_mesh, differences, bias(differences, alpha), bias(std_differences, alpha), consistency)
 

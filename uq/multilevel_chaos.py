@@ -134,7 +134,7 @@ class MultilevelChaos(Amount):
         basis = orthonormal(inputs, bases.all)
         start = _start(centre, self.first)
         sums = None if start is None else Projections(basis, centre.state, False, None, None)
-        known = _of_tangent(inputs, centre, evaluate.displacements)
+        known = _of_tangent(centre, evaluate.displacements)
         levels: list[_Level] = []
         finishing = False
         while True:
@@ -223,19 +223,19 @@ def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | 
         return None
     if first == "tangent" and centre.prediction is not None:
         return centre.prediction
-    return Prediction(centre.point, centre.state, np.zeros((len(centre.point), centre.state.size)))
+    none = np.zeros((len(centre.point), centre.state.size))
+    return Prediction(centre.point, centre.state, none, centre.coordinates)
 
 
-def _of_tangent(inputs: Inputs, centre: Linearisation, count: int) -> _Known:
+def _of_tangent(centre: Linearisation, count: int) -> _Known:
     """The tangent at the mean parameters; what is known there is constant in a model without derivatives."""
-    tangents = np.nan_to_num(centre.tangents)
-    slopes = centre.slopes[:, :count] if len(centre.slopes) else np.zeros((len(centre.point), count))
+    tangents = np.nan_to_num(centre.output_slopes)
     return _Known(
-        centre.outputs,
-        np.sqrt(((tangents * inputs.std) ** 2).sum(axis=1)),
-        centre.state[:count],
-        np.sqrt(((slopes * inputs.std[:, None]) ** 2).sum(axis=0)),
-        lambda points: centre.outputs + (points - centre.point) @ tangents.T,
+        centre.middle,
+        np.linalg.norm(tangents, axis=1),
+        centre.state_middle[:count],
+        np.linalg.norm(centre.state_slopes[:, :count], axis=0),
+        lambda points: centre.middle + centre.coordinates.of(points) @ tangents.T,
     )
 
 

@@ -1,9 +1,10 @@
 """Regression of outputs on values and gradients in orthonormal polynomials.
 
 The expansion Σ_a c_a ψ_a(ω) is fitted to the samples by least squares. A sample gives one row for its value, ψ(ω_z)·c =
-f(ω_z), and with derivatives one row more for each parameter, σ_i ∂_iψ(ω_z)·c = σ_i ∂_i f(ω_z): d + 1 rows for little
-more than the price of one solve. All rows count the same: on five test functions of two to four parameters, weights of
-1/4 to 3/2 for the gradients gave errors within the scatter of the designs.
+f(ω_z), and with derivatives one row more for each parameter, ∂ψ/∂t_i(ω_z)·c = ∂f/∂t_i(ω_z) along the coordinates t of
+the polynomials (`uq.coordinates`): d + 1 rows for little more than the price of one solve. All rows count the same: on
+five test functions of two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within the scatter of
+the designs.
 
 What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
 residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there by (I − H_z)⁻¹ r_z, and its coefficients differ
@@ -98,7 +99,7 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
 
 @dataclass(frozen=True)
 class Data:
-    """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) per standard deviation or nothing.
+    """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) along the coordinates or None.
 
     `weights` (n,) count the samples in sums of squares.
     """
@@ -126,7 +127,9 @@ class Data:
         weights: FloatArray | None = None,
     ) -> Data:
         """Take values (n, m) and, where they are given, tangents (n, m, d) at points; `weights` as of `of`."""
-        slopes = None if tangents is None else np.swapaxes(tangents * inputs.std, 1, 2)
+        slopes = None
+        if tangents is not None:
+            slopes = np.swapaxes(tangents * inputs.coordinates.steps(points)[:, None, :], 1, 2)
         return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
 
     def first(self, count: int) -> Data:

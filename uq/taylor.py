@@ -3,7 +3,8 @@
 A control is C(ω) = Σ_k φ_k(ω) c_k, of features φ whose moments are known. E[C] = Σ E[φ_k] c_k is exact whatever the
 coefficients are, as long as they do not depend on the samples that are controlled: an error of theirs costs efficiency
 and never bias. So is E[C²] = Σ c_k E[φ_kφ_l] c_l. For the Taylor polynomials around the mean parameters, with the
-deviation δ = ω − ω̄, φ = (δ_i; ½δ_i², δ_iδ_j for i < j) and c = (∂ψ/∂ω_i; ∂²ψ/∂ω_i∂ω_j).
+deviation δ = t − t̄ of the coordinates (`uq.coordinates`), φ = (δ_i; ½δ_i², δ_iδ_j for i < j) and c = (∂ψ/∂t_i;
+∂²ψ/∂t_i∂t_j).
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from uq.basis import gauss_rule
+from uq.coordinates import Coordinates
 from uq.evaluate import Evaluate, Request
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation
@@ -32,14 +35,15 @@ class Features(Protocol):
 
 @dataclass(frozen=True)
 class Monomials:
-    """The features of a Taylor polynomial: the deviations from `point` (d,), and products of `pairs` (i, j), i ≤ j."""
+    """The features of a Taylor polynomial: deviations δ from `point` (d,), and products of `pairs` (i, j), i ≤ j."""
 
+    coordinates: Coordinates
     point: FloatArray
     pairs: tuple[tuple[int, int], ...] = ()
 
     def values(self, points: FloatArray) -> FloatArray:
         """Return φ (n, k) at points (n, d)."""
-        deviation = points - self.point
+        deviation = self.coordinates.of(points) - self.coordinates.of(self.point)
         second = [(0.5 if i == j else 1.0) * deviation[:, i] * deviation[:, j] for i, j in self.pairs]
         return np.column_stack([deviation, *second])
 
@@ -85,16 +89,18 @@ class Control:
 
 
 def tangent(inputs: Inputs, centre: Linearisation) -> Control:
-    """Return the Taylor polynomial of first degree: E[φ] = 0 and E[φφᵀ] is the covariance of the inputs."""
-    zero = np.zeros(len(centre.point))
-    return Control(Monomials(centre.point), centre.tangents.T, centre.slopes, zero, inputs.covariance)
+    """Return the Taylor polynomial of first degree: E[φ] = −t̄, and E[φφᵀ] the correlation of t, and t̄t̄ᵀ."""
+    middle = -inputs.coordinates.of(centre.point)
+    second = inputs.correlation + np.outer(middle, middle)
+    features = Monomials(inputs.coordinates, centre.point)
+    return Control(features, centre.output_slopes.T, centre.state_slopes, middle, second)
 
 
 def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> Control:
     """Return the Taylor polynomial of second degree, by central differences of tangents: two solves for each parameter.
 
-    E[φ] follows from the covariance of the inputs. E[φφᵀ] needs their moments up to the fourth, which are known where
-    the inputs are independent; with a copula the second moment is controlled by the square of the tangent alone.
+    E[φ] follows from the correlation of the coordinates. E[φφᵀ] needs their moments up to the fourth, which are known
+    where the inputs are independent; with a copula the second moment is controlled by the square of the tangent alone.
 
     Parameters
     ----------
@@ -110,11 +116,11 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     SolveError
         If the model has no answer at one of the displaced points.
     """
-    d = len(centre.point)
+    d, coordinates = len(centre.point), inputs.coordinates
     pairs = tuple((i, j) for i in range(d) for j in range(i, d))
-    steps = _steps(inputs)
-    displaced = centre.point + np.concatenate([np.diag(steps), -np.diag(steps)])
-    wanted = _SecondDerivatives(centre.point, pairs) if fields and centre.slopes.size else None
+    middle, steps = coordinates.of(centre.point), _steps(inputs)
+    displaced = coordinates.points(middle + np.concatenate([np.diag(steps), -np.diag(steps)]))
+    wanted = _SecondDerivatives(coordinates, centre.point, pairs) if fields and centre.slopes.size else None
     found = evaluate(Request(displaced, tangents=True, fields=wanted, start=centre.prediction))
     for failure in found.failures:
         message = (
@@ -122,51 +128,56 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
         )
         raise SolveError(message, failure.history)
     assert found.tangents is not None
-    # (d, m, d): ∂/∂ω_i of ∂ψ/∂ω_j
-    differences = (found.tangents[:d] - found.tangents[d:]) / (2 * steps[:, None, None])
+    # (2d, m, d): ∂ψ/∂t_j; (d, m, d): ∂/∂t_i of it
+    slopes = found.tangents * coordinates.steps(displaced)[:, None, :]
+    differences = (slopes[:d] - slopes[d:]) / (2 * steps[:, None, None])
     hessian = np.array([(differences[i, :, j] + differences[j, :, i]) / 2 for i, j in pairs])
-    state = np.concatenate([centre.slopes, found.fields]) if wanted is not None else centre.slopes[:0]
+    state = np.concatenate([centre.state_slopes, found.fields]) if wanted is not None else centre.slopes[:0]
     exponents = np.concatenate([np.eye(d, dtype=int), [np.eye(d, dtype=int)[[i, j]].sum(axis=0) for i, j in pairs]])
     factors = np.array([1.0] * d + [0.5 if i == j else 1.0 for i, j in pairs])
-    covariance = inputs.covariance
-    mean = factors * np.array([0.0] * d + [covariance[i, j] for i, j in pairs])
-    second = covariance if inputs.correlations else _second_moments(inputs, exponents, factors)
-    outputs = np.concatenate([centre.tangents.T, hessian])
-    return Control(Monomials(centre.point, pairs), outputs, state, mean, second)
+    linear = tangent(inputs, centre)
+    first = linear.features_mean
+    mean = factors * np.append(first, [linear.features_second[i, j] for i, j in pairs])
+    second = linear.features_second if inputs.correlations else _second_moments(inputs, middle, exponents, factors)
+    outputs = np.concatenate([centre.output_slopes.T, hessian])
+    return Control(Monomials(coordinates, centre.point, pairs), outputs, state, mean, second)
 
 
-def _second_moments(inputs: Inputs, exponents: FloatArray, factors: FloatArray) -> FloatArray:
-    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i δ_i^e_ki."""
-    d = len(inputs.std)
-    higher = np.array([marginal.higher_moments for marginal in inputs.marginals.values()])
-    central = np.stack([np.ones(d), np.zeros(d), inputs.std**2, higher[:, 0], higher[:, 1]], axis=1)
+def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, factors: FloatArray) -> FloatArray:
+    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by Gauss rules that are exact for it."""
+    moments = []
+    for marginal, at in zip(inputs.marginals.values(), middle, strict=True):
+        t, weights = gauss_rule(marginal, 3)
+        moments.append([weights @ (t - at) ** k for k in range(5)])
     total = exponents[:, None, :] + exponents[None, :, :]
-    products = np.prod(central[np.arange(d), total], axis=-1)
+    products = np.prod(np.array(moments)[np.arange(len(middle)), total], axis=-1)
     return np.asarray(factors[:, None] * factors[None, :] * products)
 
 
 def _steps(inputs: Inputs) -> FloatArray:
-    """Steps (d,) of the differences: no further than half the way to an end of the range."""
-    steps = []
-    for marginal, mean, std in zip(inputs.marginals.values(), inputs.mean, inputs.std, strict=True):
-        lower, upper = marginal.support or (marginal.at(EDGE), marginal.at(1 - EDGE))
-        steps.append(min(STEP * std, (mean - lower) / 2, (upper - mean) / 2))
-    return np.array(steps)
+    """Steps (d,) of the differences along the coordinates: no further than half the way to an end of the range."""
+    marginals = inputs.marginals.values()
+    supports = [marginal.support or (marginal.at(EDGE), marginal.at(1 - EDGE)) for marginal in marginals]
+    lower, upper = inputs.coordinates.of(np.array(supports).T)
+    middle = inputs.coordinates.of(inputs.mean)
+    return np.asarray(np.minimum(STEP, np.minimum(middle - lower, upper - middle) / 2))
 
 
 @dataclass(frozen=True)
 class _SecondDerivatives:
-    """Sums up to ∂²u/∂ω_i∂ω_j over points that are displaced from ω̄ by ± h_i along one parameter each."""
+    """Sums up to ∂²u/∂t_i∂t_j over points that are displaced from t̄ by ± h_i along one coordinate each."""
 
+    coordinates: Coordinates
     point: FloatArray
     pairs: tuple[tuple[int, int], ...]
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        directions = np.eye(len(self.point))
+        here = self.coordinates.of(self.point)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
-            step = parameters - self.point
+            step = self.coordinates.of(parameters) - here
             moved = int(np.abs(step).argmax())
+            directions = np.diag(self.coordinates.steps(parameters))
             slopes = solution.state_tangent(directions) / (2 * step[moved])
             total = np.zeros((len(self.pairs), slopes.shape[1]))
             for k, (i, j) in enumerate(self.pairs):
