@@ -14,13 +14,14 @@ Vectors are rows: k of them are (k, N) in the field and (k, n) in the data.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Reference, Solution
+from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
 
 BLOCK = 32  # vectors whose products are formed together
 
@@ -64,6 +65,8 @@ class FieldPosterior:
         Of the differences from `mean`.
     mean
         m_0 (N,); by default zero.
+    progress
+        Told of each solve, and whether it failed.
     """
 
     model: ForwardModel
@@ -72,6 +75,7 @@ class FieldPosterior:
     prior: Prior
     mean: FloatArray | None = None
     counts: Counts = field(default_factory=Counts)
+    progress: Callable[[int, int], None] = lambda done, failed: None
 
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
@@ -118,7 +122,13 @@ class FieldPosterior:
         """
         self.counts.solves += 1
         values = self.values(noise)
-        return Point(self, np.array(noise), values, self.model.solve(values, start, reference))
+        try:
+            solution = self.model.solve(values, start, reference)
+        except SolveError:
+            self.progress(1, 1)
+            raise
+        self.progress(1, 0)
+        return Point(self, np.array(noise), values, solution)
 
 
 @dataclass(frozen=True, eq=False)

@@ -490,15 +490,23 @@ class Nearby:
         return lambda point: self.state + (point - self.point) @ self.slopes, Reference(self.point, self.state)
 
 
-def invert_by_group(inputs: Inputs, model: ForwardModel, data: Components, method: Invert, look: Look) -> Record:
-    """Invert a data set on the model of one group of ranks; collective over it.
+def invert_by_group(
+    inputs: Inputs,
+    model: ForwardModel,
+    data: Components,
+    method: Invert,
+    look: Look,
+    evaluate: Evaluate | None = None,
+) -> Record:
+    """Invert a data set on the model of one group of ranks, or by an evaluation of it; collective over the group.
 
     Raises
     ------
     SolveError
         If the model has no answer where the search needs one.
     """
-    return _invert(inputs, SerialEvaluate(model), data, method, look, lambda point: Nearby.at(model, point))
+    solve = evaluate or SerialEvaluate(model)
+    return _invert(inputs, solve, data, method, look, lambda point: Nearby.at(model, point))
 
 
 def invert_by_all(inputs: Inputs, evaluate: Evaluate, data: Components, method: Invert, look: Look) -> Record:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -321,6 +322,61 @@ def test_one_bad_file_does_not_stop_the_others(folder):
     found = xr.load_dataset(folder / "one" / "results.nc", engine="h5netcdf")
     np.testing.assert_array_equal(found["ok"], [True, True, False])
     assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
+
+
+KILLED = """
+import os
+import sys
+import workflows.study
+from uq.checkpoint import Checkpoint
+from workflows.__main__ import main
+
+workflows.study._report = lambda directory: None
+save, saved = Checkpoint.save, []
+
+
+def kill_after(self, key, block):
+    save(self, key, block)
+    saved.append(key)
+    if len(saved) == int(os.environ.get("BLOCKS", 0)):
+        os._exit(9)
+
+
+Checkpoint.save = kill_after
+code = main(sys.argv[1:])
+print(f"{len(saved)} blocks")
+sys.exit(code)
+"""
+
+
+def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch):
+    """Killed in the first data set, and in the second: nothing is solved twice, and what is finished is shown."""
+    assert (folder / "one").exists()
+    study, out = folder / "few.toml", folder / "killed"
+    blocks, rows = [], []
+    for count in ("10", "15", ""):
+        monkeypatch.setenv("BLOCKS", count or "0")
+        done = run_script(None, KILLED, "run", study, "--out", out)
+        assert done.returncode == (9 if count else 3), done.stderr
+        blocks.append(count or done.stdout.rpartition(" blocks")[0].split()[-1])
+        table = out / "batch.csv"
+        rows.append([row["data_set"] for row in csv.DictReader(table.open())] if table.exists() else [])
+    assert rows == [[], ["made-1"], ["made-1", "made-2", "wrong"]]
+    assert not (out / "evaluations").exists()
+    assert (folder / "one/batch.csv").read_bytes() == (out / "batch.csv").read_bytes()
+    assert (folder / "one/results.nc").read_bytes() == (out / "results.nc").read_bytes()
+    monkeypatch.setenv("BLOCKS", "0")
+    whole = run_script(None, KILLED, "run", study, "--out", folder / "unkilled")
+    assert sum(map(int, blocks)) == int(whole.stdout.rpartition(" blocks")[0].split()[-1])
+
+
+def test_progress_counts_the_solves_of_inversions(folder):
+    """Of all data sets, in a line off the terminal."""
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "counted")
+    solves = json.loads((folder / "counted/summary.json").read_text())["solves"]
+    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
+    quiet = run_script(None, WITHOUT_REPORT, "run", "--quiet", folder / "few.toml", "--out", folder / "counted2")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
 
 
 def test_two_ranks_give_the_same_bytes(folder):

@@ -17,7 +17,7 @@ from uq.indices import field_indices
 from workflows import bodies, plots, words
 from workflows.config import dump, parse
 from workflows.report import NO_BODY, compare, write_report
-from workflows.results import label, node_fields, summarise, write_dataset
+from workflows.results import above_rounding, blank_where_still, label, node_fields, summarise, write_dataset
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 HEXAHEDRON = [[0, 4, 6, 2, 1, 5, 7, 3]]
@@ -516,6 +516,53 @@ def test_numbers_are_rounded(value, text):
 )
 def test_times_are_readable(seconds, text):
     assert words.duration(seconds) == text
+
+
+def test_no_error_is_below_rounding():
+    """Printed with fifteen digits at most, and kept as what rounding leaves."""
+    assert words.with_error(0.1, 1e-31) == "0.100000000000000 ± 0.000000000000001"
+    assert words.with_error(-1541.02, 1e-20) == "−1,541.02000000000 ± 0.00000000001"
+    found = above_rounding(
+        xr.Dataset(
+            {
+                "mean": ("output", [2.0, 0.0, np.nan]),
+                "mean_error": ("output", [1e-30, 0.0, 1.0]),
+                "std": ("output", [1e-20, 1.0, 1.0]),
+                "std_error": ("output", [1e-40, 0.5, np.nan]),
+                "sobol_first": (("output", "parameter"), [[1e-8], [0.5], [0.0]]),
+                "sobol_first_error": (("output", "parameter"), [[1e-30], [0.1], [0.0]]),
+            }
+        )
+    )
+    np.testing.assert_array_equal(found["mean_error"], [2.0**-51, 0.0, 1.0])
+    np.testing.assert_array_equal(found["std_error"], [2.0**-51, 0.5, np.nan])
+    np.testing.assert_array_equal(found["sobol_first_error"], [[2.0**-52], [0.1], [2.0**-52]])
+
+
+def test_maps_of_indices_are_blank_where_nothing_varies():
+    """A node whose standard deviation is rounding has no indices, in results and in pictures."""
+    found = blank_where_still(
+        xr.Dataset(
+            {
+                "field_std": (("node", "component"), [[1e-17, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.2]]),
+                "node_sobol_total": (("parameter", "node"), [[0.7, 0.0, 0.4], [0.3, 0.0, 0.6]]),
+            }
+        )
+    )
+    np.testing.assert_array_equal(found["node_sobol_total"], [[np.nan, np.nan, 0.4], [np.nan, np.nan, 0.6]])
+
+
+def test_axes_hold_the_posterior():
+    """Not the prior, which is a hundred times as wide and of which points with next to no weight are left."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.normal(5.0, 0.1, 500), rng.uniform(-100, 100, 200)])
+    weights = np.concatenate([np.full(500, 1.0), np.full(200, 1e-6)])
+    low, high = plots.span(values, weights)
+    assert 4.4 < low < 4.8
+    assert 5.2 < high < 5.6
+    order = np.argsort(values)
+    assert plots.span(values[order[::-1]], weights[order[::-1]]) == (low, high)
+    assert plots.span(np.ones(3), np.ones(3))[0] < 1 < plots.span(np.ones(3), np.ones(3))[1]
 
 
 def test_report_imports_nothing_that_draws():

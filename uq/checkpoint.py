@@ -13,7 +13,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from forward.model import WORK, ModelError
-from uq.evaluate import Evaluations, Failure, Request
+from uq.evaluate import Evaluations, Failure
 
 _HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
 
@@ -63,8 +63,8 @@ class Checkpoint:
         self._identity = identity.encode()
         self._code = code
 
-    def key(self, block: Request) -> str:
-        """Return the name of a block."""
+    def key(self, block: object) -> str:
+        """Return the name of a block: of a request, or of whatever else says what was asked."""
         return digest(block, self._identity).hex()[:24]
 
     def has(self, key: str) -> bool:
@@ -100,6 +100,11 @@ class Checkpoint:
     def load(self, key: str) -> Evaluations:
         """Read a finished block, as `has` has found it."""
         return _read(self._path(key), "/")
+
+    def drop(self, keys: Iterable[str]) -> None:
+        """Remove blocks that are no longer needed, since what follows from them is kept."""
+        for key in keys:
+            self._path(key).unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.h5"

@@ -8,6 +8,7 @@ a block decides nothing: blocks are added in their order.
 from __future__ import annotations
 
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,13 @@ from uq.checkpoint import Checkpoint
 from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
 T = TypeVar("T")
+Arrived = Callable[[Evaluations, bool], None]
 _RESULT = 1
+SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their blocks
+
+
+def _unseen(done: int, failed: int) -> None:
+    """Progress of what is no solve."""
 
 
 class Ensemble:
@@ -43,6 +50,12 @@ class Ensemble:
         self.group = group
         self.groups = groups
         self.index = index
+        self._counted: Callable[[int, int], None] = lambda done, failed: None
+
+    def count(self, done: int, failed: int) -> None:
+        """Count solves of this group that are no points of a request: rank 0 hears of them, while a task runs."""
+        if self.group.rank == 0:
+            self._counted(done, failed)
 
     @classmethod
     def split(cls, world: Any, ranks_per_model: int = 1) -> Ensemble:
@@ -68,6 +81,8 @@ class Ensemble:
         checkpoint: Checkpoint | None = None,
         progress: Callable[[int, int], None] = lambda done, failed: None,
         blocks: int = BLOCKS,
+        arrived: Arrived = lambda block, kept: None,
+        counted: bool = True,
     ) -> T | None:
         """Run `task` on rank 0 with an evaluation that all groups work on; collective.
 
@@ -85,20 +100,32 @@ class Ensemble:
             On rank 0: told the numbers of points that were done and that failed since it was last told.
         blocks
             Most blocks that an evaluation is cut into.
+        arrived
+            On rank 0: told of each finished block of model number 0 as soon as it is there, in any order, and whether
+            it was on disk.
+        counted
+            Whether a point of a request is a solve; if not, models count theirs, see `count`.
 
         Returns
         -------
         object
             What the task returned, on rank 0; nothing on the other ranks.
         """
-        with _counter(self.world) as counter:
+        with _counter(self.world) as counter, _counter(self.world) as solves, _counter(self.world) as failures:
             worker = _Worker(self, _Models(model, others), checkpoint, counter)
+            tally = _Tally(solves, failures, progress if self.world.rank == 0 else None)
+
+            def count(done: int, failed: int) -> None:
+                tally(done, failed)
+                worker.pulse()
+
+            self._counted = count
             if self.world.rank > 0:
                 while (order := self.world.bcast(None)) is not None:
                     worker.work(order)
                 return None
             try:
-                return task(EnsembleEvaluate(worker, 0, progress, blocks))
+                return task(EnsembleEvaluate(worker, 0, progress if counted else _unseen, blocks, arrived))
             finally:
                 self.world.bcast(None)
 
@@ -134,6 +161,7 @@ class EnsembleEvaluate:
     number: int
     progress: Callable[[int, int], None]
     blocks: int = BLOCKS
+    arrived: Arrived = lambda block, kept: None
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -171,6 +199,8 @@ class EnsembleEvaluate:
         merger, early = Merger(request.fields), dict[int, Evaluations]()
 
         def receive(index: int, block: Evaluations) -> None:
+            if self.number == 0:
+                self.arrived(block, False)
             early[index] = block
             add_in_order()
 
@@ -181,6 +211,8 @@ class EnsembleEvaluate:
                     assert checkpoint is not None
                     block = checkpoint.load(kept[i])
                     self.progress(len(block.points), len(block.failures))
+                    if self.number == 0:
+                        self.arrived(block, True)
                 merger.add(block)
 
         add_in_order()
@@ -198,6 +230,7 @@ class _Worker:
         self.models = models
         self.checkpoint = checkpoint
         self._counter = counter
+        self.pulse: Callable[[], None] = lambda: None  # on rank 0: receive what is there
 
     def prepare(self, model: int) -> None:
         """Rank 0: have all groups make a model, this one too."""
@@ -234,14 +267,23 @@ class _Worker:
             progress(done, failed)
             drain()
 
+        self.pulse = drain
         for i, block in self._blocks(order, own_progress):
             accept(i, block)
+        heard = time.monotonic()
         while missing:
+            # Waiting as `recv` does, but other groups' solves go on being counted.
+            while not world.iprobe(tag=_RESULT):
+                time.sleep(0)
+                if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
+                    self._ensemble.count(0, 0)
+                    heard = time.monotonic()
             i, block = world.recv(tag=_RESULT)
             progress(len(block.points), len(block.failures))
             accept(i, block)
         # Only when everyone has seen that no turn is left may the counter start again for the next order.
         world.barrier()
+        self._ensemble.count(0, 0)
 
     def work(self, order: _Order | int) -> None:
         """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its number."""
@@ -283,7 +325,9 @@ class _Counter:
         self._world = world
         size = MPI.INT64_T.Get_size()
         self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
-        self._one = np.ones(1, dtype=np.int64)
+        if world.rank == 0:
+            self.reset()  # what the memory held before is anything
+        world.barrier()
 
     def reset(self) -> None:
         """Start from zero again (rank 0, while no one takes)."""
@@ -294,15 +338,35 @@ class _Counter:
 
     def take(self) -> int:
         """Return the number and raise it by one."""
+        return self.add(1)
+
+    def add(self, count: int) -> int:
+        """Raise the number by a count, and return what it was before."""
         value = np.empty(1, dtype=np.int64)
         self._window.Lock(0, MPI.LOCK_SHARED)
-        self._window.Fetch_and_op(self._one, value, 0, op=MPI.SUM)
+        self._window.Fetch_and_op(np.array([count], dtype=np.int64), value, 0, op=MPI.SUM)
         self._window.Unlock(0)
         return int(value[0])
 
     def free(self) -> None:
         """Give the window back; collective."""
         self._window.Free()
+
+
+class _Tally:
+    """Solves of all groups, in rank 0's memory; rank 0 tells its progress what the others have added."""
+
+    def __init__(self, solves: _Counter, failures: _Counter, progress: Callable[[int, int], None] | None) -> None:
+        self._counters = solves, failures
+        self._progress = progress
+        self._told = [0, 0]
+
+    def __call__(self, done: int, failed: int) -> None:
+        """Count solves of this group."""
+        now = [counter.add(count) + count for counter, count in zip(self._counters, (done, failed), strict=True)]
+        if self._progress is not None:
+            new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
+            self._progress(*new)
 
 
 @contextmanager

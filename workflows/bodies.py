@@ -93,6 +93,7 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         smooth_shading=True,
         split_sharp_edges=True,
         show_scalar_bar=False,
+        nan_color=STILL,
     )
     plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
     _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]), _up(dataset))

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -38,8 +38,10 @@ if TYPE_CHECKING:
     from forward.model import Finding, FloatArray
     from forward.specimen import SpecimenModel
     from inverse.inversion import Variables
+    from uq.evaluate import Evaluations
 
 PRIOR_DRAWS = 1024
+SOLVES_OF_FIELD = 12  # for a mode
 
 
 class DataSet(Settings):
@@ -193,11 +195,15 @@ class Inversion(Settings):
     @property
     def planned(self) -> int:
         """Number of evaluations: data sets, or solves where all groups work on one."""
-        if self.together:
-            method = self.method
-            corrections = method.solves(field=False) + method.chain_solves(len(self.names), field=False)
-            return corrections + 12 * method.starts + 2 * len(self.parameters)
-        return len(self.data.sets) + 1
+        return self.solves if self.together else len(self.data.sets) + 1
+
+    @property
+    def solves(self) -> int:
+        """Number of solves of all data sets, roughly: the searches for the modes take as many as they take."""
+        method, field = self.method, self.field
+        each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
+        each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
+        return each * sum(measurement is not None for measurement in self.measurements)
 
     @property
     def variables(self) -> Variables:
@@ -408,7 +414,9 @@ def _true_stiffness(path: Path) -> tuple[FloatArray, FloatArray]:
 # --- results ---------------------------------------------------------------------------------------------------------
 
 
-def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vertices: Any) -> xr.Dataset:
+def dataset(
+    study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vertices: Any, layout: Variables | None = None
+) -> xr.Dataset:
     """Put the records of all data sets, as vectors (n, S), into a dataset, with what is known beside them.
 
     Parameters
@@ -421,10 +429,12 @@ def dataset(study: Inversion, rows: FloatArray, reasons: Mapping[int, str], vert
         Why, by the number of the data set.
     vertices
         Places (N, 3) of the vertices, cells (n_cells, k), and VTK's number of their kind.
+    layout
+        Of the vectors, where they are of a study that has more data sets.
     """
     import xarray as xr
 
-    layout = study.variables
+    layout = layout or study.variables
     record = layout.unpack(rows)
     places, cells, kind = vertices
     held: dict[str, Any] = {name: (("data_set", *layout.dims[name]), record[name]) for name in layout.dims}
@@ -586,6 +596,42 @@ def batch_table(found: xr.Dataset) -> str:
         moved = int(one["points_moved"])
         writer.writerow([str(label), "yes" if bool(one["ok"]) else "no", count, moved, *shown, str(one["why"].item())])
     return file.getvalue()
+
+
+class Rows:
+    """The table of a batch, written anew whenever a data set is finished; the sets stand in their order.
+
+    Parameters
+    ----------
+    study
+        All data sets.
+    vertices
+        As of `dataset`.
+    write
+        Writes the table.
+    """
+
+    def __init__(self, study: Inversion, vertices: Any, write: Callable[[str], None]) -> None:
+        self._study, self._vertices, self._write = study, vertices, write
+        self._layout = study.variables
+        self._lines: dict[int, str] = {}
+        self._head = ""
+
+    def add(self, block: Evaluations) -> int:
+        """Add finished data sets; return how many solves they took."""
+        solves = 0.0
+        reasons = {failure.index: failure.reason for failure in block.failures}
+        for i, (row, number) in enumerate(zip(block.outputs, block.points[:, 0].astype(int).tolist(), strict=True)):
+            sets, measurements = self._study.data.sets[number], self._study.measurements[number]
+            data = self._study.data.model_copy(update={"sets": (sets,)})
+            alone = self._study.model_copy(update={"data": data, "measurements": (measurements,)})
+            why = {0: reasons[i]} if i in reasons else {}
+            found = dataset(alone, row[None], why, self._vertices, self._layout)
+            self._head, line = batch_table(found).splitlines()
+            self._lines[number] = line
+            solves += float(np.nansum(found["solves"]))
+        self._write("\n".join([self._head, *(self._lines[number] for number in sorted(self._lines)), ""]))
+        return int(solves)
 
 
 def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:

@@ -450,11 +450,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
         draws = of["draw"].to_numpy()
         draws = draws[np.isfinite(draws)]
         mean, std = float(of["mode"]), float(of["laplace_std"])
-        wide = max(float(of["std"]), std)
-        low = min(mean - 4 * std, draws.min(initial=mean) - 0.5 * wide)
-        high = max(mean + 4 * std, draws.max(initial=mean) + 0.5 * wide)
-        if np.isfinite(of["true"]):
-            low, high = min(low, float(of["true"]) - 0.5 * wide), max(high, float(of["true"]) + 0.5 * wide)
+        low, high = _span(draws, mean, min(std, 3 * float(of["std"])), float(of["true"]))
         values, density = before[name]
         x = np.linspace(max(low, values[0]), min(high, values[-1]), 300)
         ax.fill_between(x, _smooth(draws, float(of["std"]), _worth(one), x), **_FILLED)
@@ -465,6 +461,18 @@ def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
         _finish(ax, _with_unit(name), x)
     _legend(found)
     return found[0]
+
+
+def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[float, float]:
+    """Ends of an axis that holds a posterior, its Gaussian, and the truth unless that is far away."""
+    low, high = mode - 4 * std, mode + 4 * std
+    if len(draws):
+        ends = plots.span(draws, np.ones(len(draws)))
+        low, high = min(low, ends[0]), max(high, ends[1])
+    wide = high - low
+    if low - 2 * wide < true < high + 2 * wide:
+        low, high = min(low, true - 0.1 * wide), max(high, true + 0.1 * wide)
+    return low, high
 
 
 _FILLED: dict[str, Any] = {"color": plots.CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
@@ -507,8 +515,7 @@ def node_marginals(one: xr.Dataset) -> Axes:
     nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
     found = plots.grid(len(nodes), columns=len(nodes), height=2.6, width=2.2)
     for ax, node in zip(found, nodes, strict=True):
-        low = min(centre - 3 * before[node], mean[node] - 4 * std[node])
-        x = np.linspace(low, max(centre + 3 * before[node], mean[node] + 4 * std[node]), 300)
+        x = np.linspace(*_span(np.zeros(0), mean[node], std[node], float(one["stiffness_true"][node])), 300)
         ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)
         ax.plot(x, _bell(x, centre, before[node]), color=plots.PLAIN, linestyle="--", label="prior")
         if np.isfinite(one["stiffness_true"][node]):

@@ -96,12 +96,13 @@ def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
     return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
 
 
-SOLVES_OF_FIELD = 12  # for a mode
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
 PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
 
 
 def _inversion(study: Inversion) -> list[str]:
+    from workflows.inversion import SOLVES_OF_FIELD
+
     spec, sets = study.model, study.data.sets
     usable = [m for m in study.measurements if m is not None]
     counts = [int(m.observations.measured.sum()) for m in usable]

@@ -1,11 +1,11 @@
-"""Progress on rank 0: a bar in a terminal, plain lines elsewhere."""
+"""Progress on rank 0: a bar in a terminal, elsewhere a plain line a minute."""
 
 from __future__ import annotations
 
 import sys
 import time
 
-SECONDS_BETWEEN_LINES = 10.0
+SECONDS_BETWEEN_LINES = 60.0
 
 
 class Progress:
@@ -17,14 +17,18 @@ class Progress:
         Number of solves expected; it grows when a method asks for more.
     quiet
         Show nothing.
+    failures
+        Whether solves without an answer are failures, which are shown; where data are explained they may be parameters
+        that explain nothing.
     """
 
-    def __init__(self, planned: int, *, quiet: bool = False) -> None:
+    def __init__(self, planned: int, *, quiet: bool = False, failures: bool = True) -> None:
         self.done = 0
         self.failed = 0
         self._planned = planned
+        self._failures = failures
         self._begin = time.monotonic()
-        self._shown = self._begin
+        self._shown, self._before = self._begin, 0  # when the last line was printed, and what was done by then
         self._bar = None
         self._quiet = quiet
         if not quiet and sys.stderr.isatty():
@@ -35,16 +39,16 @@ class Progress:
     def __call__(self, done: int, failed: int) -> None:
         """Count solves that were finished, and how many of them failed."""
         self.done += done
-        self.failed += failed
+        self.failed += failed if self._failures else 0
         if self._quiet:
             return
         if self._bar is not None:
             self._bar.update(done)
             if self.failed:
                 self._bar.set_postfix(failed=self.failed)
-        elif time.monotonic() - self._shown > SECONDS_BETWEEN_LINES:
-            self._shown = time.monotonic()
-            self._print_line()
+        elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
+            self._print_line(self._shown, self._before)
+            self._shown, self._before = time.monotonic(), self.done
 
     def close(self) -> None:
         """Show the last state."""
@@ -53,11 +57,12 @@ class Progress:
             self._bar.close()
         elif not self._quiet:
             self._planned = self.done
-            self._print_line()
+            self._print_line(self._begin, 0)
 
-    def _print_line(self) -> None:
-        seconds = time.monotonic() - self._begin
-        rate = self.done / seconds if seconds > 0 else 0.0
+    def _print_line(self, since: float, before: int) -> None:
+        """Print what is done, with the rate since a time: what was read from disk at first took none."""
+        seconds = time.monotonic() - since
+        rate = (self.done - before) / seconds if seconds > 0 else 0.0
         left = max(self._planned - self.done, 0) / rate if rate > 0 else float("inf")
         line = f"{self.done}/{max(self._planned, self.done)} solves, {rate:.3g} per second, {_clock(left)} left"
         sys.stderr.write(line + (f", {self.failed} failed" if self.failed else "") + "\n")

@@ -17,6 +17,9 @@ from uq.moments import ESTIMATES
 if TYPE_CHECKING:
     import xarray as xr
 
+ROUNDING = 2.0**-52
+STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a file under another name and rename it into place."""
@@ -289,6 +292,36 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
             labels = variable[variable.dims[0]].values
             arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
     return arrays
+
+
+def above_rounding(dataset: xr.Dataset) -> xr.Dataset:
+    """Let no standard error be smaller than the rounding of what it is the error of.
+
+    A standard deviation is a difference of numbers as large as the mean, an index a ratio of sums that are as large.
+    """
+    found = {}
+    for label, errors in dataset.data_vars.items():
+        name = str(label).removesuffix("_error")
+        if name == label or name not in dataset or set(dataset[name].dims) != set(errors.dims):
+            continue
+        size: Any = np.abs(dataset[name])
+        if name.endswith("std") and (mean := f"{name.removesuffix('std')}mean") in dataset:
+            size = np.maximum(size, np.abs(dataset[mean]))
+        if "sobol" in name:
+            size = np.maximum(size, 1.0)
+        floor = (ROUNDING * size).transpose(*errors.dims).to_numpy()
+        values = errors.to_numpy()
+        found[name] = (errors.dims, np.where(values < floor, floor, values), errors.attrs)
+    return dataset.assign({f"{name}_error": variable for name, variable in found.items()})
+
+
+def blank_where_still(dataset: xr.Dataset) -> xr.Dataset:
+    """Leave out the indices of nodes that do not vary: there they are ratios of what rounding leaves."""
+    names = [str(name) for name in dataset.data_vars if str(name).startswith("node_sobol_")]
+    if not names or "field_std" not in dataset:
+        return dataset
+    size = np.sqrt((dataset["field_std"] ** 2).sum("component"))
+    return dataset.assign({name: dataset[name].where(size > STILL * size.max()) for name in names})
 
 
 def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any, vtk_cell_type: int) -> xr.Dataset:

@@ -302,11 +302,7 @@ def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
     weights = weights[used]
     columns = [one["point"].sel(parameter=name).values[used] for name in names]
     modes = [float(one["constant_mode"].sel(parameter=name)) for name in names]
-    ends = []
-    for x in columns:
-        order = np.argsort(x)
-        low, high = np.interp((0.002, 0.998), np.cumsum(weights[order]), x[order])
-        ends.append((low - 0.1 * (high - low), high + 0.1 * (high - low)))
+    ends = [plots.span(x, weights) for x in columns]
     colour = plots.COLOURS[list(dataset.model.values).index(model) % len(plots.COLOURS)]
     for i, j in np.ndindex(n, n):
         ax = grid[i, j]

@@ -28,6 +28,8 @@ from workflows import own_code, verdict
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.progress import Progress
 from workflows.results import (
+    above_rounding,
+    blank_where_still,
     inverted,
     label,
     read_summary,
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 REALISATIONS = 3  # of random fields, to look at
 _STOPPED = {"select": "all evidences found", "invert": "all data sets inverted", "synthesize": "all data made"}
+BATCH = "batch.csv"
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
@@ -108,15 +111,24 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     from uq.ensemble import Ensemble
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
-    progress = Progress(study.planned, quiet=quiet or world.rank > 0)
+    planned = study.solves if hasattr(study, "solves") else study.planned
+    progress = Progress(planned, quiet=quiet or world.rank > 0, failures=not _explains(study))
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]), loaded)
     try:
-        job = _job(study, ensemble, name)
+        job = _job(study, ensemble, name, directory, checkpoint)
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
         kept = checkpoint if job.costly else None
         dataset = ensemble.run(
-            job.model, job.task, others=job.others, checkpoint=kept, progress=progress, blocks=study.parallel.blocks
+            job.model,
+            job.task,
+            others=job.others,
+            checkpoint=kept,
+            progress=progress,
+            # A data set is a block: finished ones are kept, and shown, one by one.
+            blocks=study.parallel.blocks if job.counted else max(study.parallel.blocks, study.planned),
+            arrived=job.arrived,
+            counted=job.counted,
         )
     except BaseException:
         if world.rank == 0:
@@ -125,7 +137,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     if dataset is None:
         return DONE
     progress.close()
-    dataset = job.labelled(dataset)
+    dataset = above_rounding(blank_where_still(job.labelled(dataset)))
     add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
@@ -207,6 +219,10 @@ class _Job:
         Groups of results.nc beside its own variables.
     texts
         Further files of the directory, by name.
+    arrived
+        Told of each finished block of the first model, see `Ensemble.run`.
+    counted
+        Whether points of requests are solves; if not, they are counted where they are made.
     """
 
     model: ForwardModel
@@ -217,15 +233,17 @@ class _Job:
     costly: bool = True
     groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
     texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
+    arrived: Callable[[Evaluations, bool], None] = field(default=lambda block, kept: None)
+    counted: bool = True
 
 
-def _job(study: AnyStudy, ensemble: Ensemble, name: str) -> _Job:
+def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> _Job:
     if isinstance(study, Study):
         return _sampling(study, ensemble)
     from workflows.inversion import Inversion, Synthesis
 
     if isinstance(study, Inversion):
-        return _inversion(study, ensemble)
+        return _inversion(study, ensemble, directory, checkpoint)
     return _synthesis(study, ensemble, name) if isinstance(study, Synthesis) else _selection(study, ensemble)
 
 
@@ -276,7 +294,7 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
 
         def free(name: str, group: str) -> Evaluate:
             # What nested sampling solves is too much, and too cheap, to keep.
-            return SerialEvaluate(study.build(name, group))
+            return SerialEvaluate(study.build(name, group), ensemble.count)
 
         return study.method.run(study.models, study.groups, recorded, free)
 
@@ -290,12 +308,13 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     )
 
 
-def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
+def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> _Job:
     """One data set, whose solves all groups share, or data sets side by side; collective over the group."""
     from forward.model import SolveError
     from inverse.field_posterior import FieldPosterior
     from inverse.inversion import Inversions, Vertices, invert_by_all, invert_by_group, invert_field
     from uq.evaluate import Request
+    from uq.kept import KeptEvaluate
     from workflows import inversion
 
     method = study.method
@@ -304,6 +323,14 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
     layout = study.variables
     prior = study.model.fields[0].prior(study.model.body) if study.field else None
     recorders: dict[str, Recorder] = {}
+
+    done: list[KeptEvaluate] = []
+    rows = inversion.Rows(study, vertices, lambda text: write_text(directory / BATCH, text))
+
+    def arrived(block: Evaluations, kept: bool) -> None:
+        solves = rows.add(block)
+        if kept:
+            ensemble.count(solves, 0)
 
     def look(points: FloatArray) -> FloatArray:
         return study.stiffness(vertices[0], points) + model.log_fields(points)
@@ -317,9 +344,13 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
             observed = model.observing(data.places, data.axes, data.cases)
         except ValueError as error:  # a place that no cell has, by rounding: the other data sets go on
             raise SolveError(str(error)) from None
+        if done:
+            done.pop().forget()  # what follows from these solves is kept by now
         if prior is None:
-            return layout.pack(invert_by_group(study.inputs, observed, data, method, look))
-        posterior = FieldPosterior(observed, data.values, data.sigma, prior)
+            name = study.data.sets[number].name
+            done.append(KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count))
+            return layout.pack(invert_by_group(study.inputs, observed, data, method, look, done[0]))
+        posterior = FieldPosterior(observed, data.values, data.sigma, prior, progress=ensemble.count)
         offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
         return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass)))
 
@@ -337,10 +368,6 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
             raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
         return inversion.dataset(study, found.outputs, reasons, vertices)
 
-    def labelled(found: xr.Dataset) -> xr.Dataset:
-        add(found, *verdict.findings_of_inversion(found))
-        return found
-
     first: ForwardModel = Inversions(invert, ("data_set",), layout.names)
     if study.together:
         data = study.measurements[0].observations.components()
@@ -350,10 +377,18 @@ def _inversion(study: Inversion, ensemble: Ensemble) -> _Job:
         [],
         one if study.together else many,
         recorders,
-        labelled,
+        _judged,
         groups=partial(inversion.groups, study),
-        texts=lambda found: {"batch.csv": inversion.batch_table(found)},
+        texts=lambda found: {BATCH: inversion.batch_table(found)},
+        arrived=(lambda block, kept: None) if study.together else arrived,
+        counted=study.together,
     )
+
+
+def _judged(found: xr.Dataset) -> xr.Dataset:
+    """Say of each data set what stands and what does not."""
+    add(found, *verdict.findings_of_inversion(found))
+    return found
 
 
 def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:

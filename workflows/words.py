@@ -15,6 +15,7 @@ from forward.outputs import Output
 from workflows.config import Study
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+DIGITS = 15  # that a number has
 NONE = "–"  # what stands for a number that there is not
 
 
@@ -35,6 +36,10 @@ def with_error(value: float, error: float) -> str:
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return f"{number(value, 6)} ± {number(error, 2)}"
     decimals = 1 - math.floor(math.log10(error))
+    if value:
+        # Numbers have fifteen digits: an error below them is one of the last.
+        decimals = min(decimals, DIGITS - 1 - math.floor(math.log10(abs(value))))
+        error = max(error, 10.0**-decimals)
     power = _power(max(abs(value), error))
     places = max(decimals + power, 0)
     rounded = [round(x, decimals) / 10.0**power for x in (value, error)]
