@@ -122,8 +122,7 @@ class LocalSensitivity(Settings):
     """Derivatives of all outputs and of the displacement field at the mean parameters: one solve and its tangents.
 
     Results: `derivative` dψ/dω, `derivative_per_std` (times the standard deviation of the parameter),
-    `derivative_per_range` (times upper − lower, for bounded distributions), `field_derivative` du/dω at every node
-    and `field_derivative_norm`, its Euclidean norm over all nodes and components.
+    `derivative_per_range` (times upper − lower, for bounded distributions), and `field_derivative` du/dω at every node.
     """
 
     kind: Literal["local-sensitivity"] = "local-sensitivity"
@@ -155,6 +154,7 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
         "nominal": (("output",), centre.outputs),
         "parameter_mean": (("parameter",), inputs.mean),
         "parameter_std": (("parameter",), inputs.std),
+        "parameter_range": (("parameter",), ranges),
     }
     if evaluate.differentiable:
         data |= {
@@ -173,8 +173,5 @@ def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, 
         if len(centre.slopes):
             slopes = centre.slopes[:, :count]
             shape = (len(slopes), -1, 3)
-            norms = np.linalg.norm(slopes, axis=1)
             data["field_derivative"] = (("parameter", "node", "component"), slopes.reshape(shape))
-            data["field_derivative_norm"] = (("parameter",), norms)
-            data["field_derivative_norm_per_range"] = (("parameter",), norms * ranges)
     return xr.Dataset(data, coords=coordinates)

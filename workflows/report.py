@@ -149,7 +149,7 @@ def _context(results: Results) -> dict[str, Any]:
         "bodies": drawn,
         "sensitivities": [(o, tables.sensitivities(results, o)) for o in results.outputs] if differentiated else [],
         "tornados": [_tornado(dataset, o) for o in results.outputs] if differentiated else [],
-        "field_norms": tables.field_norms(results) if "field_derivative_norm" in dataset else None,
+        "field_norms": tables.field_norms(results) if "field_derivative_rms" in dataset else None,
         "failures": tables.failures(results) if summary["failures"] else None,
         "failures_line": tables.failures_line(summary),
         "times": list(tables.times(summary)),
@@ -319,7 +319,7 @@ def _body_captions(dataset: xr.Dataset) -> dict[str, str]:
     else:
         captions = {"nominal": f"Displacement at the mean parameters, {largest('field_nominal')}."}
     if "field_derivative" in dataset:
-        effects = dataset["field_derivative_norm"] * dataset["parameter_std"]
+        effects = dataset["field_derivative_rms"] * dataset["parameter_std"]
         strongest = dataset["parameter"].to_numpy()[np.argsort(-effects.to_numpy())][:DERIVATIVES_DRAWN]
         for name in strongest:
             captions[f"derivative {name}"] = f"What one standard deviation of {name} moves, to first order."

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
+from workflows.norms import squares
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -292,6 +293,23 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
             labels = variable[variable.dims[0]].values
             arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
     return arrays
+
+
+def with_norms(dataset: xr.Dataset) -> xr.Dataset:
+    """Add L² norms over the body of the derivatives of the displacement field, and their root mean squares.
+
+    The norm of u is √∫|u|² dX (m^{5/2}); √(∫|u|² dX/V) is the root mean square of |u| over the body (m).
+    """
+    if "field_derivative" not in dataset:
+        return dataset
+    slopes = dataset["field_derivative"].to_numpy()
+    total, volume = squares(dataset["node_position"].to_numpy(), dataset["cell_nodes"].to_numpy(), slopes)
+    norms, dims = np.sqrt(total), ("parameter",)
+    return dataset.assign(
+        field_derivative_norm=(dims, norms),
+        field_derivative_norm_per_range=(dims, norms * dataset["parameter_range"].to_numpy()),
+        field_derivative_rms=(dims, norms / np.sqrt(volume)),
+    )
 
 
 def above_rounding(dataset: xr.Dataset) -> xr.Dataset:

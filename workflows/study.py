@@ -34,6 +34,7 @@ from workflows.results import (
     label,
     read_summary,
     summarise,
+    with_norms,
     with_random_fields,
     with_regions,
     write_dataset,
@@ -137,7 +138,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     if dataset is None:
         return DONE
     progress.close()
-    dataset = above_rounding(blank_where_still(job.labelled(dataset)))
+    dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
     add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}

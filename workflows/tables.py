@@ -368,16 +368,17 @@ def sensitivities(results: Results, output: str) -> Table:
 
 
 def field_norms(results: Results) -> Table:
-    """Norms of the derivatives of the displacement field."""
+    """Root mean squares over the body of the derivatives of the displacement field."""
     dataset = results.dataset
     rows = []
-    for name in results.leading(dataset["field_derivative_norm"] * dataset["parameter_std"]):
+    for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
         of_parameter = dataset.sel(parameter=name)
-        norm, std = float(of_parameter["field_derivative_norm"]), float(of_parameter["parameter_std"])
-        over_range = float(of_parameter["field_derivative_norm_per_range"])
-        slope = with_unit(number(norm, 5), per("m", unit_of(name)))
-        rows.append((name, slope, with_unit(number(norm * std), "m"), with_unit(number(over_range), "m")))
-    return Table(("parameter", "norm of the derivative", "× standard deviation", "× range"), rows)
+        size, std, wide = (
+            float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
+        )
+        slope = with_unit(number(size, 5), per("m", unit_of(name)))
+        rows.append((name, slope, with_unit(number(size * std), "m"), with_unit(number(size * wide), "m")))
+    return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
 
 
 def failures(results: Results) -> Table:

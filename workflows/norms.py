@@ -1,0 +1,89 @@
+"""Integrals over a body of fields that are known at its nodes: norms that do not depend on the mesh.
+
+The field on a cell is the polynomial through its values at the nodes, and so is the place: |u|² is integrated by Gauss'
+rule, exactly on cells with plane faces and parallel edges (O. C. Zienkiewicz et al., The Finite Element Method (2013),
+section 5.11). That is uᵀMu with the mass matrix M of the displacements, which is never formed.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+POINTS = 4  # of Gauss' rule along each direction: exact up to degree 7
+CELLS = 2000  # that are integrated at once
+_TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+_HEXAHEDRON = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float
+)  # VTK's order
+
+
+def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> tuple[FloatArray, float]:
+    """Return ∫|u|² dX (k,) of fields u (k, N, 3), and the volume.
+
+    Parameters
+    ----------
+    nodes
+        Places (N, 3).
+    cells
+        Nodes of each cell (n_cells, 4, 10, 8 or 27), the vertices first, in VTK's order.
+    """
+    tetrahedra = cells.shape[1] in {4, 10}
+    corners = _TETRAHEDRON if tetrahedra else _HEXAHEDRON
+    quadratic = cells.shape[1] > len(corners)
+    powers = np.array(
+        [p for p in product(range(3 if quadratic else 2), repeat=3) if not tetrahedra or sum(p) <= 1 + quadratic]
+    )
+    basis = np.linalg.inv(_monomials(_reference(nodes[cells[0]], corners, tetrahedra=tetrahedra), powers))
+    points, weights = _rule(tetrahedra=tetrahedra)
+    shapes = _monomials(points, powers) @ basis  # (q, k)
+    slopes = np.array([_derivatives(points, powers, axis) @ basis for axis in range(3)])
+    total, volume = np.zeros(len(fields)), 0.0
+    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
+        jacobians = np.einsum("aqk,nkx->nqxa", slopes, nodes[part])
+        measure = np.abs(np.linalg.det(jacobians)) * weights
+        volume += float(measure.sum())
+        for i, field in enumerate(fields):
+            values = np.einsum("qk,nkx->nqx", shapes, field[part])
+            total[i] += float((measure * (values**2).sum(axis=2)).sum())
+    return total, volume
+
+
+def _reference(places: FloatArray, corners: FloatArray, *, tetrahedra: bool) -> FloatArray:
+    """Find where the nodes (k, 3) of a cell stand in the reference cell: at corners, and between them."""
+    if len(places) == len(corners):
+        return corners
+    grid = np.array(list(product((0.0, 0.5, 1.0), repeat=3)))
+    if tetrahedra:
+        grid = grid[grid.sum(axis=1) <= 1]
+    powers = np.array([p for p in product(range(2), repeat=3) if not tetrahedra or sum(p) <= 1])
+    images = _monomials(grid, powers) @ np.linalg.inv(_monomials(corners, powers)) @ places[: len(corners)]
+    nearest = np.linalg.norm(places[:, None] - images[None], axis=2).argmin(axis=1)
+    assert len(set(nearest.tolist())) == len(places)
+    return np.asarray(grid[nearest])
+
+
+def _monomials(points: FloatArray, powers: NDArray[np.int64]) -> FloatArray:
+    return np.asarray(np.prod(points[:, None, :] ** powers[None], axis=2))
+
+
+def _derivatives(points: FloatArray, powers: NDArray[np.int64], axis: int) -> FloatArray:
+    lower = powers.copy()
+    lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
+    return np.asarray(_monomials(points, lower) * powers[:, axis])
+
+
+def _rule(*, tetrahedra: bool) -> tuple[FloatArray, FloatArray]:
+    """Gauss' rule on the unit cube, or on the tetrahedron, onto which the cube is collapsed."""
+    x, w = np.polynomial.legendre.leggauss(POINTS)  # type: ignore[no-untyped-call]
+    x, w = (x + 1) / 2, w / 2
+    a, b, c = (part.ravel() for part in np.meshgrid(x, x, x, indexing="ij"))
+    weights = np.einsum("i,j,k->ijk", w, w, w).ravel()
+    if not tetrahedra:
+        return np.column_stack([a, b, c]), weights
+    points = np.column_stack([a, b * (1 - a), c * (1 - a) * (1 - b)])
+    return points, weights * (1 - a) ** 2 * (1 - b)
