@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import Annotated, Any, Literal, Self
 
@@ -14,6 +15,7 @@ from forward.own_mesh import OwnMesh
 from forward.settings import Settings
 
 Axis = Literal["x", "y", "z"]
+Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")
 Length = Annotated[float, Gt(0)]
 Count = Annotated[int, Gt(0)]
@@ -35,6 +37,10 @@ class _SixSided(Settings):
     quadrature_degree
         Degree that the integrals are exact for; by default the lowest that keeps the order of convergence. Less than 2
         (quadratic tetrahedra, linear hexahedra) or 4 (quadratic hexahedra) leaves deformations without energy.
+    grading
+        By face: how many times thinner the cells there are than at the opposite face or, where that has a grading too,
+        than in the middle between both. Edges of cells grow geometrically: ``{ z-min = 8 }`` for a body that is
+        clamped there, since stresses change fast beside the rim of a clamp.
     """
 
     kind: str
@@ -42,6 +48,7 @@ class _SixSided(Settings):
     cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
     degree: Literal[1, 2] = 2
     quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
+    grading: dict[Face, Annotated[float, Field(ge=1, le=1e4)]] = Field(default={})
 
     @property
     @abstractmethod
@@ -59,8 +66,35 @@ class _SixSided(Settings):
         """The shape in words."""
 
     @abstractmethod
+    def shaped(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the box that is meshed into the body (m), without the grading."""
+
     def place(self, points: FloatArray) -> FloatArray:
-        """Map points (n, 3) of the box that is meshed into the body (m)."""
+        """Map points (n, 3) of the box with equal cells into the body (m); nested meshes stay nested."""
+        if not self.grading:
+            return self.shaped(points)
+        axes = zip(points.T, self.meshed, AXES, strict=True)
+        moved = [
+            length * _graded(x / length, *(self.grading.get(f"{axis}-{end}", 1.0) for end in ("min", "max")))  # type: ignore[call-overload]
+            for x, length, axis in axes
+        ]
+        return self.shaped(np.column_stack(moved))
+
+    def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
+        """Return the same body with so many times the cells along each edge, thinner ones at some faces and beside.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(math.ceil(times * n) for n in self.cells)
+        graded = {}
+        for face in self.boundaries:
+            rims = any(face[0] != other[0] for other in towards)
+            more = grading if face in towards else beside if rims else 1.0
+            graded[face] = more * self.grading.get(face, 1.0)  # type: ignore[call-overload]
+        return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
 
     @abstractmethod
     def contains(self, point: Vector) -> bool:
@@ -123,7 +157,11 @@ class _SixSided(Settings):
     def longest_edge(self) -> float:
         """Length (m) of the longest edge of a cell (the diagonals of tetrahedra apart)."""
         corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
-        edges = [np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() / n for a, n in enumerate(self.cells)]
+        edges = []
+        for a, n in enumerate(self.cells):
+            ends = (self.grading.get(f"{AXES[a]}-{end}", 1.0) for end in ("min", "max"))  # type: ignore[call-overload]
+            share = np.diff(_graded(np.linspace(0, 1, n + 1), *ends)).max()
+            edges.append(np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() * share)
         return float(max(edges))
 
     def refined(self, level: int) -> Self:
@@ -166,7 +204,7 @@ class Box(_SixSided):
     ----------
     size
         Edge lengths in m.
-    cells, cell, degree, quadrature_degree
+    cells, cell, degree, quadrature_degree, grading
         The mesh, as of every body with six sides.
     """
 
@@ -189,7 +227,7 @@ class Box(_SixSided):
         """The shape in words."""
         return f"box of {' × '.join(f'{x:g}' for x in self.size)} m"
 
-    def place(self, points: FloatArray) -> FloatArray:
+    def shaped(self, points: FloatArray) -> FloatArray:
         """Leave points (n, 3) where they are."""
         return points
 
@@ -200,6 +238,25 @@ class Box(_SixSided):
     def nearest(self, points: FloatArray) -> FloatArray:
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         return np.asarray(np.clip(points, 0.0, self.size))
+
+
+def _graded(s: FloatArray, first: float, last: float) -> FloatArray:
+    """Map [0, 1] to itself with a slope that grows geometrically, `first` times from 0 and `last` times from 1.
+
+    With one of them it does so from end to end; with both, from either end to the middle.
+    """
+    if first == 1 or last == 1:
+        if first == last:
+            return s
+        return _grown(s, first) if last == 1 else 1 - _grown(1 - s, last)
+    halves = [(1 - 1 / ratio) / np.log(ratio) for ratio in (first, last)]  # lengths where the slope in the middle is 1
+    middle = halves[0] / sum(halves)
+    low, high = np.minimum(2 * s, 1), np.minimum(2 * (1 - s), 1)
+    return np.asarray(np.where(s <= 0.5, middle * _grown(low, first), 1 - (1 - middle) * _grown(high, last)))
+
+
+def _grown(s: FloatArray, ratio: float) -> FloatArray:
+    return np.asarray((ratio**s - 1) / (ratio - 1))
 
 
 class Block(_SixSided):
@@ -235,7 +292,7 @@ class Block(_SixSided):
         """The shape in words."""
         return f"block with the corners {', '.join('(' + ', '.join(f'{x:g}' for x in c) + ')' for c in self.corners)} m"
 
-    def place(self, points: FloatArray) -> FloatArray:
+    def shaped(self, points: FloatArray) -> FloatArray:
         """Map points (n, 3) of the cube into the body (m)."""
         return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
 
@@ -243,13 +300,13 @@ class Block(_SixSided):
         """Whether a point (m) lies in the undeformed body."""
         steps = np.linspace(0, 1, 5)
         guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-        gaps = np.asarray(point) - self.place(guesses)
+        gaps = np.asarray(point) - self.shaped(guesses)
         # Newton's method from the nearest guess, kept near the cube: the map is not invertible everywhere outside.
         x = guesses[[np.linalg.norm(gaps, axis=1).argmin()]]
         for _ in range(30):
-            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.place(x)[0], rcond=None)[0]
+            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.shaped(x)[0], rcond=None)[0]
             x = np.clip(x + step, -0.1, 1.1)
-        gap = np.abs(np.asarray(point) - self.place(x)[0]).max()
+        gap = np.abs(np.asarray(point) - self.shaped(x)[0]).max()
         extent = max(high - low for low, high in self.bounds)
         return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
 
@@ -259,18 +316,18 @@ class Block(_SixSided):
 
         steps = np.linspace(0, 1, 5)
         guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-        images = self.place(guesses)
+        images = self.shaped(guesses)
         found = np.empty_like(points)
         for i, point in enumerate(points):
             # Gauss and Newton's method in the cube, the steps of which end at its faces.
             x = guesses[[np.linalg.norm(images - point, axis=1).argmin()]]
             for _ in range(20):
-                gap = point - self.place(x)[0]
+                gap = point - self.shaped(x)[0]
                 step = lsq_linear(self._slopes(x)[0], gap, (np.minimum(-x[0], -1e-300), np.maximum(1 - x[0], 1e-300))).x
                 x = np.clip(x + step, 0, 1)
                 if np.abs(step).max() < 1e-12:
                     break
-            found[i] = self.place(x)[0]
+            found[i] = self.shaped(x)[0]
         return found
 
     def _trilinear(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:

@@ -32,6 +32,7 @@ Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
 LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
 FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
+QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
@@ -147,6 +148,8 @@ class OwnMesh(Settings):
         Names for numbers of boundaries and regions: ``{ vessel = 3 }``.
     tags
         Name of the array with the numbers, where it is not a usual one and not the only one.
+    divide
+        Divide every tetrahedron into eight, with thinner ones at these boundaries (``[]``: equally everywhere).
     contents
         What the file holds; it need not be given.
     """
@@ -158,6 +161,7 @@ class OwnMesh(Settings):
     quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
     names: dict[Annotated[str, Field(pattern=r"^[^.\s]+$")], int] = Field(default={})
     tags: str | None = None
+    divide: tuple[str, ...] | None = None
     contents: Contents | None = None
 
     @model_validator(mode="after")
@@ -183,7 +187,21 @@ class OwnMesh(Settings):
         if self.contents is not None and digest != self.contents.digest:
             message = f"model.body.file: {self.file} is not the file that the study was made for: it has changed"
             raise ModelError(message)
-        return _load(self.file, digest, self.unit, tuple(self.names.items()), self.tags)
+        loaded = _load(self.file, digest, self.unit, tuple(self.names.items()), self.tags)
+        return loaded if self.divide is None else divided(loaded, self.divide)
+
+    def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
+        """Return the body with every tetrahedron divided into eight, thinner ones at some boundaries.
+
+        Raises
+        ------
+        ModelError
+            If it has hexahedra, or is divided already.
+        """
+        if self.cell != "tetrahedron" or self.divide is not None:
+            message = "hexahedra of a file are not divided" if self.divide is None else "its mesh is divided already"
+            raise ModelError(message)
+        return self.model_validate(self.model_dump(exclude={"contents"}) | {"divide": towards})
 
     @property
     def found(self) -> Contents:
@@ -516,6 +534,61 @@ def _outer(facets: IntArray, groups: dict[str, NDArray[np.bool_]], cells: IntArr
     outside = of_cells[which[len(faces) :]] == 1
     found = {word: facets[outside & member] for word, member in groups.items()}
     return {word: part for word, part in found.items() if len(part)}
+
+
+def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
+    """Divide every tetrahedron into eight, thinner ones at some boundaries.
+
+    Edges that leave these boundaries are divided at a quarter, nearer to the boundary, others in the middle (graded
+    meshes for singularities: H. Li, A. Mazzucato, V. Nistor, Electron. Trans. Numer. Anal. 37 (2010) 41–69). The
+    octahedron inside is cut along the diagonal that leaves its smallest part largest.
+
+    Raises
+    ------
+    ModelError
+        If the cells are hexahedra, or there is no such boundary.
+    """
+    unknown = [name for name in towards if name not in mesh.boundaries]
+    if mesh.cell != "tetrahedron" or unknown:
+        message = f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}" if unknown else "divide: expected tetrahedra"
+        raise ModelError(message)
+    ends, which = np.unique(
+        np.sort(mesh.cells[:, _EDGES["tetrahedron"]].reshape(-1, 2), axis=1), axis=0, return_inverse=True
+    )
+    number = len(mesh.points) + which.reshape(-1, 6)
+    held = np.zeros(len(mesh.points))
+    for name in towards:
+        held[mesh.boundaries[name]] = 1
+    share = 0.5 + (0.5 - QUARTER) * (held[ends[:, 1]] - held[ends[:, 0]])  # of the second end
+    points = np.concatenate(
+        [mesh.points, (1 - share)[:, None] * mesh.points[ends[:, 0]] + share[:, None] * mesh.points[ends[:, 1]]]
+    )
+    m01, m02, m03, m12, m13, m23 = number.T
+    v0, v1, v2, v3 = mesh.cells.T
+    corners = [(v0, m01, m02, m03), (v1, m01, m12, m13), (v2, m02, m12, m23), (v3, m03, m13, m23)]
+    cuts = []
+    for a, b, around in (
+        (m01, m23, (m02, m12, m13, m03)),
+        (m02, m13, (m01, m12, m23, m03)),
+        (m03, m12, (m01, m02, m23, m13)),
+    ):
+        cuts.append(np.stack([np.stack([a, b, around[k], around[k - 1]], axis=1) for k in range(4)], axis=1))
+    inner = np.array(cuts)  # (3, n, 4, 4)
+    at = points[inner]
+    volumes = np.abs(np.linalg.det(at[..., 1:, :] - at[..., :1, :])).min(axis=2)
+    best = inner[volumes.argmax(axis=0), np.arange(len(mesh.cells))]
+    cells = np.concatenate([np.stack([np.stack(corner, axis=1) for corner in corners], axis=1), best], axis=1)
+    numbers = {(int(i), int(j)): len(mesh.points) + k for k, (i, j) in enumerate(ends)}
+
+    def quartered(facets: IntArray) -> IntArray:
+        found = []
+        for i, j, k in facets.tolist():
+            ij, jk, ik = (numbers[min(a, b), max(a, b)] for a, b in ((i, j), (j, k), (i, k)))
+            found += [(i, ij, ik), (j, ij, jk), (k, ik, jk), (ij, jk, ik)]
+        return np.array(found, dtype=np.int64)
+
+    boundaries = {name: quartered(facets) for name, facets in mesh.boundaries.items()}
+    return Loaded(points, cells.reshape(-1, 4), mesh.cell, boundaries, mesh.regions, np.repeat(mesh.region, 8))
 
 
 def contents(mesh: Loaded, digest: str) -> Contents:

@@ -22,7 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ForwardModel, FunctionModel, FunctionSolution, Reference, SolveError
+from forward.model import (
+    FloatArray,
+    ForwardModel,
+    FunctionModel,
+    FunctionSolution,
+    ModelError,
+    Reference,
+    SolveError,
+)
 from forward.settings import Settings
 from inverse.chains import (
     FEW,
@@ -39,6 +47,7 @@ from inverse.chains import (
     weigh_field,
 )
 from inverse.comparison import quantiles
+from inverse.errors import NORMAL, NormalErrors, StudentErrors
 from inverse.evidence import LEAST, Evidence, evidence
 from inverse.field_posterior import FieldPosterior
 from inverse.laplace import Laplace, laplace
@@ -95,6 +104,10 @@ class Invert(Settings):
         Draws of the posterior that are kept, of few parameters; of a field a tenth.
     seed
         Of all draws.
+    mesh_check
+        Solve once more, at the mode on a finer mesh with thinner cells at the faces that are held: what the error of
+        the mesh does to the data, in deviations of their noise, and to the unknowns, in deviations of the posterior.
+        Without it no posterior is said to be trusted.
     """
 
     kind: Literal["invert"] = "invert"
@@ -106,6 +119,7 @@ class Invert(Settings):
     rank: Annotated[int, Field(ge=1)] = 256
     draws: Annotated[int, Field(ge=10)] = 400
     seed: Annotated[int, Field(ge=0)] = 0
+    mesh_check: bool = True
 
     @model_validator(mode="after")
     def _check(self) -> Invert:
@@ -305,6 +319,12 @@ _COMMON: dict[str, tuple[str, ...]] = {
     "residual_degrees": (),
     "residual_probability": (),
     "agreement_probability": (),
+    "prior_square": (),
+    "prior_degrees": (),
+    "mesh_checked": (),
+    "mesh_why": ("letter",),
+    "mesh_error": ("datum",),
+    "mesh_shift": ("parameter",),
     "step": ("iteration", "column"),
     "place": ("datum", "axis"),
     "datum_axis": ("datum",),
@@ -333,6 +353,7 @@ _OF_FIELD: dict[str, tuple[str, ...]] = {
     "direction_stiffness": ("shown", "node"),
     "shown_number": ("shown",),
     "alone_stiffness_std": ("case", "node"),
+    "stiffness_mesh_shift": ("node",),
     "stiffness_draw": ("sample", "node"),
     "neglected": (),
     "information": (),
@@ -436,6 +457,43 @@ def _of_test(test: ResidualTest) -> Record:
     }
 
 
+def _of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
+    """How far the mode x (N,) is from the centre of the prior, in the directions that the data say more of than it.
+
+    There x has the variance λ/(1+λ) where the truth is drawn from the prior: the squares are of χ².
+    """
+    seen = spectrum.values > 1
+    values = spectrum.values[seen]
+    squares = (spectrum.vectors[seen] @ x) ** 2 * (1 + values) / values
+    return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
+
+
+@dataclass(frozen=True)
+class Finer:
+    """Outputs (m,) on a finer mesh at parameters (d,) of the model, or why they are not known."""
+
+    outputs: Callable[[FloatArray], FloatArray] | None
+    why: str = ""
+
+    def gap(self, point: FloatArray, outputs: FloatArray) -> tuple[FloatArray | None, str]:
+        """Return what the finer mesh adds to outputs (m,), or why that is not known."""
+        if self.outputs is None:
+            return None, self.why
+        try:
+            return self.outputs(point) - outputs, ""
+        except (SolveError, ModelError, ValueError) as error:
+            return None, f"the solve on a finer mesh failed: {error}"
+
+
+def _of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArray) -> Record:
+    return {
+        "mesh_checked": np.array(float(gap is not None)),
+        "mesh_why": _letters(why),
+        "mesh_error": np.full(len(scale), np.nan) if gap is None else gap / scale,
+        "mesh_shift": shift,
+    }
+
+
 def _of_chains(chains: Chains | None) -> Record:
     """What chains are worth, and how many have mixed: none where there are none."""
     if chains is None:
@@ -490,12 +548,17 @@ class Nearby:
         return lambda point: self.state + (point - self.point) @ self.slopes, Reference(self.point, self.state)
 
 
+NOT_LOOKED = Finer(None, "no finer mesh was given")
+
+
 def invert_by_group(
     inputs: Inputs,
     model: ForwardModel,
     data: Components,
     method: Invert,
     look: Look,
+    errors: NormalErrors | StudentErrors = NORMAL,
+    finer: Finer = NOT_LOOKED,
     evaluate: Evaluate | None = None,
 ) -> Record:
     """Invert a data set on the model of one group of ranks, or by an evaluation of it; collective over the group.
@@ -506,12 +569,29 @@ def invert_by_group(
         If the model has no answer where the search needs one.
     """
     solve = evaluate or SerialEvaluate(model)
-    return _invert(inputs, solve, data, method, look, lambda point: Nearby.at(model, point))
+    return _invert(inputs, solve, data, method, look, errors, finer, lambda point: Nearby.at(model, point))
 
 
-def invert_by_all(inputs: Inputs, evaluate: Evaluate, data: Components, method: Invert, look: Look) -> Record:
-    """Invert a data set with all groups of ranks, each of which solves at other points; errors as of the other."""
-    return _invert(inputs, evaluate, data, method, look, lambda point: linearise(inputs, evaluate, point).prediction)
+def invert_by_all(
+    inputs: Inputs,
+    evaluate: Evaluate,
+    data: Components,
+    method: Invert,
+    look: Look,
+    errors: NormalErrors | StudentErrors = NORMAL,
+    finer: Finer = NOT_LOOKED,
+) -> Record:
+    """Invert a data set with all groups of ranks, each of which solves at other points; raises as the other."""
+    return _invert(
+        inputs,
+        evaluate,
+        data,
+        method,
+        look,
+        errors,
+        finer,
+        lambda point: linearise(inputs, evaluate, point).prediction,
+    )
 
 
 def _invert(
@@ -520,10 +600,12 @@ def _invert(
     data: Components,
     method: Invert,
     look: Look,
+    errors: NormalErrors | StudentErrors,
+    finer: Finer,
     start: Callable[[FloatArray], Start | None],
 ) -> Record:
     counted = Recorder(evaluate)
-    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise)
+    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, errors=errors)
     d = len(inputs.names)
     with suppress(SolveError):  # or else every solve begins at zero
         posterior = replace(posterior, start=start(inputs.mean))
@@ -534,7 +616,8 @@ def _invert(
     at = posterior.at(gaussian.mode[None], derivatives=True)
     spectrum = spectrum_of(posterior, at)
     scale = data.sigma * (best[-1] if method.noise is not None else 1.0)
-    residual = (at.outputs[0] - data.values) / scale
+    raw = (at.outputs[0] - data.values) / scale
+    residual = errors.normal_scores(raw)
     test = examine(residual, spectrum, np.ones_like(residual), _pairs(data))
     chains = _chains(posterior, gaussian, found, method)
     verdict = verdict_on_few(gaussian, found, test, chains)
@@ -548,12 +631,23 @@ def _invert(
         weights, points = found.weights, posterior.physical(found.density.x)
         chosen = resampled(weights, method.draws, method.seed)
         draws, outputs = points[chosen], found.density.outputs[chosen]
+    moments = _moments(posterior, gaussian, weights, points, look)
+    gap, why = finer.gap(best[:d], at.outputs[0])
+    shift = np.full(len(best), np.nan)
+    if gap is not None:
+        # Where the residuals r + δ of the finer mesh have their mode, by the curvature at hand.
+        A = spectrum.images.T @ spectrum.vectors
+        pull = A.T @ (np.sqrt(errors.information(raw)) * gap / scale)
+        slopes = inputs.from_normals(gaussian.mode[None, :d])[1][0]
+        shift[:d] = -slopes @ np.linalg.solve(gaussian.hessian[:d, :d], pull) / moments["std"][:d]
     return {
         **_of_data(data, at.outputs[0], residual, scale, spectrum, cases),
         **_of_test(test),
-        **_moments(posterior, gaussian, weights, points, look),
+        **_of_prior(gaussian.mode[:d], spectrum),
+        **_of_mesh(gap, why, scale, shift),
+        **moments,
         **_alone(posterior, gaussian, spectrum, data),
-        **_draws(draws, outputs, data, method),
+        **_draws(draws, outputs, data, method, errors),
         **_of_chains(chains),
         "mode": best,
         "log_evidence": np.array(found.log_evidence),
@@ -631,11 +725,13 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Co
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
 
 
-def _draws(draws: FloatArray, outputs: FloatArray, data: Components, method: Invert) -> Record:
+def _draws(
+    draws: FloatArray, outputs: FloatArray, data: Components, method: Invert, errors: NormalErrors | StudentErrors
+) -> Record:
     """Draws of equal weight with what the data say of each."""
     scale = data.sigma * (draws[:, -1:] if method.noise is not None else 1.0)
     gaps = (outputs - data.values) / scale
-    return {"draw": draws, "draw_log_likelihood": -(gaps**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2}
+    return {"draw": draws, "draw_log_likelihood": -errors.minus_log(gaps) - np.log(scale)}
 
 
 # --- fields ----------------------------------------------------------------------------------------------------------
@@ -657,7 +753,9 @@ class Vertices:
     volumes: FloatArray
 
 
-def invert_field(posterior: FieldPosterior, data: Components, method: Invert, vertices: Vertices) -> Record:
+def invert_field(
+    posterior: FieldPosterior, data: Components, method: Invert, vertices: Vertices, finer: Finer = NOT_LOOKED
+) -> Record:
     """Invert a data set for a field; collective over the group of ranks that has the model.
 
     Raises
@@ -694,11 +792,24 @@ def invert_field(posterior: FieldPosterior, data: Components, method: Invert, ve
     cases = int(data.cases.max()) + 1
     inferred_noise = (factor, log_std) if method.noise is not None else None
     values, weights = _corrected(verdict, weighed, chains, drawn)
+    predicted = np.asarray(mode.point.solution.outputs)
+    mean, stiffness = (
+        _of_mean(found, vertices, inferred_noise, values, weights),
+        _of_stiffness(found, vertices, method, values, weights),
+    )
+    gap, why = finer.gap(mode.point.values, predicted)
+    moved, shift = np.full(len(found.mean), np.nan), np.full(len(mean["mode"]), np.nan)
+    if gap is not None:
+        moved = -(spectrum.images @ (gap / scale) / (1 + spectrum.values)) @ found.directions
+        shift[0] = g @ moved / mean["std"][0]
     return {
-        **_of_data(data, np.asarray(mode.point.solution.outputs), found.residual, scale, spectrum, cases),
+        **_of_data(data, predicted, found.residual, scale, spectrum, cases),
         **_of_test(test),
-        **_of_mean(found, vertices, inferred_noise, values, weights),
-        **_of_stiffness(found, vertices, method, values, weights),
+        **_of_prior(mode.point.noise, spectrum),
+        **_of_mesh(gap, why, scale, shift),
+        **mean,
+        **stiffness,
+        "stiffness_mesh_shift": moved / np.maximum(stiffness["stiffness_std"], 1e-300),
         **_directions(found),
         **_of_chains(chains),
         "log_evidence": np.array(found.log_evidence if log_evidence is None else log_evidence),

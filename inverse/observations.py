@@ -137,11 +137,25 @@ class Observations:
             raise DataError(*mistakes)
         return replace(self, places=moved), distance
 
-    def components(self) -> Components:
-        """Return what was measured, component by component, load case after load case."""
+    def data_labels(self) -> list[str]:
+        """Say of each of the `components` where it stands, at which place, in which load case and along which axis."""
+        which, axes = self._order
+        return [
+            f"{self.labels[i]} at ({', '.join(f'{x:.4g}' for x in self.places[i])}) m, {self.cases[self.case[i]]}, "
+            f"{MOTION[axis]}"
+            for i, axis in zip(which, axes, strict=True)
+        ]
+
+    @property
+    def _order(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Points and axes of what was measured, load case after load case."""
         which, axes = np.nonzero(self.measured)
         order = np.argsort(self.case[which], kind="stable")
-        which, axes = which[order], axes[order]
+        return which[order], axes[order]
+
+    def components(self) -> Components:
+        """Return what was measured, component by component, load case after load case."""
+        which, axes = self._order
         return Components(
             self.places[which],
             axes.astype(np.int64),

@@ -5,7 +5,7 @@ With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) +
     −ln p(y | x) = ½ r·r + Σ ln(s σ_i) + (m/2) ln 2π,   r_i = (ψ_i(ω) − y_i)/(s σ_i),
 
 where s = 1, or is unknown too, with a prior of its own and one more coordinate. The prior of x has no constants that
-depend on the model, so that evidences of different models compare:
+depend on the model, so that evidences of different models compare (for errors with heavy tails see `inverse.errors`):
 
     Z = ∫ p(y | x) N(x; 0, I) dx.
 
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.errors import NORMAL, NormalErrors, StudentErrors
 from uq.distributions import Distribution
 from uq.evaluate import Evaluate, Request, Start
 from uq.inputs import Inputs
@@ -111,6 +112,8 @@ class Posterior:
         Outputs (m,) of the model that were measured, by number.
     start
         Where the solver starts.
+    errors
+        Distribution of the errors over their scale sσ.
     """
 
     inputs: Inputs
@@ -120,6 +123,7 @@ class Posterior:
     noise: Distribution | None = None
     which: tuple[int, ...] | None = None
     start: Start | None = None
+    errors: NormalErrors | StudentErrors = NORMAL
 
     def __post_init__(self) -> None:
         if self.data.shape != self.sigma.shape:
@@ -145,6 +149,7 @@ class Posterior:
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
         """Solve at the points x (n, c)."""
         d, m = len(self.inputs.names), self.data.size
+        errors = self.errors
         n, c = x.shape
         points, slopes = self.inputs.from_normals(x[:, :d])
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
@@ -156,8 +161,7 @@ class Posterior:
             ln_s_slope = s_slope / s
         scale = s[:, None] * self.sigma
         residual = (outputs - self.data) / scale
-        squares = (residual**2).sum(axis=1)
-        misfit = squares / 2 + np.log(scale).sum(axis=1) + m / 2 * np.log(2 * np.pi) + np.log(self.inputs.admitted)
+        misfit = errors.minus_log(residual).sum(axis=1) + np.log(scale).sum(axis=1) + np.log(self.inputs.admitted)
         log_likelihood = np.where(found.ok, -misfit, -np.inf)
         if not derivatives:
             empty = np.zeros((n, 0))
@@ -165,13 +169,15 @@ class Posterior:
         assert found.tangents is not None
         A = np.zeros((n, m, c))
         A[:, :, :d] = found.tangents[:, which] @ slopes / scale[:, :, None]
-        gradient = x + np.einsum("zm,zmc->zc", residual, A)
-        curvature = np.eye(c) + np.einsum("zmc,zme->zce", A, A)
+        score = errors.score(residual)
+        gradient = x + np.einsum("zm,zmc->zc", score, A)
+        curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, errors.information(residual), A)
         if self.noise is not None:
-            # r falls with ln s: d(½ r·r + m ln s)/d ln s = m − r·r; the second derivatives are exact in ln s.
-            gradient[:, d] += (m - squares) * ln_s_slope
-            cross = -2 * np.einsum("zm,zmc->zc", residual, A) * ln_s_slope[:, None]
+            # r falls with ln s: d(Σρ + m ln s)/d ln s = m − r·ψ; the second derivatives are exact in ln s.
+            gradient[:, d] += (m - (residual * score).sum(axis=1)) * ln_s_slope
+            turn = errors.turn(residual)
+            cross = -np.einsum("zm,zmc->zc", turn, A) * ln_s_slope[:, None]
             curvature[:, d, :] += cross
             curvature[:, :, d] += cross
-            curvature[:, d, d] += 2 * squares * ln_s_slope**2
+            curvature[:, d, d] += (residual * turn).sum(axis=1) * ln_s_slope**2
         return Density(x, points, outputs, log_likelihood, found.outputs, found.tangents, gradient, curvature)

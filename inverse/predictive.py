@@ -185,7 +185,9 @@ def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     d = len(posterior.inputs.names)
     assert at.tangents is not None
     which = slice(None) if posterior.which is None else list(posterior.which)
-    A = at.tangents[0][which] @ posterior.inputs.from_normals(at.x[:, :d])[1][0] / _scale(posterior, at.x)[:, None]
+    scale = _scale(posterior, at.x)
+    root = np.sqrt(posterior.errors.information((at.outputs[0] - posterior.data) / scale))
+    A = at.tangents[0][which] @ posterior.inputs.from_normals(at.x[:, :d])[1][0] * (root / scale)[:, None]
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T
     return Spectrum(values, vectors, vectors @ A.T, np.zeros(d), 0.0, d)
@@ -194,7 +196,7 @@ def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
 def examine_few(posterior: Posterior, gaussian: Laplace, neighbours: Neighbours | None = None) -> ResidualTest:
     """Test the residuals of few parameters at the mode: a solve with derivatives."""
     at = posterior.at(gaussian.mode[None], derivatives=True)
-    residual = (at.outputs[0] - posterior.data) / _scale(posterior, at.x)
+    residual = posterior.errors.normal_scores((at.outputs[0] - posterior.data) / _scale(posterior, at.x))
     return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)
 
 

@@ -389,31 +389,78 @@ def test_two_ranks_give_the_same_bytes(folder):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(
-    ("study", "tasks"),
-    [("field.toml", 1), ("made.toml", 2)],
+    ("study", "tasks", "code"),
+    [("field.toml", 1, 3), ("made.toml", 2, 0)],  # the mesh of the field is too coarse, which is found
 )
-def test_fewer_tasks_than_ranks(folder, study, tasks):
+def test_fewer_tasks_than_ranks(folder, study, tasks, code):
     one, two = (folder / f"{study}-{ranks}" for ranks in (1, tasks + 1))
     done = [
         run_script(ranks, WITHOUT_REPORT, "run", folder / study, "--out", out, "--quiet")
         for ranks, out in ((None, one), (tasks + 1, two))
     ]
-    assert [each.returncode for each in done] == [0, 0], done[1].stderr
+    assert [each.returncode for each in done] == [code, code], done[1].stderr
     assert f"{tasks + 1} groups of ranks were started for {tasks} tasks: 1 have nothing to do" in done[1].stderr
     assert (one / "results.nc").read_bytes() == (two / "results.nc").read_bytes()
 
 
 def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     monkeypatch.setattr(study_runs, "_report", lambda directory: None)
-    assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']") == 0
+    # On two cells along an edge: the program finds itself that they are too few.
+    assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']") == 3
     summary = json.loads((folder / "single" / "summary.json").read_text())
     assert summary["evaluations"] > 32
     assert set(summary["posterior"]) == {"inclusions.lump.contrast", "material.mu"}
     assert summary["log_evidence_error"] < 1
+    assert summary["verdict"].startswith("not to be trusted: ")
+    said = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert any("a finer mesh moves the data by" in text and "material.mu +" in text for text in said)
     arviz = pytest.importorskip("arviz")
     kept = arviz.from_netcdf(folder / "single" / "results.nc")
     assert kept.posterior["material.mu"].shape == (1, 50)
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
+
+
+@pytest.mark.mpi
+def test_all_groups_share_one_data_set(folder):
+    """The same bytes as of one rank, the solve on the finer mesh among them."""
+    assert (folder / "single").exists()  # of the test before
+    changes = ("--set", "data.files=['data/made-1.csv']")
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "shared", "--quiet", *changes)
+    assert done.returncode == 3, done.stderr
+    assert (folder / "single/results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
+
+
+def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    changes = ("data.files=['data/made-2.csv']", "method.mesh_check=false", "model.body.cells=[3,3,3]")
+    here(folder / "few.toml", folder / "unchecked", *changes)
+    summary = json.loads((folder / "unchecked" / "summary.json").read_text())
+    assert "not checked for the mesh" in summary["verdict"]
+    assert {"severity": "warning", "text": "made-2: not checked for the mesh: method.mesh_check = false."} in summary[
+        "findings"
+    ]
+    assert any("nothing will be said to be trusted" in line for line in plan(load(folder / "few.toml", changes)))
+    assert any("mesh check  one solve of 192 displ" in line for line in plan(load(folder / "few.toml")))
+
+
+def test_what_is_strange_is_said_with_the_inversion(folder, monkeypatch):
+    """Data that do not belong by their line, and the end of a range, on the mesh that made the data."""
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    rows = (folder / "data" / "made-1.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(rows) if line.startswith("1,"))
+    cells = rows[first].split(",")
+    cells[3] = str(float(cells[3]) + 20 * float(cells[6]))
+    (folder / "strange.csv").write_text("\n".join([*rows[:first], ",".join(cells), *rows[first + 1 :]]))
+    changes = ("data.files=['strange.csv']", "model.body.cells=[3,3,3]", "method.mesh_check=false")
+    contrast = "parameters.inclusions.lump.contrast={ kind = 'log-uniform', lower = 1, upper = 2 }"
+    for out, more in (("strange", ()), ("narrow", (contrast,))):
+        assert here(folder / "few.toml", folder / out, *changes, *more) == 3
+    strange, narrow = (
+        [one["text"] for one in json.loads((folder / out / "summary.json").read_text())["findings"]]
+        for out in ("strange", "narrow")
+    )
+    assert any(f"strange.csv: line {first + 1} at (1, " in text and "1 datum does not" in text for text in strange)
+    assert any("inclusions.lump.contrast is at the upper end of its range (2)" in text for text in narrow)
 
 
 def test_volumes_of_inclusions(folder):
@@ -459,7 +506,7 @@ def test_chains_are_those_of_arviz(folder):
 
 
 def test_a_field_and_its_report(folder):
-    assert here(folder / "field.toml", folder / "field") == 0
+    assert here(folder / "field.toml", folder / "field") == 3
     found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
     assert found.sizes["node"] == 27
     assert (found["stiffness_std"] < found["stiffness_prior_std"]).all()

@@ -24,10 +24,12 @@ from forward.hyperelastic import Mistake
 from forward.inclusions import Inclusion, derived
 from forward.settings import Settings, nearest
 from forward.specimen import Specimen
+from inverse.errors import NORMAL, Errors
 from inverse.inversion import ENDS, Invert, Synthesize, names_of, sentence, variables
 from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
+from workflows import verdict
 from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
 from workflows.priors import findings_of_materials, mistakes_of_materials
 
@@ -80,6 +82,8 @@ class DataFiles(Settings):
     tolerance
         How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are taken at the
         nearest place of it, and counted.
+    errors
+        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } where a few data may be far off.
     truth
         By path: what is inside, where that is known beside what the files say of it.
     sets
@@ -90,6 +94,7 @@ class DataFiles(Settings):
     sigma: Annotated[float, Field(gt=0)] | None = None
     unit: Annotated[float, Field(gt=0)] = 1.0
     tolerance: Annotated[float, Field(ge=0)] | None = None
+    errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
 
@@ -280,6 +285,9 @@ class Inversion(Settings):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
                 yield ("method", "chains"), message, self.method.chains
+        if nodal and self.data.errors.kind != "normal":
+            message = "errors of a field are normal, expected { kind = 'normal' }, or few parameters"
+            yield ("data", "errors"), message, self.data.errors.kind
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         materials = self.model.materials(self.parameters)
@@ -439,6 +447,7 @@ def dataset(
     places, cells, kind = vertices
     held: dict[str, Any] = {name: (("data_set", *layout.dims[name]), record[name]) for name in layout.dims}
     held["why"] = ("data_set", [reasons.get(k) or sentence(letters) for k, letters in enumerate(record["why"])])
+    held["mesh_why"] = ("data_set", [sentence(letters) for letters in record["mesh_why"]])
     held["ok"] = ("data_set", [k not in reasons for k in range(len(rows))])
     found = list(study.measurements)
     count = len(found)
@@ -626,7 +635,7 @@ class Rows:
             data = self._study.data.model_copy(update={"sets": (sets,)})
             alone = self._study.model_copy(update={"data": data, "measurements": (measurements,)})
             why = {0: reasons[i]} if i in reasons else {}
-            found = dataset(alone, row[None], why, self._vertices, self._layout)
+            found = verdict.judged(dataset(alone, row[None], why, self._vertices, self._layout), alone)
             self._head, line = batch_table(found).splitlines()
             self._lines[number] = line
             solves += float(np.nansum(found["solves"]))

@@ -25,7 +25,7 @@ DIRECTIONS = 10  # of few parameters that a table lists
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
 SMALL = 1e-3  # volume (m³) that is rather written in cm³
-TRUSTED = ("Laplace's", "corrected", "not to be trusted")
+TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
 DRAWN = 8  # data sets that have more than a row of the table
 Density = tuple[FloatArray, FloatArray]
 SEEN = 1.0  # λ above which the data say more of a direction than the prior
@@ -70,7 +70,7 @@ def _of_set(one: xr.Dataset, before: dict[str, Density], *, several: bool) -> di
     return {
         "name": str(one.data_set.item()),
         "verdict": str(one["why"].item()) if several else None,
-        "trusted": int(one["trust"]) == 0,
+        "trusted": int(one["trust"]) <= 1,
         "amounts": list(amounts(one)),
         "posterior": posterior(one),
         "cases": cases(one),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from forward.finer import finer
 from forward.hyperelastic import Hyperelastic
 from forward.own_mesh import OwnMesh
 from uq.multilevel import MultilevelMonteCarlo
@@ -118,6 +119,15 @@ def _inversion(study: Inversion) -> list[str]:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
         seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
+    checked = "not asked for: nothing will be said to be trusted"
+    if study.method.mesh_check:
+        try:
+            unknowns = 8 * spec.unknowns if isinstance(spec.body, OwnMesh) else finer(spec).unknowns
+            once = seconds_per_solve(unknowns) * len(spec.cases) * TEXTBOOK
+            seconds += once
+            checked = f"one solve of {unknowns:,} displacements, about {_duration(once)}"
+        except ValueError as error:
+            checked = f"not possible: {error}; nothing will be said to be trusted"
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
@@ -125,6 +135,7 @@ def _inversion(study: Inversion) -> list[str]:
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
         *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
+        f"mesh check  {checked}",
         f"time        about {_duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]

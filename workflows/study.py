@@ -44,9 +44,12 @@ from workflows.results import (
 
 if TYPE_CHECKING:
     import xarray as xr
+    from numpy.typing import NDArray
 
+    from forward.finer import FinerMesh
     from forward.finite_element import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
+    from forward.specimen import SpecimenModel
     from uq.checkpoint import Checkpoint
     from uq.ensemble import Ensemble
     from uq.inputs import Inputs
@@ -301,7 +304,7 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
-        add(found, *verdict.findings(found))
+        add(found, *verdict.findings(found), *verdict.doubts_of_selection(found, study))
         return found
 
     return _Job(
@@ -309,18 +312,54 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     )
 
 
+@dataclass(frozen=True)
+class _Specimen:
+    """What inversions of a specimen need of it; making it is collective over the group.
+
+    Attributes
+    ----------
+    model
+        The specimen.
+    vertices
+        Places (N, 3) of its vertices, cells, and VTK's number of their kind.
+    look
+        Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices.
+    mesh
+        The specimen on a finer mesh, or `why` there is none.
+    """
+
+    model: SpecimenModel
+    vertices: tuple[FloatArray, NDArray[np.int64], int]
+    look: Callable[[FloatArray], FloatArray]
+    mesh: FinerMesh | None
+    why: str
+
+    @classmethod
+    def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
+        model = study.model.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
+        vertices = (model.vertices.coordinates, *model.vertices.cells())
+
+        def look(points: FloatArray) -> FloatArray:
+            return study.stiffness(vertices[0], points) + model.log_fields(points)
+
+        mesh, why = _finer(model) if study.method.mesh_check else (None, "method.mesh_check = false")
+        return cls(model, vertices, look, mesh, why)
+
+
 def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> _Job:
     """One data set, whose solves all groups share, or data sets side by side; collective over the group."""
+    if study.together:
+        return _inversion_by_all(study, ensemble)
     from forward.model import SolveError
     from inverse.field_posterior import FieldPosterior
-    from inverse.inversion import Inversions, Vertices, invert_by_all, invert_by_group, invert_field
+    from inverse.inversion import Finer, Inversions, Vertices, invert_by_group, invert_field
     from uq.evaluate import Request
     from uq.kept import KeptEvaluate
     from workflows import inversion
 
-    method = study.method
-    model = study.model.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
-    vertices = (model.vertices.coordinates, *model.vertices.cells())
+    method, errors = study.method, study.data.errors
+    specimen = _Specimen.of(study, ensemble)
+    model, vertices = specimen.model, specimen.vertices
     layout = study.variables
     prior = study.model.fields[0].prior(study.model.body) if study.field else None
     recorders: dict[str, Recorder] = {}
@@ -333,9 +372,6 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
         if kept:
             ensemble.count(solves, 0)
 
-    def look(points: FloatArray) -> FloatArray:
-        return study.stiffness(vertices[0], points) + model.log_fields(points)
-
     def invert(parameters: FloatArray) -> FloatArray:
         number = int(parameters[0])
         if study.measurements[number] is None:
@@ -343,23 +379,20 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
         data = study.measurements[number].observations.components()
         try:
             observed = model.observing(data.places, data.axes, data.cases)
-        except ValueError as error:  # a place that no cell has, by rounding: the other data sets go on
+        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
+        finer = Finer(None if specimen.mesh is None else partial(specimen.mesh.outputs, observed), specimen.why)
         if done:
             done.pop().forget()  # what follows from these solves is kept by now
         if prior is None:
             name = study.data.sets[number].name
-            done.append(KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count))
-            return layout.pack(invert_by_group(study.inputs, observed, data, method, look, done[0]))
+            kept = KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count)
+            done.append(kept)
+            found = invert_by_group(study.inputs, observed, data, method, specimen.look, errors, finer, kept)
+            return layout.pack(found)
         posterior = FieldPosterior(observed, data.values, data.sigma, prior, progress=ensemble.count)
         offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
-        return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass)))
-
-    def one(evaluate: Evaluate) -> xr.Dataset:
-        recorders["/"] = Recorder(evaluate)
-        data = study.measurements[0].observations.components()
-        row = layout.pack(invert_by_all(study.inputs, recorders["/"], data, method, look))
-        return inversion.dataset(study, row[None], {}, vertices)
+        return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer))
 
     def many(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
@@ -369,27 +402,67 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
             raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
         return inversion.dataset(study, found.outputs, reasons, vertices)
 
-    first: ForwardModel = Inversions(invert, ("data_set",), layout.names)
-    if study.together:
-        data = study.measurements[0].observations.components()
-        first = model.observing(data.places, data.axes, data.cases)
     return _Job(
-        first,
+        Inversions(invert, ("data_set",), layout.names),
         [],
-        one if study.together else many,
+        many,
         recorders,
-        _judged,
+        lambda found: verdict.judged(found, study),
         groups=partial(inversion.groups, study),
         texts=lambda found: {BATCH: inversion.batch_table(found)},
-        arrived=(lambda block, kept: None) if study.together else arrived,
-        counted=study.together,
+        arrived=arrived,
+        counted=False,
     )
 
 
-def _judged(found: xr.Dataset) -> xr.Dataset:
-    """Say of each data set what stands and what does not."""
-    add(found, *verdict.findings_of_inversion(found))
-    return found
+def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
+    """One data set, whose solves all groups share; collective over the group."""
+    from forward.model import FunctionModel, SolveError
+    from inverse.inversion import Finer, invert_by_all
+    from uq.evaluate import Request
+    from workflows import inversion
+
+    specimen = _Specimen.of(study, ensemble)
+    data = study.measurements[0].observations.components()
+    observed = specimen.model.observing(data.places, data.axes, data.cases)
+    recorders: dict[str, Recorder] = {}
+    others: list[Callable[[], ForwardModel]] = []
+    if specimen.mesh is not None:
+        outputs = partial(specimen.mesh.outputs, observed)
+        others = [lambda: FunctionModel(outputs, observed.parameters, observed.outputs)]
+
+    def on_finer_mesh(point: FloatArray) -> FloatArray:
+        found = recorders["/"].on(1)(Request(point[None]))
+        for failure in found.failures:
+            raise SolveError(failure.reason)
+        return np.asarray(found.outputs[0])
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        finer = Finer(on_finer_mesh if others else None, specimen.why)
+        errors = study.data.errors
+        found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
+        return inversion.dataset(study, study.variables.pack(found)[None], {}, specimen.vertices)
+
+    return _Job(
+        observed,
+        others,
+        task,
+        recorders,
+        lambda found: verdict.judged(found, study),
+        groups=partial(inversion.groups, study),
+        texts=lambda found: {BATCH: inversion.batch_table(found)},
+    )
+
+
+def _finer(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
+    """Return a specimen on a finer mesh, or why there is none."""
+    from forward.finer import FinerMesh
+
+    try:
+        return FinerMesh(model), ""
+    except ValueError as error:  # a mesh that is not divided, or would be too large
+        return None, str(error)
 
 
 def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:

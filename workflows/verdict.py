@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding
-from inverse.weights import worth
+from forward.model import Finding, Severity
+from uq.findings import add
 from workflows.words import number, with_error
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from inverse.criticism import Doubt
+    from uq.distributions import Distribution
     from uq.evaluate import Evaluations
+    from workflows.inversion import Inversion
+    from workflows.selection import Comparison
 
+DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
 GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
 
@@ -95,6 +100,8 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
 
 def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
     """Evidences that cannot be trusted, each with what its weights are worth."""
+    from inverse.weights import worth
+
     found = []
     for model in order:
         for group in dataset.group.values:
@@ -106,15 +113,111 @@ def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
     return found
 
 
-def findings_of_inversion(dataset: xr.Dataset) -> list[Finding]:
-    """Say of each data set what stands and what does not."""
-    said = []
-    for name in dataset.data_set.values:
-        one = dataset.sel(data_set=name)
-        words, ok = str(one["why"].item()), bool(one["ok"])
-        text = f"{name}: {words}" if ok else f"{name} could not be inverted: {words}"
-        said.append(Finding("note" if ok and int(one["trust"]) == 0 else "warning", text))
+def doubts_of_selection(dataset: xr.Dataset, study: Comparison) -> list[Finding]:
+    """Say what is doubtful of the most probable candidate: its constants, its errors, and data that do not belong."""
+    from inverse import criticism
+    from inverse.weights import resampled
+
+    best = ranking(dataset["log_evidence"])[0]
+    inputs, noise = study.candidates[best].inputs, study.method.noise.factor
+    names = list(inputs.names)
+    said: list[Finding] = []
+    for group in map(str, dataset.group.values):
+        of = dataset.sel(model=best, group=group)
+        mode, mean = (of[f"constant_{name}"].sel(parameter=names).to_numpy() for name in ("mode", "mean"))
+        weights = of["point_weight"].to_numpy()
+        draws = of["point"].sel(parameter=names).transpose("point", "parameter").to_numpy()
+        draws = draws[resampled(weights, DRAWS, 0)]
+        found = criticism.at_an_end(inputs.marginals, mode, draws)
+        found += criticism.far_from_prior(inputs.marginals, mode, mean, 0.0, 0.0)
+        here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
+        rows = dataset.isel(output=here)
+        values, sigma, factor = rows["measured"].to_numpy(), rows["sigma"].to_numpy(), 1.0
+        if noise is not None:
+            factor = float(of["constant_mode"].sel(parameter="noise"))
+            found += criticism.noise_far(factor, noise.at(0.5), sigma, values)
+        residual = (rows["prediction_mean"].sel(model=best).to_numpy() - values) / (factor * sigma)
+        labels = [
+            f"{test} at {number(float(at), 4)}"
+            for test, at in zip(rows["output_test"].values, rows["output_at"].values, strict=True)
+        ]
+        found += criticism.strangers(residual, np.zeros(len(residual)), labels, heavy=False, remedy="")
+        where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
+        said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
     return said
+
+
+NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md
+SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
+
+
+def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
+    """Look for all that makes the posteriors of an inversion doubtful; return the results with verdicts that say so."""
+    words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
+    said: list[Finding] = []
+    for k, name in enumerate(dataset.data_set.values):
+        if not bool(dataset["ok"][k]):
+            said.append(Finding("warning", f"{name} could not be inverted: {words[k]}"))
+            continue
+        doubts = doubts_of(dataset.isel(data_set=k), study, k)
+        words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
+        said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
+        said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
+    found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
+    add(found, *said)
+    return found
+
+
+def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
+    """Return the sentence and the number of a verdict, given what it was before anything was doubted."""
+    errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
+    warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
+    if trust == NEITHER:
+        return "; ".join([words, *errors, *warnings]), NEITHER
+    if errors:
+        return f"not to be trusted: {'; '.join([*errors, *warnings])}", NEITHER
+    if warnings:
+        return f"doubtful: {'; '.join(warnings)}; but for that, {words[0].lower()}{words[1:]}", DOUBTFUL
+    return words, trust
+
+
+def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
+    """Say what is doubtful of one data set, by its number."""
+    from inverse import criticism
+    from uq.distributions import Normal
+
+    found: list[Doubt] = []
+    names = [str(name) for name in one.parameter.values]
+    mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
+    square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
+    d = len(names) - (study.method.noise is not None)
+    if study.field:
+        centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
+        priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
+    else:
+        priors = dict(study.inputs.marginals)
+        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d])
+    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees)
+    seen = np.isfinite(one["measured"].to_numpy())
+    residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
+    if study.method.noise is not None:
+        sigma, measured = one["sigma"].to_numpy()[seen], one["measured"].to_numpy()[seen]
+        found += criticism.noise_far(float(mode[-1]), study.method.noise.at(0.5), sigma, measured)
+    else:
+        found += criticism.too_large_errors(
+            *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
+        )
+    labels = study.measurements[number].observations.data_labels()
+    found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
+    if int(one["points_moved"]):
+        count, farthest = int(one["points_moved"]), float(one["largest_move"])
+        points = "1 point" if count == 1 else f"{count} points"
+        moved = f"{points} outside the body moved to its surface, by up to {farthest:.2g} m"
+        found.append(criticism.Doubt("note", moved, ""))
+    shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
+    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
+    why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
+    return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)
 
 
 def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
