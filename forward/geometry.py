@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
 from pydantic import BeforeValidator, Field, model_validator
 
-from forward.model import FloatArray
+from forward.model import Finding, FloatArray
 from forward.own_mesh import OwnMesh
 from forward.settings import Settings
 
@@ -20,6 +21,7 @@ AXES: tuple[Axis, ...] = ("x", "y", "z")
 Length = Annotated[float, Gt(0)]
 Count = Annotated[int, Gt(0)]
 Vector = tuple[float, float, float]
+ROUNDING = 1e-6  # of that distance: a move that is none
 NEARBY = 1e-3  # of the diagonal of a body: distance from it that is an inaccuracy of places
 
 
@@ -369,13 +371,32 @@ def tolerance(body: Body) -> float:
     return NEARBY * float(np.linalg.norm([high - low for low, high in body.bounds]))
 
 
+def outside(body: Body, point: Vector) -> float:
+    """How far (m) a point lies outside the undeformed body; of a mesh from a file, outside the box around it."""
+    if body.contains(point):
+        return 0.0
+    at = np.array([point])
+    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, OwnMesh) else body.nearest(at)
+    return float(np.linalg.norm(place - at))
+
+
+def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...]:
+    """Say how far points (m), by name, that lie outside a body are moved to it."""
+    distances = {name: outside(body, point) for name, point in points.items()}
+    far = {name: distance for name, distance in distances.items() if distance > ROUNDING * tolerance(body)}
+    if not far:
+        return ()
+    name = max(far, key=far.__getitem__)
+    moved = (
+        f"{len(far)} points lie outside the body and are" if len(far) > 1 else "1 point lies outside the body and is"
+    )
+    text = f"{moved} moved to its surface, by up to {far[name]:.2g} m ('{name}')."
+    return (Finding("note", text),)
+
+
 def holds(body: Body, point: Vector) -> bool:
     """Whether a point (m) lies in the undeformed body, or no farther outside than `tolerance`.
 
     Of a mesh from a file the box around it is looked at; where the mesh is made, the point must be near a cell.
     """
-    if body.contains(point):
-        return True
-    at = np.array([point])
-    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, OwnMesh) else body.nearest(at)
-    return bool(np.linalg.norm(place - at) <= tolerance(body))
+    return outside(body, point) <= tolerance(body)

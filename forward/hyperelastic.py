@@ -15,7 +15,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.admissible import Materials
 from forward.fields import RandomField
-from forward.geometry import AXES, Body, Vector, holds
+from forward.geometry import AXES, Body, Vector, holds, moved_points
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
 from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
@@ -263,7 +263,12 @@ class Hyperelastic(Settings):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the body before anything is solved."""
-        return (*(Finding("warning", text) for text in self.body.warnings), *too_narrow(self.body, self.inclusions))
+        points = {output.name: output.at for output in self.outputs if isinstance(output, PointDisplacement)}
+        return (
+            *(Finding("warning", text) for text in self.body.warnings),
+            *too_narrow(self.body, self.inclusions),
+            *moved_points(self.body, points),
+        )
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""

@@ -35,6 +35,17 @@ def mistakes(**changes):
     return {".".join(map(str, line["loc"])): line["msg"] for line in error.value.errors()}
 
 
+def test_points_within_a_thousandth_are_moved_and_that_is_said():
+    def at(*points):
+        outputs = [{"kind": "displacement", "name": f"u{k}", "at": p, "component": "x"} for k, p in enumerate(points)]
+        return Hyperelastic.model_validate(BLOCKS | {"outputs": outputs}).findings
+
+    assert not at((1.0, 0.5, 0.5), (1.0 + 1e-15, 0.5, 0.5))
+    (note,) = at((1.001, 0.5, 0.5), (0.5, 0.5, -2e-4), (0.1, 0.1, 0.1))
+    assert note.severity == "note"
+    assert note.text == "2 points lie outside the body and are moved to its surface, by up to 0.001 m ('u0')."
+
+
 def test_the_specification_without_mistakes_is_accepted():
     assert Hyperelastic.model_validate(BLOCKS).unknowns == 3 * 5**3
 
