@@ -18,7 +18,8 @@ from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector, holds, moved_points
 from forward.inclusions import Inclusion
 from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
-from forward.materials import MATERIALS, constants, measures, small_strain_moduli, splits
+from forward.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.materials import MATERIALS, constants, measures, splits
 from forward.model import Finding
 from forward.newton import SolverSettings
 from forward.outputs import Output, PointDisplacement, Reaction
@@ -64,11 +65,6 @@ else:
         Field(discriminator="kind"),
     ]
 
-
-# κ/μ above which "auto" takes the mixed form (ν = 0.49). On a cantilever of 10 × 2 × 2 quadratic hexahedra the
-# displacement form is 4 % too stiff at 30, 5 % at 50 and 6 % beyond, and needs load steps from 100 on, while the mixed
-# form is right to 1 %; its Newton steps cost a third more.
-NEARLY_INCOMPRESSIBLE = 50.0
 
 Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
 
@@ -168,12 +164,12 @@ class Hyperelastic(Settings):
         Path, tolerance and limits of the solver; its kind alone may be given as a word, `solver = "newton"`.
     formulation
         Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
-        and a material with a constant D1). "auto" is mixed where that is possible and κ/μ of the constants as given
-        (whatever the values of parameters) is above 50.
+        and a material with a constant D1). "auto" is mixed where that is possible and κ/μ may be above 3: over all
+        values of the inputs in a study, with the constants as given elsewhere.
     """
 
     kind: Literal["hyperelastic"] = "hyperelastic"
-    formulation: Literal["displacement", "mixed", "auto"] = "auto"
+    formulation: Formulation = "auto"
     body: Body
     material: Material
     regions: dict[str, dict[str, float]] = Field(default={})
@@ -235,14 +231,24 @@ class Hyperelastic(Settings):
     @property
     def mixed(self) -> bool:
         """Whether pressures are unknowns too."""
-        if self.formulation != "auto":
-            return self.formulation == "mixed"
-        if self.body.degree < 2 or not self._splits:
-            return False
-        values = {name: getattr(self.material, name) for name in constants(MATERIALS[self.energy])}
-        of_regions = [values | {k: v for k, v in own.items() if k != CONTRAST} for own in self.regions.values()]
-        moduli = [small_strain_moduli(self.energy, numbers) for numbers in (values, *of_regions)]
-        return any(kappa > NEARLY_INCOMPRESSIBLE * mu for mu, kappa in moduli)
+        return self.decision({}).mixed
+
+    def decision(self, ranges: Ranges) -> Decision:
+        """Return the formulation for values of parameters within ranges, by their paths, and why it is taken."""
+        return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
+
+    def over(self, ranges: Ranges) -> Self:
+        """Return the same body with the formulation that suits all values of parameters within ranges."""
+        return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
+
+    def locking(self, ranges: Ranges) -> Iterator[Finding]:
+        """Find where displacements alone are too stiff for values of parameters within ranges."""
+        yield from of_locking(self.decision(ranges), self.body.cell, self.body.degree, self.materials(ranges))
+
+    def unlocked(self) -> Self:
+        """Return the same body on the same mesh in the form that locks least."""
+        body = self.body.model_copy(update={"degree": 2, "quadrature_degree": None})
+        return self.model_copy(update={"body": body, "formulation": "mixed" if self._splits else "displacement"})
 
     @property
     def _splits(self) -> bool:

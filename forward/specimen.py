@@ -10,7 +10,7 @@ import copy
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from forward.geometry import AXES, Body, Vector, holds, tolerance
 from forward.hyperelastic import Hyperelastic, Material, Scalar, materials
 from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
+from forward.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.materials import splits
 from forward.model import Finding, FloatArray, Reference, SolveError, Work
 from forward.newton import SolverSettings
 from forward.outputs import Output
@@ -117,7 +119,7 @@ class Specimen(Settings):
     inclusions: tuple[Inclusion, ...] = ()
     fields: tuple[RandomField, ...] = ()
     solver: SolverSettings = SolverSettings()
-    formulation: Literal["displacement", "mixed", "auto"] = "auto"
+    formulation: Formulation = "auto"
     cases: tuple[LoadCase, ...] = Field(min_length=1)
     observed: tuple[Observed, ...] = ()
 
@@ -147,6 +149,23 @@ class Specimen(Settings):
     def materials(self, parameters: Collection[str] = ()) -> Materials:
         """Return the materials of the body and of its regions as functions of some of its numbers, by their paths."""
         return materials(self.material, self.regions, parameters)
+
+    def decision(self, ranges: Ranges) -> Decision:
+        """Return the formulation for values of parameters within ranges, by their paths, and why it is taken."""
+        return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
+
+    @property
+    def mixable(self) -> bool:
+        """Whether it can have pressures as unknowns."""
+        return self.body.degree > 1 and splits(self.loaded(self.cases[0]).energy)
+
+    def over(self, ranges: Ranges) -> Self:
+        """Return the same specimen with the formulation that suits all values of parameters within ranges."""
+        return self.model_copy(update={"formulation": "mixed" if self.decision(ranges).mixed else "displacement"})
+
+    def locking(self, ranges: Ranges) -> Iterator[Finding]:
+        """Find where displacements alone are too stiff for values of parameters within ranges."""
+        yield from of_locking(self.decision(ranges), self.body.cell, self.body.degree, self.materials(ranges))
 
     @property
     def coefficients(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from forward.settings import Settings
 from uq.quadrature import Cut, panels
 
 PositiveFloat = Annotated[float, Gt(0)]
+RARE = 1e-4  # probability of what is beyond the range of a distribution with a tail
 TAIL = 1e-16  # nearest to 0 and 1 that a probability is taken to a quantile
 NARROW = 1e-10  # standard deviation over the mean below which rounding of the parameter shows in results
 WIDE = 10.0  # ratio of the quantiles at 10⁻⁴ and 1 − 10⁻⁴ from which polynomials are of the logarithm
@@ -101,6 +102,11 @@ class _Distribution(Settings):
     def support(self) -> tuple[float, float] | None:
         """Ends of a bounded range; None for a distribution with tails."""
         return None
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Ends of the support or, of tails, the quantiles that one of ten thousand samples is beyond."""
+        return self.support or (self.at(RARE), self.at(1 - RARE))
 
     @cached_property
     def logarithmic(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -13,6 +14,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
 from forward.hyperelastic import Hyperelastic, Mistake, Scalar
+from forward.locking import Decision
 from forward.model import Finding, ModelError
 from forward.settings import Settings, nearest
 from uq.compare import TIGHTER, Compare, Given, Sampling
@@ -110,10 +112,16 @@ class Study(Settings):
         """The random parameters, of which some may be of no material."""
         return self.inputs if self.body is None else self.inputs.within(self.body.materials(self.inputs.names))
 
-    @property
+    @cached_property
     def body(self) -> Hyperelastic | None:
-        """The model, if it is a body."""
-        return self.model if isinstance(self.model, Hyperelastic) else None
+        """The model, if it is a body, in the formulation that suits all values of its parameters."""
+        return self.model.over(ranges(self.parameters)) if isinstance(self.model, Hyperelastic) else None
+
+    @property
+    def decision(self) -> Decision:
+        """Which unknowns the body has, and why."""
+        assert isinstance(self.model, Hyperelastic)
+        return self.model.decision(ranges(self.parameters))
 
     @property
     def meshes(self) -> tuple[Hyperelastic, ...]:
@@ -126,15 +134,15 @@ class Study(Settings):
     @property
     def models(self) -> tuple[Hyperelastic | PythonModel | UmBridgeModel, ...]:
         """The models that the method may ask for, in the order of their numbers."""
-        if not isinstance(self.model, Hyperelastic):
+        if isinstance(self.model, PythonModel | UmBridgeModel) or self.body is None:
             return (self.model,) * 3 if isinstance(self.method, Compare) else (self.model,)
         if not isinstance(self.method, Compare):
             return self.meshes
-        solver = self.model.solver
+        solver = self.body.solver
         tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
         tight, textbook = (solver.model_copy(update=change) for change in (tolerances, {"kind": "newton"}))
-        others = [self.model.model_copy(update={"solver": changed}) for changed in (tight, textbook)]
-        return self.model, *others, *([self.model.refined(1)] if self.method.mesh_error else [])
+        others = [self.body.model_copy(update={"solver": changed}) for changed in (tight, textbook)]
+        return self.body, *others, *([self.body.refined(1)] if self.method.mesh_error else [])
 
     @property
     def planned(self) -> int:
@@ -144,7 +152,10 @@ class Study(Settings):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the study before anything is solved."""
-        return () if self.body is None else (*self.body.findings, *findings_of_draws(self._restricted))
+        if not isinstance(self.model, Hyperelastic):
+            return ()
+        locking = self.model.locking(ranges(self.parameters))
+        return (*self.model.findings, *locking, *findings_of_draws(self._restricted))
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -222,6 +233,11 @@ class Study(Settings):
             if set(given) != set(outputs):
                 message = f"expected values of every output: {', '.join(outputs)}"
                 yield ("method", "reference", "values"), message, list(given)
+
+
+def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of parameters, by their paths."""
+    return {path: distribution.range for path, distribution in parameters.items()}
 
 
 def refused(title: str, mistakes: Sequence[Mistake]) -> None:

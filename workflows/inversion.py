@@ -30,7 +30,15 @@ from inverse.observations import DataError, Observations, files, read
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from workflows import verdict
-from workflows.config import Correlation, Parallel, StudyError, mistakes_of_factor, mistakes_of_parameters, refused
+from workflows.config import (
+    Correlation,
+    Parallel,
+    StudyError,
+    mistakes_of_factor,
+    mistakes_of_parameters,
+    ranges,
+    refused,
+)
 from workflows.priors import findings_of_materials, mistakes_of_materials
 
 if TYPE_CHECKING:
@@ -167,10 +175,16 @@ class Inversion(Settings):
 
     __hash__ = None  # type: ignore[assignment]
 
+    @cached_property
+    def specimen(self) -> Specimen:
+        """The specimen, in the formulation that suits all values of its parameters."""
+        specimen: Specimen = self.model.over(ranges(self.parameters))
+        return specimen
+
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimen before anything is solved."""
-        return (*self.model.findings, *findings_of_materials(self.inputs))
+        return (*self.model.findings, *self.model.locking(ranges(self.parameters)), *findings_of_materials(self.inputs))
 
     @property
     def field(self) -> bool:
@@ -328,10 +342,16 @@ class Synthesis(Settings):
     method: Synthesize
     parallel: Parallel = Parallel()
 
+    @cached_property
+    def specimen(self) -> Specimen:
+        """The specimen, in the formulation that suits all values of its parameters."""
+        specimen: Specimen = self.model.over(ranges(self.parameters))
+        return specimen
+
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimen before anything is solved."""
-        return self.model.findings
+        return (*self.model.findings, *self.model.locking(ranges(self.parameters)))
 
     @cached_property
     def inputs(self) -> Inputs:

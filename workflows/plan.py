@@ -9,10 +9,11 @@ from forward.hyperelastic import Hyperelastic
 from forward.own_mesh import OwnMesh
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
-from workflows.config import Study
+from workflows.config import Study, ranges
 
 if TYPE_CHECKING:
     from forward.geometry import Body
+    from forward.locking import Decision
     from workflows.config import AnyStudy
     from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Comparison
@@ -56,6 +57,7 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
         f"method      {method.kind}",
         *_found(body),
         f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
+        _formulation(study.decision),
         *(
             f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
             for k, (size, s) in enumerate(zip(sizes, each, strict=True))
@@ -68,6 +70,11 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
     ]
+
+
+def _formulation(decision: Decision) -> str:
+    """Say which formulation is taken, and why."""
+    return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
 
 def _found(body: Body) -> list[str]:
@@ -104,7 +111,7 @@ PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from 
 def _inversion(study: Inversion) -> list[str]:
     from workflows.inversion import SOLVES_OF_FIELD
 
-    spec, sets = study.model, study.data.sets
+    spec, sets = study.specimen, study.data.sets
     usable = [m for m in study.measurements if m is not None]
     counts = [int(m.observations.measured.sum()) for m in usable]
     moved = [int((m.moved > 0).sum()) for m in usable]
@@ -132,7 +139,8 @@ def _inversion(study: Inversion) -> list[str]:
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
         *_found(spec.body),
-        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        _formulation(study.model.decision(ranges(study.parameters))),
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
         *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
         f"mesh check  {checked}",
@@ -147,12 +155,13 @@ def _moved(count: int, farthest: float) -> str:
 
 
 def _synthesis(study: Synthesis) -> list[str]:
-    spec, sets = study.model, len(study.method.fraction)
+    spec, sets = study.specimen, len(study.method.fraction)
     seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
     return [
         f"method      {study.method.kind}",
         *_found(spec.body),
-        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} displacements each",
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        _formulation(study.model.decision(ranges(study.parameters))),
         f"data sets   {sets}",
         f"time        about {_duration(seconds)} on 1 core (rough)",
     ]

@@ -146,7 +146,7 @@ class Service:
 
     def _specified(self, options: dict[str, Any]) -> Any:
         """Return the specification of the model with options."""
-        model = self._study.model
+        model = self._study.body or self._study.model
         if not options:
             return model
         if not isinstance(model, Hyperelastic):

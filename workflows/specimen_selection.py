@@ -21,7 +21,7 @@ from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
 from uq.stopping import seconds_per_solve
-from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, refused
+from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, ranges, refused
 from workflows.priors import mistakes_of_materials
 from workflows.selection import WHOLE, Comparison
 
@@ -184,15 +184,28 @@ class SpecimenSelection(Comparison):
     @cached_property
     def specimens(self) -> dict[str, Specimen]:
         """The specimen of each candidate."""
-        return {
+        given = {
             name: Specimen.model_validate(_changed(self.model, candidate.model))
             for name, candidate in self.candidates.items()
+        }
+        of_inputs = {name: ranges(candidate.parameters) for name, candidate in self.candidates.items()}
+        # The forms differ a little on a mesh: where one candidate needs pressures, all have them that can.
+        mixed = any(one.formulation == "auto" and one.decision(of_inputs[name]).mixed for name, one in given.items())
+        return {
+            name: one.model_copy(update={"formulation": "mixed"})
+            if mixed and one.formulation == "auto" and one.mixable
+            else one.over(of_inputs[name])
+            for name, one in given.items()
         }
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimens before anything is solved, each once."""
-        of_specimens = (finding for one in self.specimens.values() for finding in one.findings)
+        of_specimens = (
+            finding
+            for name, one in self.specimens.items()
+            for finding in (*one.findings, *one.locking(ranges(self.candidates[name].parameters)))
+        )
         return tuple(dict.fromkeys([*of_specimens, *super().findings]))
 
     @property

@@ -22,7 +22,7 @@ body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexa
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 # Others: neo-hookean, neo-hookean-coupled, yeoh, gent, demiray, ogden, saint-venant-kirchhoff, blatz-ko, and
 # holzapfel-gasser-ogden, c = 2e4, k1 = 1e4, k2 = 1, D1 = 2e5, fibres = [[1, 1, 0], [1, -1, 0]]
-# formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus is above 50 shear moduli
+# formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus may be above 3 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
 # (kind = "ellipsoid" has radii a, b, c and a rotation vector turn_x, turn_y, turn_z (rad) instead of a radius)
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]

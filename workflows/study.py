@@ -26,6 +26,7 @@ from uq.findings import add, findings
 from uq.sampling import random_points
 from workflows import own_code, verdict
 from workflows.config import Study, StudyError, differences, document, dump
+from workflows.locking import measured
 from workflows.progress import Progress
 from workflows.results import (
     above_rounding,
@@ -273,9 +274,11 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     cells, kind = model.layout.cells()
     regions = model.region_of_cells()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    locking = measured(study, model) if ensemble.index == 0 else []
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = label(found, units, model.layout.coordinates, cells, kind)
+        add(found, *locking)
         found = with_regions(found, spec.body.regions, regions)
         return with_random_fields(found, factors, model.variance_kept)
 
@@ -336,7 +339,7 @@ class _Specimen:
 
     @classmethod
     def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
-        model = study.model.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
+        model = study.specimen.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
         vertices = (model.vertices.coordinates, *model.vertices.cells())
 
         def look(points: FloatArray) -> FloatArray:
@@ -469,7 +472,7 @@ def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
     """The specimen that is known; collective over the group."""
     from workflows import inversion
 
-    model = study.model.build(ensemble.group, study.inputs.names)
+    model = study.specimen.build(ensemble.group, study.inputs.names)
     places, points = model.models[0].layout.coordinates, inversion.points_of(model)
     factor = np.ones((len(study.method.fraction), 1))
     if study.model.fields and ensemble.index == 0:
