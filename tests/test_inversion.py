@@ -370,6 +370,20 @@ def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch)
     assert sum(map(int, blocks)) == int(whole.stdout.rpartition(" blocks")[0].split()[-1])
 
 
+def test_an_interrupted_field_keeps_its_solves(folder, monkeypatch):
+    """The states of the search and of the samples: a kept one is accepted as it is, and the result the same."""
+    study, settings = folder / "field.toml", ("--set", "method.samples=32")
+    counts = []
+    for out, count in (("field-whole", "0"), ("field-killed", "12"), ("field-killed", "0")):
+        monkeypatch.setenv("BLOCKS", count)
+        done = run_script(None, KILLED, "run", study, "--out", folder / out, *settings)
+        assert done.returncode in (9, 0, 3), done.stderr
+        counts.append(12 if count == "12" else int(done.stdout.rpartition(" blocks")[0].split()[-1]))
+    assert counts[0] == counts[1] + counts[2] > 20
+    assert not (folder / "field-killed" / "evaluations").exists()
+    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
+
+
 def test_progress_counts_the_solves_of_inversions(folder):
     """Of all data sets, in a line off the terminal."""
     done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "counted")

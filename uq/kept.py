@@ -1,4 +1,4 @@
-"""Evaluation of a model by one group of ranks, which keeps what it has solved."""
+"""Evaluations and solves of a model by one group of ranks, which keeps what it has solved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel
+from forward.model import FloatArray, ForwardModel, Reference, Solution
 from uq.evaluate import BlockSolver, Evaluations, Request, merge
 
 if TYPE_CHECKING:
@@ -110,6 +110,98 @@ class KeptEvaluate:
 
     def forget(self) -> None:
         """Remove the blocks: what follows from them is kept."""
+        if self.group.rank == 0:
+            self.checkpoint.drop(self.keys)
+        self.keys.clear()
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What decides on a solve."""
+
+    label: str
+    parameters: FloatArray
+
+
+@dataclass(frozen=True)
+class KeptModel:
+    """A model in one group of ranks whose states are kept: one that is on disk is where the solver starts, and ends.
+
+    The state meets the tolerance as it is, so that a solution found again is the same. Collective over the group.
+
+    Parameters
+    ----------
+    model, group, checkpoint, label
+        As of `KeptEvaluate`.
+
+    Attributes
+    ----------
+    keys
+        Names of the solves so far.
+    """
+
+    model: ForwardModel
+    group: Any
+    checkpoint: Checkpoint
+    label: str
+    keys: list[str] = field(default_factory=list)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.model.displacements
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.model.differentiable
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> Solution:
+        """Return the solution at parameters (d,), from its state if that is kept; errors as of the model."""
+        key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
+        self.keys.append(key)
+        state = None
+        if self.group.rank == 0 and self.checkpoint.has(key):
+            state = self.checkpoint.load(key).fields
+        state = self.group.bcast(state)
+        if state is not None:
+            return self.model.solve(parameters, self.model.scatter(state)[0], reference, iterations)
+        solution = self.model.solve(parameters, start, reference, iterations)
+        whole = self.model.gather(np.asarray(solution.state)[None])
+        if self.group.rank == 0 and whole is not None:
+            work = solution.work.as_array()[None]
+            good, none = np.ones(1, dtype=bool), np.zeros(1)
+            outputs = np.asarray(solution.outputs)[None]
+            block = Evaluations(np.asarray(parameters)[None], outputs, None, (), none, work, none, good, whole)
+            self.checkpoint.save(key, block)
+        return solution
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """As of the model."""
+        return self.model.gather(rows)
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """As of the model."""
+        return self.model.scatter(rows)
+
+    def forget(self) -> None:
+        """Remove the states: what follows from them is kept."""
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()

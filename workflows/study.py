@@ -357,7 +357,7 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
     from inverse.field_posterior import FieldPosterior
     from inverse.inversion import Finer, Inversions, Vertices, invert_by_group, invert_field
     from uq.evaluate import Request
-    from uq.kept import KeptEvaluate
+    from uq.kept import KeptEvaluate, KeptModel
     from workflows import inversion
 
     method, errors = study.method, study.data.errors
@@ -367,7 +367,7 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
     prior = study.model.fields[0].prior(study.model.body) if study.field else None
     recorders: dict[str, Recorder] = {}
 
-    done: list[KeptEvaluate] = []
+    done: list[KeptEvaluate | KeptModel] = []
     rows = inversion.Rows(study, vertices, lambda text: write_text(directory / BATCH, text))
 
     def arrived(block: Evaluations, kept: bool) -> None:
@@ -387,13 +387,15 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
         finer = Finer(None if specimen.mesh is None else partial(specimen.mesh.outputs, observed), specimen.why)
         if done:
             done.pop().forget()  # what follows from these solves is kept by now
+        name = study.data.sets[number].name
         if prior is None:
-            name = study.data.sets[number].name
             kept = KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count)
             done.append(kept)
             found = invert_by_group(study.inputs, observed, data, method, specimen.look, errors, finer, kept)
             return layout.pack(found)
-        posterior = FieldPosterior(observed, data.values, data.sigma, prior, progress=ensemble.count)
+        solved = KeptModel(observed, ensemble.group, checkpoint, name)
+        done.append(solved)
+        posterior = FieldPosterior(solved, data.values, data.sigma, prior, progress=ensemble.count)
         offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
         return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer))
 
