@@ -9,8 +9,10 @@ functions are products ψ_a(t) = Π_i p_{a_i}(t_i) over a set of multi-indices a
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import combinations, permutations
 from typing import TypeVar
 
 import numpy as np
@@ -47,7 +49,7 @@ class Basis:
     def values(self, points: FloatArray) -> FloatArray:
         """Return ψ (n, P) at points (n, d)."""
         tables, _ = self._tables(points, derivatives=False)
-        return self._products(tables)
+        return _products(tables, self.indices)
 
     def at(self, point: FloatArray) -> FloatArray:
         """Return ψ (P,) at one point (d,), without the overhead of arrays."""
@@ -60,10 +62,17 @@ class Basis:
 
     def derivatives(self, points: FloatArray) -> FloatArray:
         """Return ∂ψ/∂t_i (n, d, P) at points (n, d): the derivatives per standard deviation of the coordinates."""
-        tables, slopes = self._tables(points, derivatives=True)
-        d = len(tables)
-        columns = [self._products([(slopes if j == i else tables)[j] for j in range(d)]) for i in range(d)]
-        return np.stack(columns, axis=1)
+        return self.rows(points, gradients=True)[:, 1:]
+
+    def rows(self, points: FloatArray, *, gradients: bool) -> FloatArray:
+        """Return what a sample gives a regression (n, 1 + d, P): values and derivatives, or values (n, 1, P) alone."""
+        tables, slopes = self._tables(points, derivatives=gradients)
+        result = np.zeros((len(points), 1 + len(slopes), len(self.indices)))
+        result[:, 0] = _products(tables, self.indices)
+        for i, table in enumerate(slopes):
+            varying = np.flatnonzero(self.indices[:, i])
+            result[:, 1 + i, varying] = _products([*tables[:i], table, *tables[i + 1 :]], self.indices[varying])
+        return result
 
     def subset(self, which: IntArray) -> Basis:
         """Return the basis of some of the functions, by their numbers."""
@@ -80,11 +89,20 @@ class Basis:
                 slopes.append(np.column_stack(columns[1]))
         return values, slopes
 
-    def _products(self, tables: list[FloatArray]) -> FloatArray:
-        result = np.ones((len(tables[0]), len(self.indices)))
-        for table, degrees in zip(tables, self.indices.T, strict=True):
+
+def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
+    """Return the products (n, P) of the columns of d tables (n, N + 1) that multi-indices (P, d) name.
+
+    Columns 0 are one, and most indices of many parameters are zero.
+    """
+    result = np.ones((len(tables[0]), len(indices)))
+    for table, degrees in zip(tables, indices.T, strict=True):
+        varying = np.flatnonzero(degrees)
+        if varying.size == degrees.size:
             result *= table[:, degrees]
-        return result
+        elif varying.size:
+            result[:, varying] *= table[:, degrees[varying]]
+    return result
 
 
 def _recur(t: Real, alpha: list[float], beta: list[float], degree: int, *, derivatives: bool) -> tuple[list[Real], ...]:
@@ -169,20 +187,39 @@ def hyperbolic(dimension: int, order: int, q: float) -> IntArray:
     q = 1 is the full basis of that total degree; smaller q drop products of many parameters
     (G. Blatman, B. Sudret, J. Comput. Phys. 230 (2011) 2345–2367).
     """
+    blocks = [np.zeros((1, dimension), dtype=np.int64)]
+    for pattern in _patterns(dimension, order, q):
+        places = np.array(list(combinations(range(dimension), len(pattern))))
+        for degrees in sorted(set(permutations(pattern))):
+            block = np.zeros((len(places), dimension), dtype=np.int64)
+            np.put_along_axis(block, places, np.array(degrees)[None, :], axis=1)
+            blocks.append(block)
+    return by_degree(np.concatenate(blocks))
+
+
+def hyperbolic_count(dimension: int, order: int, q: float) -> int:
+    """Return the number of rows of `hyperbolic`, without making them."""
+    return 1 + sum(
+        math.comb(dimension, len(pattern))
+        * math.factorial(len(pattern))
+        // math.prod(math.factorial(pattern.count(degree)) for degree in set(pattern))
+        for pattern in _patterns(dimension, order, q)
+    )
+
+
+def _patterns(dimension: int, order: int, q: float) -> Iterator[tuple[int, ...]]:
+    """Yield the degrees other than zero that the indices of `hyperbolic` have, in falling order."""
     budget = order**q * (1 + 1e-12)
-    rows: list[tuple[int, ...]] = [()]
-    spent = [0.0]
-    for _ in range(dimension):
-        longer = [
-            ((*row, k), s + k**q)
-            for row, s in zip(rows, spent, strict=True)
-            for k in range(order + 1)
-            if s + k**q <= budget
-        ]
-        rows, spent = [row for row, _ in longer], [s for _, s in longer]
-    return np.array(sorted(rows, key=by_degree), dtype=np.int64).reshape(-1, dimension)
+    longer: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+    while longer:
+        pattern, spent = longer.pop()
+        if pattern:
+            yield pattern
+        if len(pattern) < dimension:
+            largest = pattern[-1] if pattern else order
+            longer += [((*pattern, k), spent + k**q) for k in range(1, largest + 1) if spent + k**q <= budget]
 
 
-def by_degree(index: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the key that sorts multi-indices by total degree, and those of one degree by the first parameters."""
-    return (sum(index), *(-k for k in index))
+def by_degree(indices: IntArray) -> IntArray:
+    """Sort multi-indices (P, d) by total degree, and those of one degree by the first parameters."""
+    return indices[np.lexsort((*(-indices.T[::-1]), indices.sum(axis=1)))]

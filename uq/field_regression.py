@@ -62,9 +62,7 @@ class Projections:
 
     def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
         """Return Σ A_zᵀ y_z and Σ |y_z|² (P + 1, U) from the rows y_z (n, 1 + d, U) or (n, 1, U)."""
-        left = self.basis.values(points)[:, None, :]
-        if self.gradients:
-            left = np.concatenate([left, self.basis.derivatives(points)], axis=1)
+        left = self.basis.rows(points, gradients=self.gradients)
         weighted = rows
         if self.points is not None and self.weights is not None:
             which = [int(np.flatnonzero((self.points == point).all(axis=1))[0]) for point in points]

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import WORK, FloatArray
-from uq.basis import hyperbolic, orthonormal
+from uq.basis import hyperbolic, hyperbolic_count, orthonormal
 from uq.chaos import Expanded, Probability, expansion_dataset, objection
 from uq.evaluate import Evaluate, Evaluations, Prediction, Recorder, Request, Start
 from uq.field_regression import Projections, StateExpansion
@@ -90,7 +90,7 @@ class MultilevelChaos(Amount):
         """Number of samples of a level for so many parameters."""
         if self.samples is not None:
             return self.samples
-        return 1 << (SAMPLES_PER_TERM * len(hyperbolic(dimension, self.order, 1.0)) - 1).bit_length()
+        return 1 << (SAMPLES_PER_TERM * hyperbolic_count(dimension, self.order, 1.0) - 1).bit_length()
 
     def planned(self, dimension: int) -> int:
         """Number of solves, with all levels."""
@@ -102,7 +102,7 @@ class MultilevelChaos(Amount):
 
     def shortage(self, dimension: int) -> str | None:
         """Say that there are too few samples for the terms of the expansion, or nothing."""
-        terms = len(hyperbolic(dimension, self.order, 1.0))
+        terms = hyperbolic_count(dimension, self.order, 1.0)
         if self.per_level(dimension) > terms:
             return None
         return f"an expansion of order {self.order} in {dimension} parameters has {terms} terms, expected more samples"

@@ -13,12 +13,13 @@ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from uq.basis import Basis, IntArray, by_degree, hyperbolic, orthonormal
+from uq.basis import Basis, IntArray, by_degree, hyperbolic, hyperbolic_count, orthonormal
 from uq.evaluate import Evaluations
 from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
@@ -29,6 +30,7 @@ FULL = 8  # parameters up to which whole bases are tried; above, functions are s
 DICTIONARY = 2000  # functions to select from, at most
 FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
 ROUNDING = 1e-13  # relative error below which there is nothing left to select for
+LIKELY = 24  # functions whose inner products are found together
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 
 
@@ -71,27 +73,31 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
     """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
     d = len(inputs.names)
     most = max(rows // ROWS_PER_TERM, d + 1)
-    found: dict[tuple[bool, tuple[tuple[int, ...], ...]], tuple[int, float]] = {}
+    found: dict[tuple[bool, bytes], tuple[IntArray, int, float]] = {}
     determined = False
     for q in reversed(TRUNCATIONS):
-        for order in range(1, max_order + 1):
+        counts = {order: hyperbolic_count(d, order, q) for order in range(1, max_order + 1)}
+        if d <= FULL:
+            for order, count in counts.items():
+                if count <= most or order == 1:
+                    indices = hyperbolic(d, order, q)
+                    found.setdefault((False, indices.tobytes()), (indices, order, q))
+        order = max(order for order, count in counts.items() if count <= dictionary or order == 1)
+        widest = order
+        while not determined and order > 0:
             indices = hyperbolic(d, order, q)
-            members = tuple(map(tuple, indices.tolist()))
-            if d <= FULL and (len(indices) <= most or order == 1):
-                found.setdefault((False, members), (order, q))
-            if len(indices) <= dictionary or order == 1:
-                widest = members, order
-        if (True, widest[0]) not in found and not determined:
-            found[True, widest[0]] = (widest[1], q)
+            found.setdefault((True, indices.tobytes()), (indices, order, q))
+            # Where there are fewer rows than functions, it helps to have less to choose from.
+            order = order - 1 if rows < counts[order] and order > 2 else 0
         # Nothing is lost by selecting from all of them where there are as many rows.
-        determined = determined or (widest[1] == max_order and len(widest[0]) <= rows)
-    union = sorted({index for _, members in found for index in members}, key=by_degree)
-    number = {index: i for i, index in enumerate(union)}
+        determined = determined or (widest == max_order and counts[widest] <= rows)
+    union = by_degree(np.unique(np.concatenate([indices for indices, *_ in found.values()]), axis=0))
+    number = {index.tobytes(): i for i, index in enumerate(union)}
     sets = [
-        Candidate(order, q, np.array([number[a] for a in members]), sparse)
-        for (sparse, members), (order, q) in found.items()
+        Candidate(order, q, np.array([number[index.tobytes()] for index in indices]), sparse)
+        for (sparse, _), (indices, order, q) in found.items()
     ]
-    return Candidates(np.array(union, dtype=np.int64), tuple(sets))
+    return Candidates(union, tuple(sets))
 
 
 # --- regression ----------------------------------------------------------------------------------------------------
@@ -132,25 +138,26 @@ class Data:
             slopes = np.swapaxes(tangents * inputs.coordinates.steps(points)[:, None, :], 1, 2)
         return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
 
-    def first(self, count: int) -> Data:
-        """Return the first `count` samples."""
-        slopes = None if self.slopes is None else self.slopes[:count]
-        return Data(self.points[:count], self.values[:count], slopes, self.weights[:count])
+    def some(self, which: slice | IntArray) -> Data:
+        """Return some of the samples, in the order asked for."""
+        slopes = None if self.slopes is None else self.slopes[which]
+        return Data(self.points[which], self.values[which], slopes, self.weights[which])
 
     @property
     def right(self) -> FloatArray:
         """Right-hand sides (n, rows, m)."""
-        return self._rows(self.values, self.slopes)
+        blocks = [self.values[:, None, :]] if self.slopes is None else [self.values[:, None, :], self.slopes]
+        return np.asarray(np.concatenate(blocks, axis=1) * self._roots)
 
     def left(self, basis: Basis) -> FloatArray:
         """Matrix (n, rows, P)."""
-        return self._rows(basis.values(self.points), None if self.slopes is None else basis.derivatives(self.points))
+        rows = basis.rows(self.points, gradients=self.slopes is not None)
+        rows *= self._roots
+        return rows
 
-    def _rows(self, values: FloatArray, slopes: FloatArray | None) -> FloatArray:
-        blocks = values[:, None, :]
-        if slopes is not None:
-            blocks = np.concatenate([blocks, slopes], axis=1)
-        return np.asarray(blocks * np.sqrt(self.weights)[:, None, None])
+    @property
+    def _roots(self) -> FloatArray:
+        return np.sqrt(self.weights)[:, None, None]
 
     def size(self, errors: FloatArray) -> FloatArray:
         """Root mean square (m,) of the first rows of residuals (n, rows, m): those of the values."""
@@ -224,15 +231,19 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     SolveError
         If there are not enough samples.
     """
-    left, right = data.left(largest), data.right
-    n, rows, _ = right.shape
-    d = largest.indices.shape[1]
+    # Samples that are left out together stand together.
+    n = len(data.points)
     held = np.arange(n) % min(n, FOLDS)
+    order = np.argsort(held, kind="stable")
+    data, held = data.some(order), held[order]
+    left, right = data.left(largest), data.right
+    rows, d = right.shape[1], largest.indices.shape[1]
     scores: list[tuple[float, Candidate, _Folds | None]] = []
     for candidate in candidates.sets:
         terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
         if candidate.sparse and (d > FULL or n * rows > d):
-            scores.append(_select(left, right, data, candidate, held, most))
+            products = _Products.of(left[:, :, candidate.which], held)
+            scores.append(_select(products, right, data, candidate, held, most))
         elif (
             not candidate.sparse
             and terms <= n * rows
@@ -271,13 +282,61 @@ def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> Float
     return errors
 
 
+@dataclass(frozen=True)
+class _Products:
+    """Inner products of the columns of a regression, without the rows of each number in turn.
+
+    Attributes
+    ----------
+    columns
+        The matrix (n rows, P), samples that are left out together next to each other.
+    parts
+        The rows of each number.
+    gram
+        Products (P, P) over all rows.
+    """
+
+    columns: FloatArray
+    parts: tuple[slice, ...]
+    gram: FloatArray
+    _known: dict[int, FloatArray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, left: FloatArray, held: IntArray) -> _Products:
+        """Take the matrix (n, rows, P) of samples with rising numbers `held` (n,)."""
+        ends = left.shape[1] * np.searchsorted(held, np.arange(held.max() + 2))
+        columns = left.reshape(-1, left.shape[2])
+        return cls(columns, tuple(slice(*pair) for pair in pairwise(ends.tolist())), columns.T @ columns)
+
+    def lengths(self) -> FloatArray:
+        """Squared lengths (F + 1, P) of the columns without the rows of each number; the last without none."""
+        total = np.diag(self.gram)
+        return np.array([*(total - (self.columns[part] ** 2).sum(axis=0) for part in self.parts), total])
+
+    def rows(self, pick: IntArray, likely: IntArray) -> FloatArray:
+        """Products (F + 1, P) with all columns of the one that `pick` (F + 1,) names for each number.
+
+        Products within the parts are found for many columns at once: for those that are `likely` to be asked for next.
+        """
+        missing = [j for j in dict.fromkeys(pick[:-1].tolist()) if j not in self._known]
+        if missing:
+            wanted = [*missing, *(j for j in likely.tolist() if j not in missing and j not in self._known)]
+            found = [self.columns[part][:, wanted].T @ self.columns[part] for part in self.parts]
+            self._known.update(zip(wanted, np.stack(found, axis=1), strict=True))
+        rows = self.gram[pick]
+        for k, j in enumerate(pick[:-1].tolist()):
+            rows[k] -= self._known[j][k]
+        return rows
+
+
 def _select(
-    left: FloatArray, right: FloatArray, data: Data, dictionary: Candidate, held: IntArray, most: int
+    products: _Products, right: FloatArray, data: Data, dictionary: Candidate, held: IntArray, most: int
 ) -> tuple[float, Candidate, _Folds]:
     """Take functions one by one, each time the one that explains most of what all outputs have left.
 
     Orthogonal least squares, from all samples and, to learn when to stop, without those of each number in `held` (n,):
-    what is selected by samples cannot be judged by them.
+    what is selected by samples cannot be judged by them. All of it is done with inner products (the Cholesky factor of
+    the Gram matrix grows by a row for each function), so that a step does not go through all rows of all functions.
 
     Returns
     -------
@@ -285,17 +344,18 @@ def _select(
         The relative error at the samples left out, the functions selected from all, and those selected without some.
     """
     n, rows, m = right.shape
-    columns = left[:, :, dictionary.which].reshape(n * rows, -1)
-    # The last of these fits sees everything.
-    numbers = np.arange(held.max() + 2)
-    seen = np.repeat(held[None, :] != numbers[:, None], rows, axis=1).astype(float)
+    columns, parts, folds = products.columns, products.parts, len(products.parts)
     scale = np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
-    rest = np.tile(right.reshape(n * rows, m) / scale, (len(numbers), 1, 1))
-    lengths = seen @ columns**2
+    rest = (right / scale).reshape(n * rows, m)
+    explained = np.tile(columns.T @ rest, (folds + 1, 1, 1))
+    for k, part in enumerate(parts):
+        explained[k] -= columns[part].T @ rest[part]
+    lengths = products.lengths()
+    every = np.arange(folds + 1)
     left_over = lengths.copy()
-    taken: list[IntArray] = []
     limit = min(most, columns.shape[1])
-    q = np.empty((len(numbers), n * rows, limit))
+    q, triangles = np.empty((n * rows, limit)), np.empty((folds + 1, limit, columns.shape[1]))
+    taken: list[IntArray] = []
     scores: list[float] = []
     left_out: list[FloatArray] = []
     while (step := len(taken)) < limit and (
@@ -304,19 +364,25 @@ def _select(
         usable = left_over > 1e-8 * lengths
         if not usable.any(axis=1).all():
             break
-        pick = np.zeros(len(numbers), dtype=np.int64)  # the constant comes first
-        if taken:
-            gains = np.swapaxes(rest * seen[:, :, None], 1, 2) @ columns
-            pick = np.where(usable, (gains**2).sum(axis=1) / np.where(usable, left_over, 1.0), -1.0).argmax(axis=1)
-        column = columns[:, pick].T
-        earlier = q[:, :, :step]
-        column = column - (earlier @ (np.swapaxes(earlier, 1, 2) @ (column * seen)[:, :, None]))[:, :, 0]
-        column = column / np.sqrt((column**2 * seen).sum(axis=1))[:, None]
-        q[:, :, step] = column
-        left_over -= ((column * seen) @ columns) ** 2
-        rest = rest - column[:, :, None] * np.einsum("fn,fnm->fm", column * seen, rest)[:, None, :]
+        gains = np.where(usable, (explained**2).sum(axis=2) / np.where(usable, left_over, 1.0), -1.0)
+        # The constant comes first.
+        pick = gains.argmax(axis=1) if taken else np.zeros_like(every)
+        likely = np.argsort(-gains.sum(axis=0), kind="stable")[:LIKELY]
+        size = np.sqrt(left_over[every, pick])
+        gain = explained[every, pick] / size[:, None]
+        before = triangles[every, :step, pick]
+        row = products.rows(pick, likely) - (before[:, None] @ triangles[:, :step])[:, 0]
+        row /= size[:, None]
+        triangles[:, step] = row
+        explained -= row[:, :, None] * gain[:, None]
+        left_over -= row**2
+        left_over[every, pick] = 0.0
+        for k, part in enumerate(parts):
+            direction = (columns[part, pick[k]] - q[part, :step] @ before[k]) / size[k]
+            rest[part] -= direction[:, None] * gain[k]
+            q[part, step] = direction
         taken.append(pick)
-        left_out.append(rest.reshape(len(numbers), n, rows, m)[held, np.arange(n)] * scale)
+        left_out.append(rest.reshape(n, rows, m) * scale)
         scores.append(float(data.relative(left_out[-1]).max()))
     count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
     picks = dictionary.which[np.array(taken[:count])]
@@ -328,15 +394,15 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
     from scipy.linalg import solve_triangular
 
     n, rows, m = right.shape
-    q, r = np.linalg.qr(left[:, :, chosen.which].reshape(n * rows, -1))
+    q, triangle = np.linalg.qr(left[:, :, chosen.which].reshape(n * rows, -1))
     blocks = q.reshape(n, rows, -1)
     rotated = np.einsum("zrp,zrm->pm", blocks, right)
     residual = right - blocks @ rotated
-    coefficients = solve_triangular(r, rotated)
+    coefficients = solve_triangular(triangle, rotated)
     if folds is None:
         errors = _left_out(blocks, residual, np.arange(n))
         terms = chosen.which.size
-        moved = solve_triangular(r, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
+        moved = solve_triangular(triangle, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
         without = np.zeros((n, left.shape[2], m))
         without[:, chosen.which] = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
     else:
@@ -344,11 +410,11 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
         without = np.zeros((len(folds.which), left.shape[2], m))
         for k, which in enumerate(folds.which):
             kept = folds.held != k
-            matrix = left[kept][:, :, which].reshape(-1, which.size)
-            without[k, which] = np.linalg.lstsq(matrix, right[kept].reshape(-1, m), rcond=None)[0]
+            q, r = np.linalg.qr(left[np.ix_(np.flatnonzero(kept), np.arange(rows), which)].reshape(-1, which.size))
+            without[k, which] = solve_triangular(r, q.T @ right[kept].reshape(-1, m))
     squares = (residual**2).sum(axis=(0, 1))
-    sampled = _sampled(blocks, residual, r)
-    return Fit(chosen, coefficients, without, sampled, r, data.size(errors), data.relative(errors), squares)
+    sampled = _sampled(blocks, residual, triangle)
+    return Fit(chosen, coefficients, without, sampled, triangle, data.size(errors), data.relative(errors), squares)
 
 
 def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
@@ -407,7 +473,7 @@ class Regression:
 
     def first(self, count: int) -> Regression:
         """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
-        data = self.data.first(count)
+        data = self.data.some(slice(count))
         return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
 
     @property
