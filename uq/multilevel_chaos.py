@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import WORK, FloatArray
-from uq.basis import hyperbolic, hyperbolic_count, orthonormal
+from uq.basis import hyperbolic_count, orthonormal
 from uq.chaos import Expanded, Probability, expansion_dataset, objection
 from uq.evaluate import Evaluate, Evaluations, Prediction, Recorder, Request, Start
 from uq.field_regression import Projections, StateExpansion
