@@ -222,4 +222,4 @@ def _patterns(dimension: int, order: int, q: float) -> Iterator[tuple[int, ...]]
 
 def by_degree(indices: IntArray) -> IntArray:
     """Sort multi-indices (P, d) by total degree, and those of one degree by the first parameters."""
-    return indices[np.lexsort((*(-indices.T[::-1]), indices.sum(axis=1)))]
+    return np.asarray(indices[np.lexsort((*(-indices.T[::-1]), indices.sum(axis=1)))])

@@ -24,6 +24,7 @@ from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
 T = TypeVar("T")
 Arrived = Callable[[Evaluations, bool], None]
+WORTH = 5e-3  # seconds to find a block above which a file of it is worth writing, and reading again
 _RESULT = 1
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their blocks
 
@@ -312,8 +313,10 @@ class _Worker:
                 return
             solver = solver or BlockSolver(self.models[order.request.model], order.request)
             i = order.pending[turn]
+            begin = time.monotonic()
             block = solver(blocks[i].points, progress)
-            if self.checkpoint is not None and group.rank == 0:
+            worth = time.monotonic() - begin > WORTH
+            if self.checkpoint is not None and group.rank == 0 and worth:
                 self.checkpoint.save(order.keys[i], block)
             yield i, block
 
