@@ -24,7 +24,8 @@ from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
 T = TypeVar("T")
 Arrived = Callable[[Evaluations, bool], None]
-WORTH = 5e-3  # seconds to find a block above which a file of it is worth writing, and reading again
+CHEAP = 1e-3  # seconds below which a block is found sooner than its file is written and read again,
+SELDOM = 0.1  # so that a file of such blocks is written only so often (s)
 _RESULT = 1
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their blocks
 
@@ -231,6 +232,7 @@ class _Worker:
         self.models = models
         self.checkpoint = checkpoint
         self._counter = counter
+        self._saved = -np.inf  # when a block was last written
         self.pulse: Callable[[], None] = lambda: None  # on rank 0: receive what is there
 
     def prepare(self, model: int) -> None:
@@ -315,9 +317,11 @@ class _Worker:
             i = order.pending[turn]
             begin = time.monotonic()
             block = solver(blocks[i].points, progress)
-            worth = time.monotonic() - begin > WORTH
+            now = time.monotonic()
+            worth = now - begin > CHEAP or now - self._saved > SELDOM
             if self.checkpoint is not None and group.rank == 0 and worth:
                 self.checkpoint.save(order.keys[i], block)
+                self._saved = now
             yield i, block
 
 
