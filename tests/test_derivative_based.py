@@ -257,3 +257,15 @@ def test_the_beam_is_bounded():
     assert (data["total_bound"] <= 1.3 * data["sobol_total"] + 0.02).all()
     assert (data["active_eigenvalue"][:, 0] > 50 * data["active_eigenvalue"][:, 1]).all()
     np.testing.assert_allclose(data["local_share"], data["sobol_total"], atol=0.02)
+
+
+def test_indices_are_computed_where_they_are_cheap_or_asked_for():
+    """The expansion that they come from takes longer than all else where there are many parameters."""
+    inputs = Inputs({f"x{i}": Uniform(lower=0, upper=1) for i in range(9)})
+    model = FunctionModel(lambda p: [p.sum()], inputs.names, ("f",), lambda p: [[1.0] * 9])
+    method = DerivativeBased(samples=32, scrambles=4, fields=False)
+    data = method.run(inputs, SerialEvaluate(model))
+    assert "total_bound" in data
+    assert "sobol_total" not in data
+    data = method.model_copy(update={"indices": True}).run(inputs, SerialEvaluate(model))
+    np.testing.assert_allclose(data["sobol_total"][0], 1 / 9, atol=1e-9)

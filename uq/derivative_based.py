@@ -24,6 +24,7 @@ Points are independent scrambles of Sobol' points, and errors come from drawing 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import numpy as np
@@ -50,7 +51,7 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
-from uq.regression import Regression
+from uq.regression import FULL, Regression
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 
@@ -86,6 +87,9 @@ class DerivativeBased(Amount):
         Probabilities of the quantiles of the outputs.
     fields
         Whether the derivatives of the displacement field at the mean parameters are kept.
+    indices
+        Whether total indices are estimated too, from an expansion of the same samples; up to 8 parameters they are
+        unless this is false.
     """
 
     kind: Literal["derivative-based"] = "derivative-based"
@@ -93,6 +97,7 @@ class DerivativeBased(Amount):
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
+    indices: bool | None = None
 
     def check_amount(self) -> None:
         """Raise a ValueError where no amount is given, or not one of whole scrambles."""
@@ -372,21 +377,18 @@ class _Samples:
                 },
             }
         )
-        found_out: list[Finding] = []
-        try:
-            regression = Regression.of(inputs, points[ok], values[ok], self._in_order(self.tangents)[ok], ORDER)
-        except SolveError:
-            pass  # too few samples for an expansion: the bounds stand alone
-        else:
-            estimates = regression.estimates()
-            for name in ("sobol_first", "sobol_total"):
-                for end in ("", "_error"):
-                    dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
-            dataset["loo_error"] = (("output",), regression.fit.relative)
-            found_out = list(_above_bounds(dataset))
+        wanted = len(inputs.names) <= FULL if method.indices is None else method.indices
+        if wanted:
+            with suppress(SolveError):  # of too few samples for an expansion: the bounds stand alone
+                regression = Regression.of(inputs, points[ok], values[ok], self._in_order(self.tangents)[ok], ORDER)
+                estimates = regression.estimates()
+                for name in ("sobol_first", "sobol_total"):
+                    for end in ("", "_error"):
+                        dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
+                dataset["loo_error"] = (("output",), regression.fit.relative)
+                findings.add(dataset, *_above_bounds(dataset))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
-        findings.add(dataset, *found_out)
         return dataset
 
 
