@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from difflib import get_close_matches
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
+
+UNKNOWN_KIND = "unknown_kind"  # type of a mistake, whose context holds the `known` kinds
 
 
 class Settings(BaseModel):
@@ -26,7 +29,8 @@ class Settings(BaseModel):
             return handler(_freeze(value))  # type: ignore[no-any-return]
         except ValidationError as error:
             raise ValidationError.from_exception_data(
-                cls.__name__, [_explain(cls, line) for line in error.errors(include_url=False)]
+                cls.__name__,
+                [_explain(cls, line) for line in error.errors(include_url=False) if not _follows(line)],
             ) from None
 
     def __hash__(self) -> int:
@@ -45,13 +49,8 @@ class Named(Settings):
         return self.name or str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
 
 
-def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
-    """Say which of the `known` words was probably meant, or list them: the tail of an error message."""
-    close = get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"expected one of: {', '.join(known)}"
-
-
 LONGEST = 80  # letters of a value in a message
+LISTED = 30  # words that a message proposes
 
 
 def shown(value: Any) -> str:
@@ -60,7 +59,28 @@ def shown(value: Any) -> str:
         text = repr(list(value) if isinstance(value, tuple) else value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, lists nested as deep
         return f"a long {type(value).__name__}"
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return cut(text, LONGEST)
+
+
+def cut(text: str, most: int) -> str:
+    """Cut a text that is longer than so many letters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def one_line(text: str, most: int = 600) -> str:
+    """Return a message without line breaks and letters that cannot be seen, its words and itself cut where long."""
+    visible = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+    visible = re.sub(r"\S{300,}", lambda word: cut(word[0], LONGEST), visible)
+    return visible if len(visible) <= most else f"{visible[: most // 2]} ... {visible[-most // 2 :]}"
+
+
+def nearest(word: str, known: list[str] | tuple[str, ...]) -> str:
+    """Say which of the `known` words was probably meant, or list them: the tail of an error message."""
+    close = get_close_matches(word, known, n=1, cutoff=0.5) if len(word) <= LONGEST and word not in known else []
+    if close:
+        return f"did you mean '{cut(close[0], LONGEST)}'?"
+    more = f" and {len(known) - LISTED} others" if len(known) > LISTED else ""
+    return f"expected one of: {', '.join(cut(one, LONGEST) for one in known[:LISTED])}{more}"
 
 
 def _freeze(value: Any) -> Any:
@@ -71,12 +91,51 @@ def _freeze(value: Any) -> Any:
     return value
 
 
+_PLAIN = {  # pydantic's types of mistakes, in words of TOML
+    "tuple_type": "expected a list",
+    "list_type": "expected a list",
+    "dict_type": "expected a table, { key = value }",
+    "model_type": "expected a table, { key = value }",
+    "model_attributes_type": "expected a table, { key = value }",
+    "missing": "missing",
+    "invalid_key": "expected a word as key",
+}
+_PATTERNS = {  # of texts, by how they begin
+    r"'^[^.\s]": "expected a name without dots and blanks",
+    r"'^\S+$": "expected a name without blanks",
+    r"'^[^\W\d]": "expected MODULE.FUNCTION",
+    "'^https?": "expected an address, http://HOST:PORT",
+}
+
+
+def _follows(line: Any) -> bool:
+    """Whether a mistake is that a list is too short only because there are mistakes in its items."""
+    return line["type"] == "too_short" and len(line["input"]) >= int(
+        line["ctx"].get("min_length", len(line["input"]) + 1)
+    )
+
+
 def _explain(cls: type[BaseModel], line: Any) -> InitErrorDetails:
-    """Carry one pydantic error on; an unknown key of this very block gets its nearest known key."""
-    if line["type"] == "extra_forbidden" and len(line["loc"]) == 1:
-        hint = nearest(str(line["loc"][0]), [name for name in cls.model_fields if name != "kind"])
-        kind: PydanticCustomError | str = PydanticCustomError("unknown_key", "unknown key; {hint}", {"hint": hint})
-    else:
-        message = line["msg"].removeprefix("Value error, ")
-        kind = PydanticCustomError(line["type"], message.replace("{", "(").replace("}", ")"))
-    return InitErrorDetails(type=kind, loc=line["loc"], input=line["input"])
+    """Carry one pydantic error on, in words; an unknown key of this very block gets its nearest known key."""
+    place, given, kind, context = line["loc"], line["input"], line["type"], {}
+    message = _PLAIN.get(kind, line["msg"].removeprefix("Value error, "))
+    if kind == "extra_forbidden" and len(place) == 1:
+        known = [name for name in cls.model_fields if name != "kind"]
+        kind, message = "unknown_key", f"unknown key; {nearest(str(place[0]), known)}"
+    elif kind in {"union_tag_invalid", "union_tag_not_found"}:
+        word = given.get("kind") if isinstance(given, dict) else None
+        place = (*place, "kind")
+        if word is None:
+            kind, message = "missing", "missing"
+        elif not isinstance(word, str):
+            kind, message, given = "no_word", "expected a word", word
+        else:
+            context = {"known": re.findall(r"'([^']*)'", line["ctx"]["expected_tags"])}
+            kind, message, given = UNKNOWN_KIND, f"unknown kind; {nearest(word, context['known'])}", word
+    elif kind == UNKNOWN_KIND:
+        context = line["ctx"]
+    elif kind == "string_pattern_mismatch":
+        message = next((words for start, words in _PATTERNS.items() if start in message), message)
+    message = message.replace("Tuple", "List").replace(" after validation", "")
+    error = PydanticCustomError(kind, "{message}", {"message": message, **context})
+    return InitErrorDetails(type=error, loc=place, input=given)

@@ -338,8 +338,8 @@ class Beta(_Bounded):
 
     closed: ClassVar[bool] = True
     kind: Literal["beta"] = "beta"
-    a: PositiveFloat
-    b: PositiveFloat
+    a: Annotated[PositiveFloat, Field(le=1e9)]  # beyond, quantiles take minutes, of what is hardly random
+    b: Annotated[PositiveFloat, Field(le=1e9)]
 
     def _chaospy(self, cp: Any) -> Any:
         return cp.Beta(self.a, self.b, self.lower, self.upper)

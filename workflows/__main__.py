@@ -52,9 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(text: str) -> None:
-    """Print errors once, on the first rank of the job."""
+    """Print errors once, on the first rank of the job, a line each."""
+    from forward.settings import one_line
+
     if next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0":
-        sys.stderr.write(f"{text}\n")
+        sys.stderr.write("".join(f"{one_line(line)}\n" for line in text.split("\n")))
 
 
 def _abort_all() -> None:

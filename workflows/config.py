@@ -16,7 +16,7 @@ from forward.external import PythonModel, UmBridgeModel
 from forward.hyperelastic import Hyperelastic, Mistake, Scalar
 from forward.locking import Decision
 from forward.model import Finding, ModelError
-from forward.settings import Settings, nearest
+from forward.settings import UNKNOWN_KIND, Settings, cut, nearest, one_line, shown
 from uq.compare import TIGHTER, Compare, Given, Sampling
 from uq.derivative_based import DerivativeBased
 from uq.distributions import Distribution, Normal
@@ -45,8 +45,16 @@ Method = Annotated[
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
+DEEPEST = 32  # levels of lists and tables in a study
+LISTED = 50  # mistakes that are shown
+
+
 class StudyError(Exception):
     """A study that cannot be run; each argument is one line: the place, what was given and what was expected."""
+
+    def __init__(self, *mistakes: str) -> None:
+        more = [f"and {len(mistakes) - LISTED} more mistakes"] if len(mistakes) > LISTED else []
+        super().__init__(*map(one_line, mistakes[:LISTED]), *more)
 
     def __str__(self) -> str:
         """All mistakes, a line each."""
@@ -306,10 +314,13 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     blocks = dict(document)
     for assignment in overrides:
         _override(blocks, assignment)
+    if _deeper_than(blocks, DEEPEST):
+        message = f"lists and tables are nested too deeply, expected at most {DEEPEST} levels"
+        raise StudyError(message)
     try:
         blocks = _located(blocks, folder)
         kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
-        if kind in {"invert", "synthesize"}:
+        if kind in ("invert", "synthesize"):
             from workflows.inversion import made
 
             return made(blocks, folder)
@@ -319,7 +330,16 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
             return selection.made(blocks, folder)
         return Study.model_validate(blocks)
     except ValidationError as error:
-        raise StudyError(*dict.fromkeys(line(item) for item in error.errors(include_url=False))) from None
+        raise StudyError(*lines(error)) from None
+
+
+def _deeper_than(tree: Any, most: int) -> bool:
+    """Whether lists and tables are nested in more levels than these."""
+    level = [tree]
+    for _ in range(most):
+        level = [item for one in level for item in (one.values() if isinstance(one, dict) else one)]
+        level = [item for item in level if isinstance(item, dict | list)]
+    return bool(level)
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -336,6 +356,9 @@ def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        message = f"{path}: lists or tables are nested too deeply"
+        raise StudyError(message) from None
     except tomllib.TOMLDecodeError as error:
         message = f"{path}: not valid TOML: {error}"
         raise StudyError(message) from None
@@ -416,6 +439,9 @@ def _override(blocks: dict[str, Any], assignment: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
+    except RecursionError:
+        message = f"--set {cut(assignment, _WORD)}: lists or tables are nested too deeply"
+        raise StudyError(message) from None
     here: Any = blocks
     *way, last = _path(key.strip(), blocks)
     for step in way:
@@ -456,46 +482,76 @@ def _named(items: list[Any], name: str, key: str) -> dict[str, Any]:
 
 
 _APART = ["select", "invert", "synthesize"]  # kinds of studies whose files have other blocks
-_PLAIN = {  # in words of TOML
-    "tuple_type": "expected a list",
-    "dict_type": "expected a table, { key = value }",
-    "model_type": "expected a table, { key = value }",
-    "model_attributes_type": "expected a table, { key = value }",
+# What pydantic puts into the places of mistakes beside keys: the members of a union, in words of TOML.
+_MEMBERS = {
+    "str": "a text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "tuple": "a list",
+    "list": "a list",
+    "dict": "a table",
 }
-_PATTERNS = {  # of texts, by how they begin
-    r"'^[^.\s]": "expected a name without dots and blanks",
-    r"'^\S+$": "expected a name without blanks",
-    r"'^[^\W\d]": "expected MODULE.FUNCTION",
-    "'^https?": "expected an address, http://HOST:PORT",
-}
+_MEMBER = re.compile(rf"({'|'.join(_MEMBERS)})(\[.*\])?$")
+_INNER = re.compile(
+    r"\[key\]$|(function-|tagged-union|literal|constrained|lax-or|nullable|is-instance|model|chain|json)\S*\["
+)
 
 
-def line(item: Any, place: str = "") -> str:
-    """Say one mistake in a block at a place: where, what was given, what was expected."""
-    for step in item["loc"]:
+def lines(error: ValidationError, place: str = "") -> list[str]:
+    """Say the mistakes of a block at a place: where, what was given, what was expected."""
+    items = error.errors(include_url=False)
+    members: dict[str, list[str]] = {}  # what would have been right, by where
+    deeper = set[str]()
+    for item in items:
+        where, member, rest = _around_member(item["loc"], place)
+        if member is not None:
+            members.setdefault(where, []).append(member)
+            deeper |= {where} if rest else set()
+    found = []
+    for item in items:
+        where, member, rest = _around_member(item["loc"], place)
+        if member is None or rest:
+            found.append(_line(item, _place(item["loc"], place)))
+        elif where not in deeper:
+            words = list(dict.fromkeys(members[where]))
+            found.append(f"{where}: expected {' or '.join(words)}; given {shown(item['input'])}")
+    return list(dict.fromkeys(map(one_line, found)))
+
+
+def _around_member(steps: Sequence[str | int], place: str) -> tuple[str, str | None, bool]:
+    """Return where a union on the way to a mistake stands, the member that it is in, and whether it is inside that."""
+    for i, step in enumerate(steps):
+        match = _MEMBER.match(step) if isinstance(step, str) else None
+        if match is not None:
+            return _place(steps[:i], place), _MEMBERS[match[1]], i + 1 < len(steps)
+    return _place(steps, place), None, False
+
+
+def _place(steps: Sequence[str | int], place: str) -> str:
+    for step in steps:
         if isinstance(step, int):
             place += f"[{step}]"
-        elif step not in _TAGS or place == "candidates":
-            place += f".{step}" if place else step
+        elif (step not in _TAGS or place == "candidates") and not _INNER.match(step) and not _MEMBER.match(step):
+            place += f".{cut(step, _WORD)}" if place else cut(step, _WORD)
+    return place
+
+
+def _line(item: Any, place: str) -> str:
     message, given = item["msg"], item["input"]
-    if item["type"] == "missing":
-        return f"{place}: missing"
-    if item["type"] == "unknown_key":
+    if item["type"] in {"missing", "unknown_key"}:
         return f"{place}: {message}"
-    if item["type"] == "union_tag_not_found":
-        return f"{place}.kind: missing"
-    if item["type"] == "union_tag_invalid":
-        found, *known = re.findall(r"'([\w-]+)'", message.replace("'kind'", ""))
-        known += _APART if place == "method" else []
-        return f"{place}.kind: unknown kind; {nearest(found, known)}; given '{found}'"
-    if item["type"] == "string_pattern_mismatch":
-        message = next((words for start, words in _PATTERNS.items() if start in message), message)
-    message = _PLAIN.get(item["type"], message.replace("Tuple", "List").replace(" after validation", ""))
-    message = f"{place}: {message[0].lower()}{message[1:]}"
-    if isinstance(given, Mapping) and item["type"] not in _PLAIN:  # a whole block, of which the message names the part
+    if item["type"] == UNKNOWN_KIND and place == "method.kind":
+        message = f"unknown kind; {nearest(given, [*item['ctx']['known'], *_APART])}"
+    message = f"{place}: {message[:1].lower()}{message[1:]}"
+    if isinstance(given, Mapping) and not message.endswith(
+        ("a table, { key = value }", "a word")
+    ):  # a whole block, of which the message names the part
         return message
-    shown = repr(list(given) if isinstance(given, tuple) else given)
-    return f"{message}; given {shown if len(shown) <= 80 else shown[:77] + '...'}"
+    return f"{message}; given {shown(given)}"
+
+
+_WORD = 60  # letters of a key in a message
 
 
 def _kinds() -> set[str]:

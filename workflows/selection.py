@@ -17,7 +17,7 @@ from forward.homogeneous import HELD, Component, HomogeneousModel, MaterialTest,
 from forward.hyperelastic import Mistake
 from forward.materials import MATERIALS, constants
 from forward.model import Finding, FloatArray, ForwardModel
-from forward.settings import Settings, nearest
+from forward.settings import Settings, nearest, shown
 from inverse.comparison import Candidate, Data
 from inverse.observations import DataError, read_table
 from inverse.posterior import NOISE
@@ -283,13 +283,16 @@ class CandidateModel(Settings):
     @model_validator(mode="after")
     def _check(self) -> CandidateModel:
         kind = self.material.get("kind")
+        if kind is None:
+            message = "material.kind: missing"
+            raise ValueError(message)
         if kind not in MATERIALS:
-            message = f"material.kind: {kind!r}; {nearest(str(kind), tuple(MATERIALS))}"
+            message = f"material.kind: {shown(kind)}; {nearest(str(kind), tuple(MATERIALS))}"
             raise ValueError(message)
         numbers = {name for name, value in self.material.items() if isinstance(value, float)}
         words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
         if words:
-            message = f"material.{words[0]}: {self.material[words[0]]!r}, expected a number"
+            message = f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
             raise ValueError(message)
         known = constants(MATERIALS[self.kind])
         given = dict.fromkeys([*self.fixed, *self.parameters])
@@ -546,9 +549,9 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     try:
         table = DataFile.model_validate(dict(data))
     except ValidationError as error:
-        from workflows.config import line
+        from workflows.config import lines
 
-        raise StudyError(*(line(item, "data") for item in error.errors(include_url=False))) from None
+        raise StudyError(*lines(error, "data")) from None
     return {**document, "data": table.read(folder)}
 
 

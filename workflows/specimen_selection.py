@@ -316,19 +316,19 @@ def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     data, candidates = blocks.get("data"), blocks.get("candidates")
     if not isinstance(data, Mapping) or "file" not in data or not isinstance(candidates, Mapping) or not candidates:
         return dict(blocks)
-    from workflows.config import line
+    from workflows.config import lines
 
     try:
         file = DisplacementFile.model_validate(dict(data))
     except ValidationError as error:
-        raise StudyError(*(line(item, "data") for item in error.errors(include_url=False))) from None
+        raise StudyError(*lines(error, "data")) from None
     name, first = next(iter(candidates.items()))
     changes = first.get("model", {}) if isinstance(first, Mapping) else {}
     try:
         specimen = Specimen.model_validate(_changed(blocks["model"], changes))
     except ValidationError as error:
         place = f"candidates.{name}.model"
-        raise StudyError(*dict.fromkeys(line(item, place) for item in error.errors(include_url=False))) from None
+        raise StudyError(*lines(error, place)) from None
     return {**blocks, "data": file.read(folder, specimen)}
 
 
