@@ -145,7 +145,8 @@ class Materials:
 
     def admissible(self, values: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
         """Return which parameters, arrays (n,) by name, are of materials (n,)."""
-        return np.asarray(np.all([admissible(self.energy, own) for _, own in self._at(values)], axis=0))
+        found = [admissible(self.energy, own) for _, own in self._at(values)]
+        return np.asarray(np.all(np.broadcast_arrays(*found), axis=0))  # a place may have no parameters of its own
 
     def _at(self, values: Values) -> Iterator[tuple[str, dict[str, Any]]]:
         for place, own in self.constants.items():
