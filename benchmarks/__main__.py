@@ -6,6 +6,7 @@ import sys
 
 from benchmarks import (
     bookkeeping,
+    buckling,
     calibration,
     chaos,
     fields,
@@ -35,6 +36,7 @@ ALL = {
     "streaming": streaming.main,
     "stability": stability.main,
     "locking": locking.main,
+    "buckling": buckling.main,
     "chaos": chaos.main,
     "scaling": scaling.main,
     "startup": startup.main,

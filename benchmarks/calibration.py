@@ -79,7 +79,7 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     assert slopes is not None
     sizes = [np.sqrt((part**2).mean()) for part in model.values(solution.outputs)]
     sigma = noise * np.array(sizes)[model.cases]
-    start = Prediction(centre, state[0], slopes)
+    start = Prediction(centre, state[0], slopes, inputs.coordinates, inputs.std)
     return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), sigma, start=start)
 
 

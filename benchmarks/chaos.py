@@ -270,6 +270,7 @@ def _own_fields(inputs: Inputs, order: int, points: FloatArray, fields: FloatArr
                 np.zeros((1, len(WORK)), dtype=np.int64),
                 np.zeros(1),
                 np.ones(1, dtype=bool),
+                np.zeros(1, dtype=np.int8),
                 (state - fields[0])[None, :],
             )
         )

@@ -29,6 +29,7 @@ from forward.newton import Residual
 from forward.own_mesh import OwnMesh
 from forward.vertex_fields import VertexField
 
+NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
 _OPS = SimpleNamespace(
@@ -97,7 +98,7 @@ class Discretisation:
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._loads = self._virtual_works()
-        self._symmetric = not any(isinstance(load, Pressure) for load in spec.loads)
+        self.symmetric = not any(isinstance(load, Pressure) for load in spec.loads)
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
@@ -111,6 +112,7 @@ class Discretisation:
         self._rounding: float | None = None
         self._given: FloatArray | None = None  # parameters that are set
         self._stretch = self._small_stretch()
+        self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
@@ -282,7 +284,7 @@ class Discretisation:
 
     @cached_property
     def _transposed_action(self) -> fenicsx.VectorAssembler:
-        if self._symmetric:
+        if self.symmetric:
             return self._stiffness_action
         return self.vector(self.derivative(ufl.action(self._imbalance_form(), self._along)))
 
@@ -317,7 +319,7 @@ class Discretisation:
     def new_solver(self) -> fenicsx.DirectSolver:
         """Return a matrix and a solver of their own for the stiffness."""
         return fenicsx.DirectSolver(
-            self._stiffness, self._constraints, self.unknowns, self.comm, symmetric=self._symmetric
+            self._stiffness, self._constraints, self.unknowns, self.comm, symmetric=self.symmetric
         )
 
     # --- state and parameters ----------------------------------------------------------------------------------------
@@ -558,6 +560,68 @@ class Discretisation:
         self.set_state(u)
         return fenicsx.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
 
+    def assembled_stiffness(self) -> Any:
+        """The stiffness at the state that is set, for `products`; the factor of `factorise` is lost."""
+        return self._solver.assembled()
+
+    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
+        """Products (k, U_local) of such a matrix with rows (k, U_local)."""
+        return self._solver.products(matrix, rows)
+
+    @cached_property
+    def _symmetric_stiffness(self) -> Any:
+        """The symmetric part of the stiffness, compiled; the stiffness itself where it is symmetric."""
+        if self.symmetric:
+            return self._stiffness
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        form = ufl.derivative(self._imbalance_form(), self._state, trial)
+        return fenicsx.compile_form(0.5 * form + 0.5 * ufl.adjoint(form), self.comm)
+
+    def new_symmetric_solver(self) -> fenicsx.DirectSolver:
+        """Return a matrix and a solver of their own for the symmetric part of the stiffness."""
+        return fenicsx.DirectSolver(
+            self._symmetric_stiffness, self._constraints, self.unknowns, self.comm, symmetric=True
+        )
+
+    @cached_property
+    def _symmetric_part(self) -> fenicsx.DirectSolver:
+        return self.new_symmetric_solver()
+
+    def negative_eigenvalues(self, u: FloatArray) -> int:
+        """Factorise at u (U_local,); return the number of negative eigenvalues, of the symmetric part under pressures.
+
+        Those of the condensed stiffness: in the mixed form each pressure adds one, which does not count.
+        """
+        if self.symmetric:
+            self.factorise(u)
+            return self.negative_pivots()
+        self.set_state(u)
+        self.work.assemblies += 1
+        self.work.factorisations += 1
+        self._symmetric_part.factorise()
+        return self._symmetric_part.negative_pivots() - self.unknowns.pressures
+
+    @cached_property
+    def free_displacements(self) -> FloatArray:
+        """1 on free displacements, 0 on other unknowns (U_local,)."""
+        free = np.zeros(self.size)
+        free[: 3 * self.nodes_owned] = 1
+        free[self.fixed] = 0
+        return free
+
+    def stiffness_near(self, u: FloatArray, imbalance: FloatArray, rows: FloatArray) -> FloatArray:
+        """Products (k, U_local) of the stiffness of the free unknowns at u (U_local,) with rows, to a few digits.
+
+        They are differences from the `imbalance` at u (that of a `Residual`).
+        """
+        largest = np.abs(rows[:, : 3 * self.nodes_owned]).max(axis=1, initial=0.0)
+        products = np.empty_like(rows)
+        for row, product, size in zip(rows, products, largest, strict=True):
+            step = self._nudge / max(-fenicsx.smallest(self.comm, -float(size)), float(np.finfo(float).tiny))
+            product[:] = (self._imbalance(u + step * row) - imbalance) / step
+        products[:, self.fixed] = 0
+        return products
+
     def negative_pivots(self) -> int:
         """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; −1 if unknown."""
         found = self._solver.negative_pivots()
@@ -589,9 +653,12 @@ class Discretisation:
 
     def right_sides_of_all(self) -> FloatArray:
         """Right-hand sides (d, U_local) of the tangents along every parameter, at the state set."""
-        right = np.zeros((len(self.parameters), self.size))
-        right[self.scalars] = self.right_sides()
-        return right + self.field_right_sides(np.eye(len(right))) if self.fields else right
+        return self.right_sides_along(np.eye(len(self.parameters)))
+
+    def right_sides_along(self, directions: FloatArray) -> FloatArray:
+        """Right-hand sides (k, U_local) of the tangents along directions (k, d) of the parameters, at the state set."""
+        right = directions[:, self.scalars] @ self.right_sides()
+        return right + self.field_right_sides(directions) if self.fields else right
 
     def field_right_sides(self, directions: FloatArray) -> FloatArray:
         """Right-hand sides (k, U_local) of tangents along what directions (k, d) change of fields, at the state set."""

@@ -578,6 +578,8 @@ class DirectSolver:
         # Room for what pivoting adds to the factor, in per cent of MUMPS's own estimate.
         self._ksp.pc.setFactorSetUpSolverType()
         self._ksp.pc.getFactorMatrix().setMumpsIcntl(14, 60)
+        if symmetric:  # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots
+            self._ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
         self._right = self._matrix.createVecLeft()
         self._solution = self._matrix.createVecRight()
 
@@ -589,9 +591,7 @@ class DirectSolver:
         SolveError
             If the matrix is singular or has entries that are not finite.
         """
-        self._matrix.zeroEntries()
-        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
-        self._matrix.assemble()
+        self._assemble()
         self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
         status = self._ksp.pc.getFactorMatrix().getMumpsInfog(1)
         if status < 0:
@@ -599,6 +599,25 @@ class DirectSolver:
                 "the stiffness is singular" if status == -10 else f"the factorisation failed (MUMPS error {status})"
             )
             raise SolveError(message)
+
+    def _assemble(self) -> None:
+        self._matrix.zeroEntries()
+        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
+        self._matrix.assemble()
+
+    def assembled(self) -> Any:
+        """Assemble; return a copy of the matrix, for `products`. The factor at hand is that of another matrix then."""
+        self._assemble()
+        return self._matrix.copy()
+
+    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
+        """Return the products (k, n) of such a matrix with rows (k, n)."""
+        found = np.empty_like(rows)
+        for row, product in zip(rows, found, strict=True):
+            self._right.array[:] = self._unknowns.reorder(row)
+            matrix.mult(self._right, self._solution)
+            product[:] = self._unknowns.take(self._solution.array_r)
+        return found
 
     def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""

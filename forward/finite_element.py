@@ -17,10 +17,11 @@ from forward.acceleration import Inverse, block_galerkin
 from forward.discretisation import Discretisation
 from forward.functionals import functional
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, InadmissibleError, Reference, Work
-from forward.newton import Found, solve
+from forward.model import FloatArray, InadmissibleError, Reference, SolveError, Stability, Work
+from forward.newton import Found, Residual, solve
 from forward.own_mesh import OwnMesh
 from forward.reference import ReferenceFactor, turn
+from forward.stability import NOT_SCREENED, Screened, draw
 
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of these derivatives, before a factor is made after all
@@ -110,15 +111,19 @@ class HyperelasticModel:
             raise InadmissibleError(objection)
         if self.spec.solver.kind == "newton" or start is None:
             reference = None
+        screen = False
         if reference is not None:
             self.reference.prepare(reference)
+            screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
         body.work = Work()
         body.set_parameters(parameters)
-        way = None if reference is None else _Way(self, reference, parameters)
+        way = None if reference is None else _Way(self, reference, parameters, screen=screen)
         found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
-        corrected = way is not None and way.rotation is not None and body.work.factorisations == 0
-        return FiniteElementSolution(self, parameters, found, body.work, way if corrected else None)
+        solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
+        if found.stability >= Stability.COUNTED and body.symmetric:
+            self._factorised = solution
+        return solution
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -171,7 +176,20 @@ class HyperelasticModel:
             self._factorised = None  # a factorisation that fails leaves no factor
             body.factorise(solution.state)
             self._factorised = solution
+            if solution.stability == Stability.SCREENED and body.symmetric:
+                negative = body.negative_pivots()
+                if negative > 0:
+                    message = (
+                        f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
+                        "derivative has shown: the body buckles, or its mesh is too coarse"
+                    )
+                    raise SolveError(message, work=solution.work, stability=Stability.MISSED)
+                solution.stability = Stability.COUNTED
         return body
+
+    def has_factor(self, solution: FiniteElementSolution) -> bool:
+        """Whether the factor at hand is that of a solution."""
+        return self._factorised is solution
 
     def take_reference(self, reference: Reference) -> ReferenceFactor:
         """Return the factor of a reference; this may change parameters and state."""
@@ -191,9 +209,13 @@ class _Way:
         Of the reference.
     rotation
         Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    draw
+        A number in [0, 1) that depends on the parameters asked for.
     """
 
-    def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray) -> None:
+    def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray, *, screen: bool) -> None:
+        self._screen = screen
+        self.draw = draw(parameters)
         self._body, self._factor = model.body, model.reference
         self._from, self._to = reference.parameters, parameters
         self.reference = reference
@@ -203,6 +225,11 @@ class _Way:
     def inverse(self, u: FloatArray) -> Inverse:
         self.rotation = self._factor.rotation(u)
         return self._factor.inverse(self.rotation)
+
+    def screen(self, u: FloatArray, residual: Residual) -> Screened:
+        if not self._screen or self.rotation is None:
+            return NOT_SCREENED
+        return self._factor.screen(u, residual.vector, self.rotation)
 
     def at(self, fraction: float) -> None:
         self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
@@ -228,6 +255,7 @@ class FiniteElementSolution:
         self.parameters = np.array(parameters, dtype=float)
         self.state = np.array(found.state)
         self.residual, self.converged = found.residual, found.converged
+        self.stability = found.stability
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
@@ -256,7 +284,8 @@ class FiniteElementSolution:
     def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
         """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
         model = self._model
-        if self._reference is not None and self._rotation is not None and len(right) <= FEW:
+        near = self._reference is not None and not model.has_factor(self)
+        if near and self._reference is not None and self._rotation is not None and len(right) <= FEW:
             found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
             if found is not None:
                 return found

@@ -43,12 +43,12 @@ class Layout:
         self._space = space
         self._comm = comm
         self.coordinates, self._canonical, self.positions = sorted_by_place(space, comm)
-        self._size = self.coordinates.size
+        self.size = self.coordinates.size
         self._unknowns = (3 * self.positions[:, None] + np.arange(3)).ravel()
         if pressure is not None:
             vertices, _, positions = sorted_by_place(pressure, comm)
-            self._unknowns = np.concatenate([self._unknowns, self._size + positions])
-            self._size += len(vertices)
+            self._unknowns = np.concatenate([self._unknowns, self.size + positions])
+            self.size += len(vertices)
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
@@ -59,7 +59,7 @@ class Layout:
         parts = self._comm.gather((self._unknowns, rows))
         if parts is None:
             return None
-        whole = np.empty((len(rows), self._size))
+        whole = np.empty((len(rows), self.size))
         for unknowns, part in parts:
             whole[:, unknowns] = part
         return whole

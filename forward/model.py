@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from enum import IntEnum
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -34,6 +35,16 @@ class Work:
 WORK = tuple(field.name for field in fields(Work))
 
 
+class Stability(IntEnum):
+    """How it was looked at whether an equilibrium is stable, and what was found."""
+
+    NOT_TESTED = 0  # it was not asked for, or the state is none that can be unstable, or no equilibrium
+    SCREENED = 1  # a few directions that are likely to show an instability show none
+    COUNTED = 2  # the stiffness at the state has no negative eigenvalue
+    REFUSED = 3  # the stiffness at an equilibrium has some, and no stable one was found
+    MISSED = 4  # the same where the screen had shown none, or where another equilibrium was found then
+
+
 class SolveError(Exception):
     """The model has no answer at these parameters; the message says where the solver stopped and why.
 
@@ -45,13 +56,22 @@ class SolveError(Exception):
         The iterations that led there, one line each.
     work
         What was spent on the attempt.
+    stability
+        Whether it is an equilibrium that was refused.
     """
 
-    def __init__(self, reason: str, history: Sequence[str] = (), work: Work | None = None) -> None:
+    def __init__(
+        self,
+        reason: str,
+        history: Sequence[str] = (),
+        work: Work | None = None,
+        stability: Stability = Stability.NOT_TESTED,
+    ) -> None:
         super().__init__(reason)
         self.reason = reason
         self.history = tuple(history)
         self.work = work or Work()
+        self.stability = stability
 
 
 class InadmissibleError(SolveError):
@@ -94,16 +114,18 @@ class Reference:
         Where (d,).
     state
         This rank's part (U_local,) of the state there.
+    spread
+        Standard deviations (d,) of the parameters, where they are known.
     """
 
     parameters: FloatArray
     state: FloatArray
+    spread: FloatArray | None = None
 
     def same(self, other: Reference) -> bool:
-        """Whether both are at the same place."""
-        return self is other or (
-            np.array_equal(self.parameters, other.parameters) and np.array_equal(self.state, other.state)
-        )
+        """Whether both are at the same place, for the same parameters."""
+        pairs = zip(*([one.parameters, one.state, one.spread] for one in (self, other)), strict=True)
+        return self is other or all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
 class Solution(Protocol):
@@ -131,6 +153,10 @@ class Solution(Protocol):
     @property
     def converged(self) -> bool:
         """Whether that meets the solver's tolerance (or is rounding); if not, the solver was stopped before."""
+
+    @property
+    def stability(self) -> Stability:
+        """What is known of the stability of the equilibrium so far."""
 
     @property
     def work(self) -> Work:
@@ -290,6 +316,11 @@ class FunctionSolution:
     def converged(self) -> bool:
         """Always."""
         return True
+
+    @property
+    def stability(self) -> Stability:
+        """No equilibrium that could be unstable."""
+        return Stability.NOT_TESTED
 
     @property
     def work(self) -> Work:

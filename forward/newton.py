@@ -20,8 +20,9 @@ import numpy as np
 from pydantic import Field
 
 from forward.acceleration import AndersonMixing, Inverse
-from forward.model import FloatArray, SolveError, Work
+from forward.model import FloatArray, SolveError, Stability, Work
 from forward.settings import Settings
+from forward.stability import NOT_SCREENED, Screened
 
 
 class SolverSettings(Settings):
@@ -48,7 +49,8 @@ class SolverSettings(Settings):
     minimum_load_step
         Smallest load step, as a fraction of the load, before the solver gives up.
     accept_unstable
-        Whether an equilibrium counts where the stiffness is known to have negative eigenvalues (the body has buckled).
+        Whether an equilibrium counts where the stiffness has negative eigenvalues (the body has buckled). Nothing is
+        then spent on looking for them.
     """
 
     kind: Literal["predict-correct", "newton"] = "predict-correct"
@@ -72,6 +74,7 @@ POLISH = 8  # corrections with the factor of a Newton step
 ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
 ASTRAY = 100  # relative residual after the corrections that were allowed: the reference is too far away
 SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
+LOCATED = 1 / 64  # load step that is not halved any more where it leads to an unstable equilibrium
 STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
 
 
@@ -161,6 +164,15 @@ class System(Protocol):
         A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
         """
 
+    def negative_eigenvalues(self, u: FloatArray) -> int:
+        """Factorise the stiffness at u; return the same of it, or of its symmetric part where it is not symmetric.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+
 
 class Way(Protocol):
     """The way in parameters from a reference state, whose factor is at hand, to the values that are asked for."""
@@ -168,6 +180,13 @@ class Way(Protocol):
     @property
     def state(self) -> FloatArray:
         """The state (U_local,) of the reference."""
+
+    @property
+    def draw(self) -> float:
+        """A number in [0, 1) that depends on the parameters only: states are counted where it is small."""
+
+    def screen(self, u: FloatArray, residual: Residual) -> Screened:
+        """Return what the screen of `forward.stability` says of an equilibrium."""
 
     def at(self, fraction: float) -> None:
         """Give the system the parameters after a part of the way."""
@@ -177,15 +196,40 @@ class Way(Protocol):
 
 
 class Found(NamedTuple):
-    """A state (U_local,), its relative residual, and whether it is an equilibrium to the solver's tolerance."""
+    """A state (U_local,) and what is known of it.
+
+    Attributes
+    ----------
+    state
+        The state.
+    residual
+        Its relative residual.
+    converged
+        Whether it is an equilibrium to the solver's tolerance.
+    corrected
+        Whether it was found with the factor of the reference.
+    stability
+        How its stability was looked at; where that is by counting, the last factor is that of the stiffness there.
+    """
 
     state: FloatArray
     residual: float
     converged: bool = True
+    corrected: bool = False
+    stability: Stability = Stability.NOT_TESTED
 
 
 class _Diverged(Exception):  # noqa: N818 - control flow inside this file
     """An attempt at one load failed, for the reason given."""
+
+
+class _Unstable(_Diverged):
+    """An equilibrium was found that is not stable."""
+
+    def __init__(self, negative: int, *, missed: bool) -> None:
+        what = f"the equilibrium is unstable (its stiffness has {_counted(negative)})"
+        super().__init__(f"{what}: the body buckles, or its mesh is too coarse")
+        self.stability = Stability.MISSED if missed else Stability.REFUSED
 
 
 def solve(
@@ -226,26 +270,44 @@ def solve(
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
     history: list[str] = []
+    refused = Stability.NOT_TESTED  # of equilibria at full load
+
+    def failed(stop: _Diverged) -> None:
+        nonlocal refused
+        if isinstance(stop, _Unstable):
+            refused = max(refused, stop.stability)
+
+    def known(found: Found) -> Found:
+        # What the screen has missed is to be known, even where another equilibrium is found in its place.
+        return found._replace(stability=refused) if refused == Stability.MISSED else found
+
     if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
         system.at_load(1.0)
         try:
             return _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
         except _Diverged as stop:
             history.append(f"{stop}: the equilibrium is looked for after all")
+            failed(stop)
     from_zero = start is None or (settings.kind == "newton" and iterations is None)
     guesses = [zero] if start is None or from_zero else [start, zero]
     if way is not None and len(guesses) == 2:
         system.at_load(1.0)
         try:
-            return _predict_correct(system, settings, guesses[0], way, history)
-        except _Diverged:
-            pass
+            return known(_predict_correct(system, settings, guesses[0], way, history))
+        except _Diverged as stop:
+            failed(stop)
     for guess in guesses:
         try:
-            return _newton(system, settings, guess, history, 1.0)[0]
-        except _Diverged:
-            continue
-    return _load_steps(system, settings, zero, history)
+            return known(_newton(system, settings, guess, history, 1.0)[0])
+        except _Diverged as stop:
+            failed(stop)
+    try:
+        return known(_load_steps(system, settings, zero, history))
+    except SolveError as error:
+        if refused != Stability.NOT_TESTED:
+            message = f"{error.reason}; the equilibrium that was found at full load is unstable"
+            raise SolveError(message, error.history, error.work, refused) from None
+        raise
 
 
 def _iterate_few(
@@ -275,8 +337,8 @@ def _iterate_few(
             if mixing is not None and last is not None and not _convex(system, last, (u, residual)):
                 message = "the stiffness is indefinite along the last move"
                 raise _Diverged(message)
-            factorised = mixing is None and iteration > 0
-            return Found(_accepted(system, settings, u, factorised=factorised), residual.relative)
+            stability = _accepted(system, settings, u, residual, way if mixing is not None else None, history)
+            return Found(u, residual.relative, corrected=mixing is not None, stability=stability)
         if iteration == iterations:
             break
         last = (u, residual)
@@ -289,7 +351,8 @@ def _iterate_few(
     if mixing is not None and residual.relative > ASTRAY:
         message = "the reference is too far away"
         raise _Diverged(message)
-    return Found(_accepted(system, settings, u, factorised=False), residual.relative, converged=False)
+    _check_jacobian(system, u)  # no equilibrium, so neither stable nor unstable
+    return Found(u, residual.relative, converged=False, corrected=mixing is not None)
 
 
 def _convex(system: System, before: tuple[FloatArray, Residual], now: tuple[FloatArray, Residual]) -> bool:
@@ -319,7 +382,8 @@ def _predict_correct(
         if close:
             u, residual, close = _mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
         if close and target == 1:
-            return Found(u, residual.relative)
+            stability = _accepted(system, settings, u, residual, way, history)
+            return Found(u, residual.relative, corrected=True, stability=stability)
         if close:
             known.append((target, ((u - way.state) / target - slope) / target))
             reached, target = target, 1.0
@@ -406,7 +470,10 @@ def _load_steps(system: System, settings: SolverSettings, zero: FloatArray, hist
         except _Diverged as stop:
             step /= 2
             slope = np.zeros_like(zero)
-            if step < settings.minimum_load_step:
+            smallest = settings.minimum_load_step
+            if isinstance(stop, _Unstable):
+                smallest = max(smallest, LOCATED)  # smaller steps find the same branch and where it ends
+            if step < smallest:
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
                 jacobian = system.smallest_jacobian(found.state)
                 if jacobian < SQUEEZED:
@@ -445,7 +512,7 @@ def _iterate(
     for iteration in range(settings.iterations + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if _converged(system, settings.tolerance, u, residual, sizes):
-            return Found(_accepted(system, settings, u, factorised=iteration > 0), residual.relative), iteration
+            return Found(u, residual.relative, stability=_accepted(system, settings, u, residual)), iteration
         if iteration == settings.iterations:
             break
         _factorise(system, u)
@@ -458,7 +525,7 @@ def _iterate(
         if settings.kind != "newton" and length < NEAR * before < np.inf:
             u, residual, reached = _mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
-                return Found(_accepted(system, settings, u, factorised=True), residual.relative), iteration + 1
+                return Found(u, residual.relative, stability=_accepted(system, settings, u, residual)), iteration + 1
     message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
     raise _Diverged(message + _instability(system))
 
@@ -470,20 +537,43 @@ def _factorise(system: System, u: FloatArray) -> None:
         raise _Diverged(error.reason) from None
 
 
-def _accepted(system: System, settings: SolverSettings, u: FloatArray, *, factorised: bool) -> FloatArray:
-    """Return an equilibrium if no cell is turned inside out and it is not known to be unstable."""
+def _accepted(
+    system: System,
+    settings: SolverSettings,
+    u: FloatArray,
+    residual: Residual,
+    way: Way | None = None,
+    history: list[str] | None = None,
+) -> Stability:
+    """Look at an equilibrium: no cell is turned inside out and it is not unstable, or raise `_Diverged`.
+
+    What counts is the stiffness at the state itself, however it was found. Only where a reference is at hand may a
+    screen take the place of counting its negative eigenvalues.
+    """
+    _check_jacobian(system, u)
+    if settings.accept_unstable:
+        return Stability.NOT_TESTED
+    seen = NOT_SCREENED
+    if way is not None:
+        seen = way.screen(u, residual)
+        if history is not None:
+            history.append(f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}")
+        if way.draw >= seen.chance:
+            return Stability.SCREENED
+    try:
+        negative = system.negative_eigenvalues(u)
+    except SolveError as error:
+        raise _Diverged(error.reason) from None
+    if negative > 0:
+        raise _Unstable(negative, missed=seen.clear)
+    return Stability.COUNTED
+
+
+def _check_jacobian(system: System, u: FloatArray) -> None:
     jacobian = system.smallest_jacobian(u)
     if not jacobian > 0:
         message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
         raise _Diverged(message)
-    if factorised and not settings.accept_unstable and system.negative_pivots() > 0:
-        _factorise(system, u)  # the factor at hand is that of a state nearby
-        negative = system.negative_pivots()
-        if negative > 0:
-            what = f"the equilibrium is unstable (its stiffness has {_counted(negative)})"
-            message = f"{what}: the body buckles, or its mesh is too coarse"
-            raise _Diverged(message)
-    return u
 
 
 def _admissible_step(

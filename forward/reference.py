@@ -8,16 +8,19 @@ polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. St
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.acceleration import Inverse
 from forward.model import FloatArray, Reference, Work
+from forward.stability import BLOCK, Rows, Screened, screen, screening_vectors
 
 if TYPE_CHECKING:
     from forward.discretisation import Discretisation
+    from forward.fenicsx import DirectSolver
 
 
 def rotations(F: FloatArray) -> FloatArray:
@@ -82,6 +85,10 @@ def turned(inverse: Inverse, R: FloatArray, fixed: NDArray[np.int64]) -> Inverse
     return correct
 
 
+STEP = 1e-3  # of the differences of stiffnesses, in standard deviations
+DIRECTIONS = 6  # in which parameters are changed for the screen: one after the other or, if there are more, at random
+
+
 class ReferenceFactor:
     """The factor of a reference state of a body, as an approximate inverse of the stiffness at other states."""
 
@@ -91,12 +98,14 @@ class ReferenceFactor:
         self._rotations = np.empty((3, 3, 0))
         self._reference: Reference | None = None
         self._slopes: FloatArray | None = None
+        self._vectors: FloatArray | None = None
+        self._screening: DirectSolver | None = None  # where the stiffness is not symmetric
 
     def prepare(self, reference: Reference) -> None:
         """Factorise at a reference, if the factor at hand is another's; this changes parameters and state."""
         if self._reference is not None and self._reference.same(reference):
             return
-        self._reference = self._slopes = None
+        self._reference = self._slopes = self._vectors = None
         body = self._set(reference)
         self._solver.factorise()
         self._rotations = rotations(body.gradients())
@@ -119,6 +128,90 @@ class ReferenceFactor:
             body.work = kept
         return self._slopes
 
+    def prepare_screen(self) -> bool:
+        """Make the vectors that show instabilities, if they are not there; this may change parameters and state.
+
+        False where there are none: without spread of the parameters, or where the reference itself is not stable.
+        """
+        assert self._reference is not None
+        reference, body = self._reference, self._body
+        if reference.spread is None or not np.isfinite(reference.spread).all():
+            return False
+        if self._vectors is None and not body.symmetric:
+            self._set(reference)
+            self._screening = self._screening or body.new_symmetric_solver()
+            self._screening.factorise()
+        if self._definite().negative_pivots() != body.unknowns.pressures:
+            return False
+        if self._vectors is None:
+            kept, body.work = body.work, Work()  # charged to none, as the factor
+            random = np.random.default_rng(0)
+            forces = body.layout.scatter(random.standard_normal((BLOCK, body.layout.size)))
+            self._vectors = screening_vectors(
+                self._changes(reference, random),
+                self._definite().solve,
+                forces,
+                body.free_displacements,
+                body.total,
+            )
+            body.work = kept
+        return True
+
+    def _definite(self) -> DirectSolver:
+        """The factor of the symmetric part of the stiffness at the reference."""
+        if self._body.symmetric:
+            return self._solver
+        assert self._screening is not None
+        return self._screening
+
+    def _changes(self, reference: Reference, random: np.random.Generator) -> Iterator[Rows]:
+        """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents."""
+        assert reference.spread is not None
+        body, d = self._body, len(reference.parameters)
+        if d <= DIRECTIONS:
+            directions = np.diag(reference.spread)[reference.spread > 0]
+        else:
+            directions = random.standard_normal((DIRECTIONS, d)) * reference.spread
+        self._set(reference)
+        slopes = self._solver.solve(body.right_sides_along(directions))
+        for direction, slope in zip(directions, slopes, strict=True):
+            ends: list[tuple[float, Any, FloatArray]] = []
+            for step in (STEP, -STEP):
+                state = reference.state + step * slope
+                R = self.rotation(state)
+                body.set_parameters(reference.parameters + step * direction)
+                body.at_load(1.0)
+                body.set_state(state)
+                ends.append((step, body.assembled_stiffness(), R))
+
+            def multiply(rows: FloatArray, ends: list[tuple[float, Any, FloatArray]] = ends) -> FloatArray:
+                # As the screen sees it: turned along with the body, so that its rotations are no change.
+                total = np.zeros_like(rows)
+                for step, matrix, R in ends:
+                    along = turn(rows, R)
+                    along[:, body.fixed] = 0
+                    total += turn(body.products(matrix, along), R.swapaxes(0, 1)) / (2 * step)
+                total[:, body.fixed] = 0
+                return total
+
+            yield multiply
+            for _, matrix, _ in ends:
+                matrix.destroy()
+
+    def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
+        """Return what the screen says of a state u (U_local,), with its imbalance, turned by R from the reference."""
+        assert self._vectors is not None
+        body, free = self._body, self._body.free_displacements
+        vectors = turn(self._vectors, R)
+        vectors[:, body.fixed] = 0
+        return screen(
+            vectors,
+            lambda rows: body.stiffness_near(u, imbalance, rows),
+            self._inverse(self._definite(), R),
+            free,
+            body.total,
+        )
+
     def rotation(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
         body = self._body
@@ -127,10 +220,13 @@ class ReferenceFactor:
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
+        return self._inverse(self._solver, R, transpose=transpose)
+
+    def _inverse(self, solver: DirectSolver, R: FloatArray, *, transpose: bool = False) -> Inverse:
         body = self._body
 
         def inverse(right: FloatArray) -> FloatArray:
             body.work.back_substitutions += 1 if right.ndim == 1 else len(right)
-            return self._solver.solve(right, transpose=transpose)
+            return solver.solve(right, transpose=transpose)
 
         return turned(inverse, R, body.fixed)

@@ -25,7 +25,7 @@ from forward.inclusions import Inclusion
 from forward.loads import Displacement, Load
 from forward.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials import splits
-from forward.model import Finding, FloatArray, Reference, SolveError, Work
+from forward.model import Finding, FloatArray, Reference, SolveError, Stability, Work
 from forward.newton import SolverSettings
 from forward.outputs import Output
 from forward.settings import Settings, nearest
@@ -363,12 +363,15 @@ class SpecimenModel:
         solutions = []
         parts = zip(self.spec.cases, self.models, self.positions, starts, references, strict=True)
         for case, model, where, begin, state in parts:
-            near = None if reference is None or state is None else Reference(reference.parameters[where], state)
+            near = None
+            if reference is not None and state is not None:
+                spread = None if reference.spread is None else reference.spread[where]
+                near = Reference(reference.parameters[where], state, spread)
             try:
                 solutions.append(model.solve(parameters[where], begin, near, iterations))
             except SolveError as error:
                 message = f"load case '{case.name}': {error.reason}"
-                raise type(error)(message, error.history, error.work) from error
+                raise type(error)(message, error.history, error.work, error.stability) from error
         return SpecimenSolution(self, tuple(solutions))
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
@@ -403,6 +406,12 @@ class SpecimenSolution:
             array.flags.writeable = False
         self.residual = max(solution.residual for solution in solutions)
         self.converged = all(solution.converged for solution in solutions)
+
+    @property
+    def stability(self) -> Stability:
+        """What is known of the case of which least is known; an instability that was missed counts more."""
+        known = [solution.stability for solution in self.solutions]
+        return max(known) if Stability.MISSED in known else min(known)
 
     @property
     def work(self) -> Work:

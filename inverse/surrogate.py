@@ -87,7 +87,16 @@ class Surrogate:
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals = np.where(outside, np.nan, 0.0)
         return Evaluations(
-            points, outputs, tangents, failures, np.zeros(n), work, residuals, ~outside, np.zeros((0, 0))
+            points,
+            outputs,
+            tangents,
+            failures,
+            np.zeros(n),
+            work,
+            residuals,
+            ~outside,
+            np.zeros(n, dtype=np.int8),
+            np.zeros((0, 0)),
         )
 
 

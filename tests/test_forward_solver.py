@@ -57,7 +57,9 @@ def test_load_steps_succeed_where_newton_from_zero_fails(heavy):
 @pytest.mark.parametrize(("axis", "distance"), [("x", -0.6), ("x", 2.0), ("y", -1.5), ("y", 4.0)])
 def test_large_prescribed_displacements(axis, distance):
     grip = {"on": "x-max", "x": 0.0, "y": 0.0, "z": 0.0}
-    spec = unloaded_body("mooney-rivlin", body=CUBE, displacements=(grip,), outputs=INTEGRALS)
+    # Pulled to three times its length, this coarse cube has an eigenvalue below zero.
+    solver = {"tolerance": 1e-12, "accept_unstable": (axis, distance) == ("x", 2.0)}
+    spec = unloaded_body("mooney-rivlin", body=CUBE, displacements=(grip,), outputs=INTEGRALS, solver=solver)
     model = spec.build(MPI.COMM_SELF, (f"displacements.x-max.{axis}",))
     check(model, model.solve(np.array([distance])))
 
@@ -140,7 +142,7 @@ def test_a_prediction_changes_the_cost_and_not_the_answer(model):
     assert predicted.work.back_substitutions < from_zero.work.back_substitutions
     check(model, predicted)
     again = model.solve(POINT + change, from_zero.state)
-    assert again.work.factorisations == 0
+    assert again.work.factorisations == 1  # that which counts the negative eigenvalues there
 
 
 @pytest.mark.parametrize("wrong", [np.nan, 1e6, 1.0, -0.7])

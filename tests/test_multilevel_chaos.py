@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError, Work
+from forward.model import FunctionModel, SolveError, Stability, Work
 from tests.launch import run_script
 from uq import chaos
 from uq.basis import gauss, hyperbolic, orthonormal
@@ -42,6 +42,7 @@ class Approached:
     residual: float
     converged: bool
     work: Work
+    stability: Stability = Stability.NOT_TESTED
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def test_settings_that_cannot_work_are_refused():
 def test_an_expansion_predicts_and_is_part_of_the_name_of_a_block(tmp_path):
     basis = orthonormal(INPUTS, hyperbolic(2, 3, 1.0))
     rng = np.random.default_rng(0)
-    start = StateExpansion(basis, rng.random((10, 3)), INPUTS.mean, np.zeros(3))
+    start = StateExpansion(basis, rng.random((10, 3)), INPUTS.mean, np.zeros(3), INPUTS.std)
     predict, reference = start.on(Contraction())
     points = rng.random((5, 2))
     for point, row in zip(points, basis.values(points), strict=True):
@@ -188,7 +189,7 @@ def test_an_expansion_predicts_and_is_part_of_the_name_of_a_block(tmp_path):
         np.testing.assert_allclose(predict(point), row @ start.coefficients, rtol=1e-14)
     np.testing.assert_array_equal(reference.parameters, INPUTS.mean)
     checkpoint = Checkpoint(tmp_path, "study")
-    other = StateExpansion(basis, start.coefficients * (1 + 1e-15), INPUTS.mean, np.zeros(3))
+    other = StateExpansion(basis, start.coefficients * (1 + 1e-15), INPUTS.mean, np.zeros(3), INPUTS.std)
     keys = {checkpoint.key(Request(points, start=s, iterations=i)) for s in (start, other, None) for i in (None, 1, 2)}
     assert len(keys) == 9
 
@@ -224,7 +225,8 @@ def test_the_beam_by_corrections_is_the_beam_by_newton(beam):
         assert (np.abs(data[name] - published[name]) <= 2 * spread).all()
         np.testing.assert_allclose(data[name], published[name], rtol=1e-3)
     counts = {n: d["level_work"].sum("level").to_series() for n, d in (("this", data), ("published", published))}
-    assert counts["this"]["factorisations"] == counts["this"]["assemblies"] == 0
+    # Those of the last level whose negative eigenvalues were counted.
+    assert counts["this"]["factorisations"] == counts["this"]["assemblies"] < 3
     assert counts["published"]["factorisations"] > 100
     # An iteration is a residual and a back-substitution, after the residual of the start.
     first = data["level_work"].isel(level=0).to_series()
@@ -247,7 +249,7 @@ def test_a_chaos_prediction_saves_corrections(beam):
     points = inputs.points(np.random.default_rng(0).random((40, 2)))
     states = model.gather(np.array([model.solve(p, centre.prediction.on(model)[0](p)).state for p in points]))
     coefficients = np.linalg.lstsq(basis.values(points), states, rcond=None)[0]
-    start = StateExpansion(basis, coefficients, centre.point, centre.state)
+    start = StateExpansion(basis, coefficients, centre.point, centre.state, centre.spread)
     fresh = inputs.points(np.random.default_rng(1).random((20, 2)))
     tangent, expanded = (evaluate(Request(fresh, start=s)) for s in (centre.prediction, start))
     np.testing.assert_allclose(expanded.outputs, tangent.outputs, rtol=1e-7)

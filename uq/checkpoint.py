@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Protocol
 import h5py
 import numpy as np
 
-from forward.model import WORK, ModelError
+from forward.model import WORK, ModelError, Stability
 from uq.evaluate import Evaluations, Failure
 
 _HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
@@ -155,6 +155,8 @@ def _write(
             group["work"].attrs["columns"] = list(WORK)
             group["residuals"] = block.residuals
             group["converged"] = block.converged
+            group["stability"] = block.stability
+            group["stability"].attrs["values"] = [known.name.lower().replace("_", " ") for known in Stability]
             group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
             if block.tangents is not None:
                 group["tangents"] = block.tangents
@@ -229,6 +231,7 @@ def _read(path: Path, name: str) -> Evaluations:
                 np.asarray(file["work"]),
                 np.asarray(file["residuals"]),
                 np.asarray(file["converged"]),
+                np.asarray(file["stability"]),
                 np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
             )
     except (OSError, KeyError, ValueError) as error:

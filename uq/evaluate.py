@@ -54,6 +54,8 @@ class Evaluations:
         Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
     converged
         Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
+    stability
+        Whether each state (n,) was counted or only screened, or refused as unstable: `forward.model.Stability`.
     fields
         Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
         `CompactSum`, the rows of these points themselves, one point after the other.
@@ -67,6 +69,7 @@ class Evaluations:
     work: NDArray[np.int64]
     residuals: FloatArray
     converged: NDArray[np.bool_]
+    stability: NDArray[np.int8]
     fields: FloatArray
 
     @property
@@ -134,22 +137,24 @@ class Prediction:
         `point`.
     coordinates
         The coordinates.
+    spread
+        Standard deviations (d,) of the parameters, for the screen of stability.
     """
 
     point: FloatArray
     state: FloatArray
     slopes: FloatArray
     coordinates: Coordinates
+    spread: FloatArray | None = None
 
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+        reference = Reference(self.point, state, self.spread)
         if len(slopes) == 0:
-            return lambda _: state, Reference(self.point, state)
+            return lambda _: state, reference
         here = self.coordinates.of(self.point)
-        return lambda parameters: state + (self.coordinates.of(parameters) - here) @ slopes, Reference(
-            self.point, state
-        )
+        return lambda parameters: state + (self.coordinates.of(parameters) - here) @ slopes, reference
 
 
 @dataclass(frozen=True)
@@ -348,6 +353,7 @@ class BlockSolver:
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
+        stability = np.zeros(n, dtype=np.int8)
         failures: list[Failure] = []
         rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
         states: list[FloatArray] = []  # of a row that is not complete
@@ -366,11 +372,12 @@ class BlockSolver:
                 row = None
                 lost = isinstance(error, InadmissibleError)
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history, lost))
-                work[i] = error.work.as_array()
+                work[i], stability[i] = error.work.as_array(), error.stability
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
                 residuals[i], converged[i] = solution.residual, solution.converged
+                stability[i] = solution.stability
                 states += [solution.state] if self._joint is not None else []
             if self._joint is not None and (i + 1) % self._together == 0:
                 row = self._joint(np.array(states)) if len(states) == self._together else None
@@ -385,7 +392,9 @@ class BlockSolver:
         fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
-        return Evaluations(points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, fields)
+        return Evaluations(
+            points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, stability, fields
+        )
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
@@ -463,5 +472,6 @@ class Merger:
             np.concatenate([b.work for b in self._blocks]),
             np.concatenate(list(joined(lambda b: b.residuals))),
             np.concatenate([b.converged for b in self._blocks]),
+            np.concatenate([b.stability for b in self._blocks]),
             self._fields,
         )

@@ -136,24 +136,27 @@ class StateExpansion:
         (P, U), in canonical order.
     point, state
         Parameters (d,) of the factor, and the state (U,) there.
+    spread
+        Standard deviations (d,) of the parameters.
     """
 
     basis: Basis
     coefficients: FloatArray
     point: FloatArray
     state: FloatArray
+    spread: FloatArray
 
     @classmethod
     def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
         """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
         coefficients = solved(fit, fields[fit.chosen.which])
         coefficients[(basis.indices == 0).all(axis=1)] += centre.state
-        return cls(basis, coefficients, centre.point, centre.state)
+        return cls(basis, coefficients, centre.point, centre.state, centre.spread)
 
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
         coefficients, state = model.scatter(self.coefficients), model.scatter(self.state[None, :])[0]
-        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state)
+        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state, self.spread)
 
 
 def solved(fit: Fit, projections: FloatArray) -> FloatArray:

@@ -188,7 +188,8 @@ class KeptModel:
             work = solution.work.as_array()[None]
             good, none = np.ones(1, dtype=bool), np.zeros(1)
             outputs = np.asarray(solution.outputs)[None]
-            block = Evaluations(np.asarray(parameters)[None], outputs, None, (), none, work, none, good, whole)
+            known = np.array([solution.stability], dtype=np.int8)
+            block = Evaluations(np.asarray(parameters)[None], outputs, None, (), none, work, none, good, known, whole)
             self.checkpoint.save(key, block)
         return solution
 

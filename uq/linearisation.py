@@ -38,6 +38,8 @@ class Linearisation:
         dū/dω (d, U); empty (0, U) for a model without derivatives or of more than `MANY` parameters.
     coordinates
         What predictions are linear in.
+    spread
+        Standard deviations (d,) of the parameters.
     """
 
     point: FloatArray
@@ -46,13 +48,14 @@ class Linearisation:
     state: FloatArray
     slopes: FloatArray
     coordinates: Coordinates
+    spread: FloatArray
 
     @property
     def prediction(self) -> Prediction | None:
         """The prediction of the state, linear where there are slopes; None for a model without derivatives."""
         if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
-        return Prediction(self.point, self.state, self.state_slopes, self.coordinates)
+        return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread)
 
     @property
     def output_slopes(self) -> FloatArray:
@@ -115,7 +118,7 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     m, d = len(evaluate.outputs), len(evaluate.parameters)
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
-    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates)
+    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates, inputs.std)
 
 
 class LocalSensitivity(Settings):

@@ -224,7 +224,7 @@ def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | 
     if first == "tangent" and centre.prediction is not None:
         return centre.prediction
     none = np.zeros((len(centre.point), centre.state.size))
-    return Prediction(centre.point, centre.state, none, centre.coordinates)
+    return Prediction(centre.point, centre.state, none, centre.coordinates, centre.spread)
 
 
 def _of_tangent(centre: Linearisation, count: int) -> _Known:

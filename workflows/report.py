@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uq.findings import findings
-from workflows import bodies, plots, tables
+from workflows import bodies, plots, tables, words
 from workflows.config import Study, StudyError, parse
 from workflows.results import read_dataset, read_summary, write_text
 from workflows.tables import Results, Table
@@ -124,6 +124,7 @@ def _context(results: Results) -> dict[str, Any]:
         "title": f"Study {summary['study']}",
         "method": str(type(results.study.method).__doc__).partition("\n")[0],
         "amount": f"{summary['stopped']}; {tables.solves(summary)}, {summary['failed']:,} failed",
+        "stability": words.stability(summary["stability"]) if "stability" in summary else None,
         "note": summary.get("note"),
         "findings": findings(dataset),
         "model": list(model_in_words(results.study)),

@@ -20,11 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.model import Stability
 from forward.own_modules import Loaded
+from uq import branch
 from uq.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.findings import add, findings
 from uq.sampling import random_points
-from workflows import own_code, verdict
+from workflows import own_code, verdict, words
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.locking import measured
 from workflows.progress import Progress
@@ -148,6 +150,8 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     own_code.keep(directory, study, loaded)
     add(dataset, *(verdict.findings_of_solves(evaluations.values()) if _explains(study) else ()))
+    if isinstance(study, Study):
+        dataset = _with_stability(study, dataset, evaluations["/"])
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
     if isinstance(study, Study) and len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, job.recorders["/"])
@@ -155,6 +159,19 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
     return exit_code(summary)
+
+
+def _with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+    """Add how the stability of each sample was looked at, and say where a stable branch ends."""
+    if not branch.counts([evaluations]):
+        return dataset
+    continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
+    add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
+    if "points" in dataset and dataset.points.dims == ("sample", "parameter"):
+        known = branch.by_sample(dataset.points.to_numpy(), evaluations)
+        meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
+        dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
+    return dataset
 
 
 def exit_code(summary: Mapping[str, Any]) -> int:
@@ -603,6 +620,7 @@ def _summary(
     failed = sum(len(found.failures) for found in every) - unlikely
     names = {label: _parameters(study, label) for label in evaluations}
     source = own_code.digest(study)
+    stability = branch.counts(every)
     return {
         "study": name,
         "method": study.method.kind,
@@ -625,6 +643,7 @@ def _summary(
                 LISTED,
             )
         ],
+        **({"stability": stability} if stability else {}),
         "wall_seconds": wall,
         "cpu_seconds": float(sum(found.seconds.sum() for found in every)) * study.parallel.ranks_per_model,
         "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
@@ -725,6 +744,8 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
 
     failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
     lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
+    if "stability" in summary:
+        lines.append(words.stability(summary["stability"]))
     if "note" in summary:
         lines.append(summary["note"])
     lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]

@@ -19,6 +19,18 @@ DIGITS = 15  # that a number has
 NONE = "–"  # what stands for a number that there is not
 
 
+def stability(counts: dict[str, int]) -> str:
+    """Say how the stability of the states of a study was looked at, from `stability` in summary.json."""
+    refused = counts["refused"] + counts["missed"]
+    parts = [
+        f"{counts['counted']:,} by counting negative eigenvalues",
+        f"{counts['screened']:,} by the screen alone",
+        *([f"{counts['not_tested']:,} not at all"] if counts["not_tested"] else []),
+        *([f"{refused:,} refused as unstable"] if refused else []),
+    ]
+    return f"stability of the states: {', '.join(parts)}"
+
+
 def number(value: float | None, digits: int = 4) -> str:
     """Write a number with some significant digits; powers of ten where it is very small or large."""
     if value is None or math.isnan(value):
