@@ -275,6 +275,18 @@ def test_tails_may_not_reach_the_impossible():
     assert parse(study).parameters["material.D1"] == Normal(mean=3e5, std=2e4)
 
 
+def test_tails_of_no_material_are_told():
+    """A draw there is a failed sample: `check` says how many. A constant may be negative if its material is stable."""
+    study = blocks()
+    study["parameters"]["material.D1"] = {"kind": "normal", "mean": 3e5, "std": 1.5e5}
+    told = [one for one in parse(study).findings if "stable at rest" in one.text]
+    assert [one.severity for one in told] == ["warning"]
+    assert told[0].text.startswith("2.3 % of the samples are of materials that are not stable at rest")
+    study["parameters"]["material.D1"]["std"] = 1e4
+    study["parameters"]["material.C2"] = {"kind": "uniform", "lower": -5e3, "upper": 1e4}
+    assert parse(study).findings == ()
+
+
 @pytest.fixture(scope="module")
 def validator():
     found = schema()

@@ -70,7 +70,10 @@ def test_curved_ridge(noise, allowed, repeats):
 
 
 def test_route_and_reason_are_stated():
-    linear = on_treloar("mooney-rivlin", LINEAR["mooney-rivlin"])
+    wide = on_treloar("mooney-rivlin", LINEAR["mooney-rivlin"])  # to where there is no material, nor a Gaussian
+    assert evidence(wide, laplace(wide), 64).route != "closed form"
+    narrow = {"C1": Normal(mean=2e5, std=2e4), "C2": Normal(mean=0.0, std=1e4)}
+    linear = on_treloar("mooney-rivlin", narrow)
     found = evidence(linear, laplace(linear), 64)
     assert (found.route, found.log_evidence) == ("closed form", laplace(linear).log_evidence)
     assert found.error < 1e-8
