@@ -28,6 +28,10 @@ class NormalErrors(Settings):
         """Return ρ, −ln of the density, of residuals over the scale, of any shape."""
         return np.asarray(r**2 / 2 + HALF_LOG)
 
+    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
+        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
+        return np.asarray((r**2).sum(axis=1) / 2 + log_scale + r.shape[1] * HALF_LOG)
+
     def score(self, r: FloatArray) -> FloatArray:
         """Return ψ = ρ′."""
         return r
@@ -65,6 +69,10 @@ class StudentErrors(Settings):
         nu = self.degrees
         constant = gammaln(nu / 2) - gammaln((nu + 1) / 2) + np.log(nu * np.pi) / 2
         return np.asarray((nu + 1) / 2 * np.log1p(r**2 / nu) + constant)
+
+    def misfit(self, r: FloatArray, log_scale: FloatArray) -> FloatArray:
+        """Return −ln of the likelihood (n,) of residuals (n, m) with sums (n,) of the logarithms of their scales."""
+        return np.asarray(self.minus_log(r).sum(axis=1) + log_scale)
 
     def score(self, r: FloatArray) -> FloatArray:
         """Return ψ = ρ′."""

@@ -22,6 +22,7 @@ from typing import Protocol
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
+from inverse.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
 
 BLOCK = 32  # vectors whose products are formed together
 
@@ -67,6 +68,8 @@ class FieldPosterior:
         m_0 (N,); by default zero.
     progress
         Told of each solve, and whether it failed.
+    errors
+        Distribution of the errors over their scale σ.
     """
 
     model: ForwardModel
@@ -76,6 +79,7 @@ class FieldPosterior:
     mean: FloatArray | None = None
     counts: Counts = field(default_factory=Counts)
     progress: Callable[[int, int], None] = lambda done, failed: None
+    errors: NormalErrors | StudentErrors = NORMAL
 
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
@@ -153,16 +157,33 @@ class Point:
     solution: Solution
 
     @cached_property
-    def residual(self) -> FloatArray:
-        """R (n,); zero where nothing was measured."""
+    def gaps(self) -> FloatArray:
+        """What is predicted less what was measured, over σ (n,); zero where nothing was measured."""
         posterior = self.posterior
         gap = np.where(posterior.measured > 0, self.solution.outputs - posterior.data, 0.0)
         return np.asarray(posterior.weights * gap)
 
-    @property
+    @cached_property
+    def root(self) -> FloatArray:
+        """√ (n,) of the weights of the data in Gauss–Newton's matrix: 1 of normal errors, see `inverse.errors`."""
+        return np.asarray(np.sqrt(self.posterior.errors.information(self.gaps)))
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """R (n,); of errors that are not normal, what has their gradient with the weights of Gauss–Newton."""
+        return np.asarray(self.posterior.errors.score(self.gaps) / self.root)
+
+    @cached_property
     def misfit(self) -> float:
-        """½ r·r."""
-        return float(self.residual @ self.residual) / 2
+        """½ r·r, or what takes its place: −ln p(y | ξ) but for Σ ln σ + (n/2) ln 2π."""
+        minus_log = self.posterior.errors.minus_log(self.gaps) - HALF_LOG
+        return float(self.posterior.measured @ minus_log)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Ln p(y | ξ)."""
+        weights = self.posterior.weights[self.posterior.weights > 0]
+        return -self.misfit + float(np.log(weights).sum()) - len(weights) * HALF_LOG
 
     @property
     def penalty(self) -> float:
@@ -183,13 +204,13 @@ class Point:
         """Return Aξ (n,), or (k, n) for k of them."""
         posterior = self.posterior
         posterior.counts.tangents += len(np.atleast_2d(noise))
-        return posterior.weights * self.solution.tangent(posterior.prior.root(noise))
+        return self.root * posterior.weights * self.solution.tangent(posterior.prior.root(noise))
 
     def pull(self, data: FloatArray) -> FloatArray:
         """Return Aᵀr (N,), or (k, N) for k of them."""
         posterior = self.posterior
         posterior.counts.adjoints += len(np.atleast_2d(data))
-        return posterior.prior.root_transposed(self.solution.adjoint(posterior.weights * data))
+        return posterior.prior.root_transposed(self.solution.adjoint(self.root * posterior.weights * data))
 
     def product(self, noise: FloatArray) -> FloatArray:
         """Return AᵀAξ (N,), or (k, N) for k of them."""

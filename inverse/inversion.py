@@ -617,7 +617,7 @@ def _invert(
     spectrum = spectrum_of(posterior, at)
     scale = data.sigma * (best[-1] if method.noise is not None else 1.0)
     raw = (at.outputs[0] - data.values) / scale
-    residual = errors.normal_scores(raw)
+    residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, np.ones_like(residual), _pairs(data))
     chains = _chains(posterior, gaussian, found, method)
     verdict = verdict_on_few(gaussian, found, test, chains)
@@ -637,11 +637,11 @@ def _invert(
     if gap is not None:
         # Where the residuals r + δ of the finer mesh have their mode, by the curvature at hand.
         A = spectrum.images.T @ spectrum.vectors
-        pull = A.T @ (np.sqrt(errors.information(raw)) * gap / scale)
+        pull = A.T @ (root * gap / scale)
         slopes = inputs.from_normals(gaussian.mode[None, :d])[1][0]
         shift[:d] = -slopes @ np.linalg.solve(gaussian.hessian[:d, :d], pull) / moments["std"][:d]
     return {
-        **_of_data(data, at.outputs[0], residual, scale, spectrum, cases),
+        **_of_data(data, at.outputs[0], residual, scale / root, spectrum, cases),
         **_of_test(test),
         **_of_prior(gaussian.mode[:d], spectrum),
         **_of_mesh(gap, why, scale, shift),
@@ -774,7 +774,9 @@ def invert_field(
         mode, found, converged = inferred.mode, inferred.found, inferred.converged
         factor, log_std, log_evidence = inferred.factor, inferred.log_std, inferred.log_evidence
     spectrum = found.spectrum
-    test = examine(found.residual, spectrum, np.ones_like(found.residual), _pairs(data))
+    errors, root = posterior.errors, mode.point.root
+    residual = errors.normal_scores(mode.point.gaps)
+    test = examine(residual, spectrum, np.ones_like(residual), _pairs(data))
     samples = method.solves(field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
     g = vertices.volumes / vertices.volumes.sum()
@@ -800,10 +802,10 @@ def invert_field(
     gap, why = finer.gap(mode.point.values, predicted)
     moved, shift = np.full(len(found.mean), np.nan), np.full(len(mean["mode"]), np.nan)
     if gap is not None:
-        moved = -(spectrum.images @ (gap / scale) / (1 + spectrum.values)) @ found.directions
+        moved = -(spectrum.images @ (root * gap / scale) / (1 + spectrum.values)) @ found.directions
         shift[0] = g @ moved / mean["std"][0]
     return {
-        **_of_data(data, predicted, found.residual, scale, spectrum, cases),
+        **_of_data(data, predicted, residual, scale / root, spectrum, cases),
         **_of_test(test),
         **_of_prior(mode.point.noise, spectrum),
         **_of_mesh(gap, why, scale, shift),

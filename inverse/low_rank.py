@@ -152,9 +152,11 @@ class LowRankPosterior:
     residual
         r (n,) there.
     weights
-        1/σ (n,), zero where nothing was measured.
+        1/σ (n,), times the root of the weights of Gauss–Newton; zero where nothing was measured.
     prior, spectrum
         What it is made of.
+    log_likelihood
+        ln p(y | m̂).
     """
 
     mean: FloatArray
@@ -163,6 +165,7 @@ class LowRankPosterior:
     weights: FloatArray
     prior: Prior
     spectrum: Spectrum
+    log_likelihood: float
 
     @classmethod
     def at(
@@ -187,7 +190,8 @@ class LowRankPosterior:
             block=block,
             seed=seed,
         )
-        return cls(mode.values, mode.noise, mode.residual, posterior.weights, posterior.prior, spectrum)
+        weights, likelihood = mode.root * posterior.weights, mode.log_likelihood
+        return cls(mode.values, mode.noise, mode.residual, weights, posterior.prior, spectrum, likelihood)
 
     # --- the field ---------------------------------------------------------------------------------------------------
 
@@ -248,10 +252,7 @@ class LowRankPosterior:
     @property
     def log_evidence(self) -> float:
         """Ln p(y) = ln L(m̂) − ½|ξ̂|² − ½ Σ ln(1+λ); exact for linear models, but for the pairs left out."""
-        weights = self.weights[self.weights > 0]
-        misfit = float(self.residual @ self.residual) / 2 - float(np.log(weights).sum())
-        misfit += len(weights) / 2 * float(np.log(2 * np.pi))
-        return -misfit - float(self.noise @ self.noise) / 2 + self.log_determinant / 2
+        return self.log_likelihood - float(self.noise @ self.noise) / 2 + self.log_determinant / 2
 
     @property
     def information(self) -> float:

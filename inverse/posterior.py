@@ -161,7 +161,7 @@ class Posterior:
             ln_s_slope = s_slope / s
         scale = s[:, None] * self.sigma
         residual = (outputs - self.data) / scale
-        misfit = errors.minus_log(residual).sum(axis=1) + np.log(scale).sum(axis=1) + np.log(self.inputs.admitted)
+        misfit = errors.misfit(residual, np.log(scale).sum(axis=1)) + np.log(self.inputs.admitted)
         log_likelihood = np.where(found.ok, -misfit, -np.inf)
         if not derivatives:
             empty = np.zeros((n, 0))

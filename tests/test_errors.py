@@ -5,10 +5,14 @@ import pytest
 from scipy import stats
 
 from forward.model import FunctionModel
+from inverse.chains import weigh_field
 from inverse.errors import NormalErrors, StudentErrors
 from inverse.evidence import evidence
+from inverse.field_posterior import FieldPosterior
 from inverse.inversion import Invert, invert_by_group
 from inverse.laplace import laplace
+from inverse.low_rank import LowRankPosterior
+from inverse.newton_cg import find_mode
 from inverse.observations import Components
 from inverse.posterior import Posterior
 from uq.distributions import LogNormal, Normal
@@ -108,3 +112,37 @@ def test_what_does_not_belong_does_not_decide():
     np.testing.assert_allclose(heavy["draw_log_likelihood"][0], stats.t(3).logpdf(r) - np.log(SIGMA))
     assert heavy["residual_probability"] > 1e-4
     assert plain["residual_probability"] < 1e-40
+
+
+class Line:
+    """N(0, std²) of one value."""
+
+    variance = np.array([PRIOR.std**2])
+
+    def root(self, noise):
+        return PRIOR.std * noise
+
+    def root_transposed(self, g):
+        return PRIOR.std * g
+
+
+def test_fields_have_the_same_errors():
+    """A field of one value is the parameter above: mode, weights and evidence by quadrature."""
+    data = np.append(VALUES, np.nan)  # one that was not measured
+    slopes = np.append(SLOPES, 1.0)
+    model = FunctionModel(lambda p: slopes * p[0], ("a",), tuple(map(str, range(16))), lambda p: slopes[:, None])
+    field = FieldPosterior(model, data, np.full(16, 0.2), Line(), errors=HEAVY)
+    x = np.array([0.3])
+    h = 1e-6
+    slope = (field.at(x + h).cost - field.at(x - h).cost) / (2 * h)
+    assert field.at(x).gradient[0] == pytest.approx(slope, rel=1e-6)
+    mode = find_mode(field, tolerance=1e-6)
+    assert mode.converged
+    log_evidence, mean, std, best = quadrature()
+    assert mode.point.values[0] == pytest.approx(best, abs=2e-3)
+    found = LowRankPosterior.at(mode.point)
+    assert found.log_evidence == pytest.approx(log_evidence, abs=0.3)
+    weighed = weigh_field(mode.point, found, 4096)
+    assert weighed.log_evidence == pytest.approx(log_evidence, abs=max(4 * weighed.error, 0.01))
+    assert weighed.mean[0] == pytest.approx(mean, abs=0.1 * std)
+    assert weighed.std[0] == pytest.approx(std, rel=0.05)

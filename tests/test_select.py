@@ -26,7 +26,7 @@ from uq.inputs import Inputs
 from workflows.config import StudyError, dump, load, parse
 from workflows.plan import plan
 from workflows.starter import starter
-from workflows.verdict import findings, grade
+from workflows.verdict import doubts_of_selection, findings, grade
 
 TISSUQ = Path(sys.executable).parent / "tissuq"
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
@@ -121,6 +121,39 @@ def test_discrepancy_is_found_when_no_candidate_is_right():
         assert any(line.startswith("Best of bad models") for line in texts(wrong))
         right = compare(values, ("neo-hookean", "yeoh"), tests, noise)
         assert not any(line.startswith("Best of bad models") for line in texts(right))
+
+
+def doubts(values, kind, noise=None, **priors):
+    inputs = Inputs(FIVE[kind] | priors)
+    labels = tuple(test.label for test in TESTS for _ in test.at)
+    data = Data(values, None, labels, np.concatenate([test.at for test in TESTS]))
+    noise = noise or Noise(relative=0.05, absolute=5e3)
+    method = Select(samples=64, noise=noise)
+    found = method.run({kind: Candidate(inputs)}, {"all": data}, lambda name, _: SerialEvaluate(model(name)))
+    return doubts_of_selection(found, {kind: inputs}, noise.factor)
+
+
+def test_what_is_doubtful_of_the_most_probable_candidate_is_said():
+    """Nothing of data of its own; else noise, data that do not belong, and constants far off or at an end, by name."""
+    rng = np.random.default_rng(6)
+    stress = model("mooney-rivlin").stresses(np.array([[2e5, 2e4]]))[0]
+    values = stress + np.maximum(0.05 * np.abs(stress), 5e3) * rng.standard_normal(stress.size)
+    assert not doubts(values, "mooney-rivlin")
+    strange = np.where(np.arange(18) == 4, 2 * values, values)
+    (doubt,) = doubts(strange, "mooney-rivlin")
+    assert "not belong to the other 1" in doubt.text
+    assert "by residuals in standard deviations: uniaxial at 2.9: -" in doubt.text  # the largest is listed first
+    doubt, *_ = doubts(values, "neo-hookean", C1=Normal(mean=1e5, std=1e4))
+    assert re.match(r"neo-hookean: the posterior of C1 .* prior deviations from the prior \(1e\+05\)", doubt.text)
+    assert doubt.severity == "error"
+    doubt, *_ = doubts(values, "mooney-rivlin", C2=Uniform(lower=0.0, upper=1e3))
+    assert "C2 is at the upper end of its range (1000)" in doubt.text
+    noise = Noise(relative=1e-3, absolute=100, factor=LogUniform(lower=0.1, upper=1e3))
+    found = doubts(values, "mooney-rivlin", noise)
+    assert any(re.search(r"the inferred errors are [3-6]\d(\.\d)? times the stated ones", one.text) for one in found)
+    noise = Noise(absolute=5e5, factor=LogUniform(lower=0.1, upper=10.0))
+    found = doubts(1e6 * rng.standard_normal(18), "neo-hookean", noise)
+    assert any("the model does not explain these data" in one.text and one.severity == "error" for one in found)
 
 
 def test_left_out_scores_of_a_linear_model():

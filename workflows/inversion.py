@@ -299,8 +299,8 @@ class Inversion(Settings):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
                 yield ("method", "chains"), message, self.method.chains
-        if nodal and self.data.errors.kind != "normal":
-            message = "errors of a field are normal, expected { kind = 'normal' }, or few parameters"
+        if nodal and self.method.noise is not None and self.data.errors.kind != "normal":
+            message = "the size of such errors is not inferred with a field, expected { kind = 'normal' } or no noise"
             yield ("data", "errors"), message, self.data.errors.kind
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}

@@ -324,7 +324,9 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
-        add(found, *verdict.findings(found), *verdict.doubts_of_selection(found, study))
+        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
+        doubts = verdict.doubts_of_selection(found, candidates, study.method.noise.factor)
+        add(found, *verdict.findings(found), *doubts)
         return found
 
     return _Job(
@@ -412,7 +414,7 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
             return layout.pack(found)
         solved = KeptModel(observed, ensemble.group, checkpoint, name)
         done.append(solved)
-        posterior = FieldPosterior(solved, data.values, data.sigma, prior, progress=ensemble.count)
+        posterior = FieldPosterior(solved, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
         offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
         return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer))
 

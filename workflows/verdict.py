@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from inverse.criticism import Doubt
     from uq.distributions import Distribution
     from uq.evaluate import Evaluations
+    from uq.inputs import Inputs
     from workflows.inversion import Inversion
-    from workflows.selection import Comparison
 
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
@@ -113,13 +113,25 @@ def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
     return found
 
 
-def doubts_of_selection(dataset: xr.Dataset, study: Comparison) -> list[Finding]:
-    """Say what is doubtful of the most probable candidate: its constants, its errors, and data that do not belong."""
+def doubts_of_selection(
+    dataset: xr.Dataset, candidates: Mapping[str, Inputs], noise: Distribution | None
+) -> list[Finding]:
+    """Say what is doubtful of the most probable candidate: its constants, its errors, and data that do not belong.
+
+    Parameters
+    ----------
+    dataset
+        What was found.
+    candidates
+        Their random constants, by name.
+    noise
+        Prior of the factor on the errors, if it was inferred.
+    """
     from inverse import criticism
     from inverse.weights import resampled
 
     best = ranking(dataset["log_evidence"])[0]
-    inputs, noise = study.candidates[best].inputs, study.method.noise.factor
+    inputs = candidates[best]
     names = list(inputs.names)
     said: list[Finding] = []
     for group in map(str, dataset.group.values):
