@@ -432,6 +432,8 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
     kept = arviz.from_netcdf(folder / "single" / "results.nc")
     assert kept.posterior["material.mu"].shape == (1, 50)
     assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
+    assert np.isfinite(arviz.loo(kept).elpd_loo)
+    assert set(kept.prior.data_vars) == set(kept.posterior.data_vars)
 
 
 @pytest.mark.mpi

@@ -27,6 +27,7 @@ from forward.specimen import Specimen
 from inverse.errors import NORMAL, Errors
 from inverse.inversion import ENDS, Invert, Synthesize, names_of, sentence, variables
 from inverse.observations import DataError, Observations, files, read
+from inverse.posterior import NOISE
 from uq.distributions import Distribution, Normal
 from uq.inputs import Inputs
 from workflows import verdict
@@ -550,7 +551,11 @@ def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, Flo
 def prior_draws(study: Inversion) -> FloatArray:
     """Draws (n, d) of the parameters before the data."""
     rng = np.random.default_rng(study.method.seed)
-    return study.inputs.from_normals(rng.standard_normal((PRIOR_DRAWS, len(study.inputs.names))))[0]
+    kept = np.zeros((0, len(study.inputs.names)))
+    while len(kept) < PRIOR_DRAWS:
+        points = study.inputs.from_normals(rng.standard_normal((PRIOR_DRAWS, len(study.inputs.names))))[0]
+        kept = np.concatenate([kept, points[study.inputs.allowed(points)]])
+    return kept[:PRIOR_DRAWS]
 
 
 def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArray) -> FloatArray:
@@ -691,6 +696,9 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
     left["posterior"] = xr.Dataset({str(name): whole.sel(parameter=name, drop=True) for name in found.parameter.values})
     before = prior_draws(study)
     columns = {name: (("chain", "draw"), before[None, :, i]) for i, name in enumerate(study.inputs.names)}
+    if study.method.noise is not None:
+        z = np.random.default_rng([study.method.seed, 1]).standard_normal(PRIOR_DRAWS)
+        columns[NOISE] = (("chain", "draw"), study.method.noise.from_normal(z)[0][None])
     left["prior"] = xr.Dataset(columns)
     left["log_likelihood"] = xr.Dataset({"displacement": draws("draw_log_likelihood")})
     return left
