@@ -74,6 +74,12 @@ class Basis:
             result[:, 1 + i, varying] = _products([*tables[:i], table, *tables[i + 1 :]], self.indices[varying])
         return result
 
+    def of_one(self, i: int, t: FloatArray) -> FloatArray:
+        """Return the factor p_{a_i}(t) (n, P) that each function has of coordinate i, at values (n,) of it."""
+        degree = int(self.indices[:, i].max(initial=0))
+        table, _ = _recur(t, self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
+        return np.column_stack(table)[:, self.indices[:, i]]
+
     def subset(self, which: IntArray) -> Basis:
         """Return the basis of some of the functions, by their numbers."""
         return replace(self, indices=self.indices[which])

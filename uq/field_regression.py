@@ -89,6 +89,8 @@ class Deviations:
         Which samples (n,) had an answer and were fitted.
     prediction
         Of the state, from which the solver may start; nothing where the state was not wanted.
+    reach
+        Lowest and highest coordinates (2, d) of the samples that were fitted.
     """
 
     basis: Basis
@@ -97,6 +99,7 @@ class Deviations:
     relative: FloatArray
     ok: NDArray[np.bool_]
     prediction: StateExpansion | None
+    reach: FloatArray
 
 
 def fit_deviations(
@@ -121,7 +124,9 @@ def fit_deviations(
     if wanted is not None:
         state = solved(fit, evaluations.fields[fit.chosen.which])
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
-    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction)
+    t = inputs.coordinates.of(data.points)
+    reach = np.array([t.min(axis=0), t.max(axis=0)])
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach)
 
 
 @dataclass(frozen=True)

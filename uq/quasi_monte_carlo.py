@@ -34,11 +34,12 @@ from uq.moments import (
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
 from uq.regression import FULL, ROWS_PER_TERM
 from uq.sampling import check_scrambles, power_of_two, sobol_points
-from uq.taylor import Control, quadratic, tangent
+from uq.taylor import Control, expansion, held_expansion, quadratic, tangent
 
 if TYPE_CHECKING:
     import xarray as xr
 
+Pair = tuple[FloatArray, FloatArray]
 ORDER = 6  # largest of the expansions that are tried as control
 FIT = 2**32 - 1  # number of the scramble that the control is fitted to, which none of the samples belong to
 
@@ -68,7 +69,9 @@ class QuasiMonteCarlo(MonteCarlo):
         and with `fields` it is where the solver starts from too.
     control_samples
         Number of samples that the expansion is fitted to; if nothing is said, twice what order 3 needs (order 2 above
-        eight parameters). Order and terms are chosen as `Chaos` does.
+        eight parameters). Order and terms are chosen as `Chaos` does. Where parameters have tails and the expansion
+        goes wrong beyond the reach of these samples, which the others tell, it is held at its values there, and the
+        displacement field has no control.
     coefficient
         "one", or "optimal": estimated by regression over the scrambles, of which there must be 4; it has a bias of
         order 1/R, a fraction of its error (seen with 4 points per scramble, for the standard deviation).
@@ -152,12 +155,12 @@ class QuasiMonteCarlo(MonteCarlo):
             control = tangent(inputs, centre)
         elif self.control == "quadratic":
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
-        expansion = None
+        fitted = held = None
         start: Start | None = centre.prediction
         if self.control == "chaos":
-            expansion = self._expand(inputs, evaluate, centre)
-            control, start = _orthonormal(expansion), expansion.prediction or start
-        samples = _Samples(self, inputs, evaluate, centre, control, start)
+            fitted = self._expand(inputs, evaluate, centre)
+            control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
+        samples = _Samples(self, inputs, evaluate, centre, control, held, start)
         last = self.limit // self.scrambles
         first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
         samples.extend(first)
@@ -167,7 +170,7 @@ class QuasiMonteCarlo(MonteCarlo):
                 break
             samples.extend(2 * samples.each)
             scalars = samples.scalars(samples.each)
-        return self._dataset(inputs, evaluate, centre, expansion, samples, scalars)
+        return self._dataset(inputs, evaluate, centre, fitted, samples, scalars)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
         """Fit the expansion to a scramble of its own: given the fit, the samples are as random as ever."""
@@ -184,7 +187,7 @@ class QuasiMonteCarlo(MonteCarlo):
         inputs: Inputs,
         evaluate: Evaluate,
         centre: Linearisation,
-        expansion: Deviations | None,
+        fitted: Deviations | None,
         samples: _Samples,
         scalars: Estimates,
     ) -> xr.Dataset:
@@ -215,10 +218,8 @@ class QuasiMonteCarlo(MonteCarlo):
         )
         if self.control != "none":
             dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
-        if expansion is not None:
-            dataset = dataset.assign(
-                loo_error=(by_output, expansion.relative), control_samples=((), int(expansion.ok.sum()))
-            )
+        if fitted is not None:
+            dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
         field = samples.field()
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
@@ -227,9 +228,8 @@ class QuasiMonteCarlo(MonteCarlo):
         error = f"relative error {reached:.3g}"
         dataset.attrs["stopped"] = self.why_stopped(reached, error, ok.size, self.limit, amount)
         notes = []
-        if expansion is not None and not expansion.ok.all():
-            fitted = expansion.ok
-            notes.append(f"{int((~fitted).sum())} of {fitted.size} samples for the chaos control have no answer")
+        if fitted is not None and not fitted.ok.all():
+            notes.append(f"{int((~fitted.ok).sum())} of {fitted.ok.size} samples for the chaos control have no answer")
         if not ok.all():
             followed = None if self.control == "none" else f"the {self.control} control"
             which = "all estimates" if self.control == "none" else "quantiles"
@@ -237,12 +237,6 @@ class QuasiMonteCarlo(MonteCarlo):
         if notes:
             dataset.attrs["note"] = "; ".join(notes)
         return dataset
-
-
-def _orthonormal(expansion: Deviations) -> Control:
-    """Return the control that an expansion in orthonormal polynomials is: E[φφᵀ] = 1, E[φ] is 1 for the constant."""
-    constant = (expansion.basis.indices == 0).all(axis=1)
-    return Control(expansion.basis, expansion.outputs, expansion.state, constant.astype(float), np.eye(constant.size))
 
 
 def _products(deviation: FloatArray, controls: tuple[FloatArray, FloatArray] | None) -> FloatArray:
@@ -292,10 +286,11 @@ class _Samples:
         evaluate: Evaluate,
         centre: Linearisation,
         control: Control | None,
+        held: Control | None,
         start: Start | None,
     ) -> None:
         self._method, self._inputs, self._evaluate = method, inputs, evaluate
-        self._centre, self._control, self._start = centre, control, start
+        self._centre, self._control, self._held, self._start = centre, control, held, start
         R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
         self._field_control = control if control is not None and len(control.state) else None
         self.each = 0
@@ -364,13 +359,34 @@ class _Samples:
         ok = self.ok[:, :each]
         some = ok.any(axis=1)
         deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
-        controls = None
+        controls = expected = None
         if control is not None:
-            controls = control.predict(control.features(self.points[:, :each]), control.outputs)
+            controls, expected = self._of(control, each)
+            held = self._which_held(each)
+            if self._held is not None and held.any():
+                (C, D), (C_mean, D_mean) = self._of(self._held, each)
+                controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
+                expected = np.where(held, C_mean, expected[0]), np.where(held, D_mean, expected[1])
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
-        expected = None if control is None else control.expected(control.outputs)
         return estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
+
+    def _of(self, control: Control, each: int) -> tuple[Pair, Pair]:
+        """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
+        controls = control.predict(control.features(self.points[:, :each]), control.outputs)
+        return controls, control.expected(control.outputs)
+
+    def _which_held(self, each: int) -> NDArray[np.bool_]:
+        """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own."""
+        if self._control is None or self._held is None:
+            return np.zeros(self.outputs.shape[2], dtype=bool)
+        ok = self.ok[:, :each]
+        deviations = self.outputs[:, :each][ok] - self._centre.outputs
+        whole, held = (
+            ((deviations - control.predict(control.features(self.points[:, :each][ok]), control.outputs)[0]) ** 2)
+            for control in (self._control, self._held)
+        )
+        return np.asarray(whole.sum(axis=0) > held.sum(axis=0))
 
     def field(self) -> Estimates | None:
         """Estimate the moments of the state, where its sums were kept."""
@@ -380,4 +396,7 @@ class _Samples:
             return None
         expected = None if self._field_control is None else self._field_control.expected(self._field_control.state)
         replicates = np.stack(means, axis=1)
+        if self._which_held(self.each).any():
+            # What is known of the field is where the samples of the expansion are not: it controls nothing.
+            replicates, expected = replicates[:2], None
         return estimate_from_replicates(replicates, self._centre.state, expected, self._method.coefficient)

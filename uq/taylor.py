@@ -16,13 +16,18 @@ from typing import Protocol
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.basis import gauss_rule
+from uq.basis import Basis, gauss_rule
 from uq.coordinates import Coordinates
+from uq.distributions import Distribution
 from uq.evaluate import Evaluate, Request
+from uq.field_regression import Deviations
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation
+from uq.quadrature import panels
 
 STEP = 0.5  # of the difference quotients, in standard deviations: wide, to see the curvature where the samples lie
+MARGIN = 0.25  # of the reach of its samples, by which an expansion is followed beyond them on either side
+FAR = 9.0  # standard deviations beyond which a normal density is nothing
 EDGE = 1e-9  # probability of the quantile that takes the place of the end of an unbounded range
 
 
@@ -86,6 +91,63 @@ class Control:
         """Return E[C] and E[D] (q,)."""
         leading = coefficients[: len(self.features_second)]
         return self.features_mean @ coefficients, (leading * (self.features_second @ leading)).sum(axis=0)
+
+
+def expansion(fitted: Deviations) -> Control:
+    """Return the control that an expansion in orthonormal polynomials is: E[φφᵀ] = 1, E[φ] is 1 for the constant."""
+    constant = (fitted.basis.indices == 0).all(axis=1)
+    return Control(fitted.basis, fitted.outputs, fitted.state, constant.astype(float), np.eye(constant.size))
+
+
+def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
+    """Return the outputs' control that the expansion is within the reach of its samples and `MARGIN`, held beyond.
+
+    There the expansion itself is a guess that no sample supports, while E[φφᵀ] counts it in full. None where all
+    parameters have ends, up to which samples reach.
+    """
+    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    if not tails.any():
+        return None
+    lower, upper = fitted.reach
+    more = MARGIN * (upper - lower)
+    held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
+    mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))
+    for i, marginal in enumerate(inputs.marginals.values()):
+        if tails[i]:
+            t, weights = _normal_rule(marginal, held.lower[i], held.upper[i])
+            table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
+        else:
+            t, weights = gauss_rule(marginal, int(fitted.basis.indices[:, i].max()) + 1)
+            table = fitted.basis.of_one(i, t)
+        mean *= weights @ table
+        second *= table.T @ (weights[:, None] * table)
+    return Control(held, fitted.outputs, fitted.state[:0], mean, second)
+
+
+@dataclass(frozen=True)
+class Held:
+    """Functions of the parameters that beyond a range (d,) of the coordinates keep the values at its edge."""
+
+    basis: Basis
+    lower: FloatArray
+    upper: FloatArray
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+        coordinates = self.basis.coordinates
+        return self.basis.values(coordinates.points(np.clip(coordinates.of(points), self.lower, self.upper)))
+
+
+def _normal_rule(marginal: Distribution, lower: float, upper: float) -> tuple[FloatArray, FloatArray]:
+    """Coordinates t and weights of a rule for what has kinks at the coordinates lower and upper."""
+    from scipy.special import ndtri
+
+    alone = Inputs({"": marginal}).coordinates
+    p = marginal.cumulative(alone.points(np.array([[lower], [upper]]))[:, 0])
+    kinks = np.clip(ndtri(p), -FAR, FAR).tolist()
+    z, weights = panels(sorted({*np.linspace(-FAR, FAR, 7).tolist(), *kinks}))
+    weights = weights * np.exp(-(z**2) / 2)
+    return alone.of(marginal.from_normal(z)[0][:, None])[:, 0], weights / weights.sum()
 
 
 def tangent(inputs: Inputs, centre: Linearisation) -> Control:
