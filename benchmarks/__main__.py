@@ -16,6 +16,7 @@ from benchmarks import (
     realisation,
     scaling,
     selection,
+    skewed,
     stability,
     startup,
     streaming,
@@ -38,6 +39,7 @@ ALL = {
     "locking": locking.main,
     "buckling": buckling.main,
     "chaos": chaos.main,
+    "skewed": skewed.main,
     "scaling": scaling.main,
     "startup": startup.main,
 }
