@@ -227,7 +227,7 @@ def test_normal_coordinates_of_awkward_distributions(marginal):
         lambda: Uniform(lower=1.0, upper=1.0 + 1e-12),
         lambda: Normal(mean=1e5, std=1e-8),
         lambda: LogNormal(mean=1.0, std=1e-13),
-        lambda: Beta(a=1e25, b=1e25, lower=0.0, upper=1.0),
+        lambda: Beta(a=2.0, b=3.0, lower=1e6, upper=1e6 + 1e-5),
         lambda: TruncatedNormal(mean=0.0, std=1.0, lower=1e6, upper=2e6),
         lambda: Gamma(shape=2.0, scale=1e-9, shift=100.0),
         lambda: Triangular(lower=7.0, mode=7.0, upper=7.0 + 1e-13),
