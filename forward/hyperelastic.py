@@ -17,7 +17,7 @@ from forward.admissible import Materials
 from forward.fields import RandomField
 from forward.geometry import AXES, Body, Vector, holds, moved_points
 from forward.inclusions import Inclusion
-from forward.loads import LOAD_SIZES, Displacement, Gravity, Load
+from forward.loads import LOAD_SIZES, Displacement, Gravity, Load, Pressure
 from forward.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials import MATERIALS, constants, measures, splits
 from forward.model import Finding
@@ -274,7 +274,18 @@ class Hyperelastic(Settings):
             *(Finding("warning", text) for text in self.body.warnings),
             *too_narrow(self.body, self.inclusions),
             *moved_points(self.body, points),
+            *self._of_followers(),
         )
+
+    def _of_followers(self) -> Iterator[Finding]:
+        """What the test of stability cannot see under loads that turn with the body."""
+        followers = [load.label for load in self.loads if isinstance(load, Pressure)]
+        if followers and not self.solver.accept_unstable:
+            text = (
+                f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. Stability "
+                "is judged by the symmetric part, in which divergence (buckling) shows; flutter shows in no static test."
+            )
+            yield Finding("note", text)
 
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""

@@ -223,6 +223,16 @@ def test_where_a_branch_ends_is_found(inputs):
     assert where.endswith(("have an answer", "has an answer")) or "none with" in where
 
 
+def test_loads_that_follow_the_body_are_named():
+    problem = buckling.follower()
+    (note,) = problem.spec.findings
+    assert note.severity == "note"
+    assert "pressure follows the body" in note.text
+    assert "flutter" in note.text
+    assert not changed(problem.spec, accept_unstable=True).findings
+    assert not buckling.column().spec.findings
+
+
 def test_without_refusals_nothing_is_said(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     none = np.zeros(20, dtype=bool)
