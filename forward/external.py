@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from forward.hyperelastic import Scalar
-from forward.model import FloatArray, FunctionModel, ModelError, SolveError
+from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
 from forward.own_modules import Sources, sources
 from forward.settings import Settings, nearest
 
@@ -111,7 +111,7 @@ class _External(Settings):
 
         def slopes(point: FloatArray) -> FloatArray:
             assert jacobian is not None
-            found = np.asarray(jacobian(whole(point)), dtype=float)
+            found = real(jacobian(whole(point)), "jacobian")
             if found.size != m * len(names) or (found.shape != (m, len(names)) and 1 not in {m, len(names)}):
                 message = f"model.jacobian: returned shape {found.shape}, expected ({m}, {len(names)})"
                 raise ModelError(message)

@@ -118,6 +118,19 @@ def too_narrow(body: Body, inclusions: Iterable[Inclusion]) -> Iterator[Finding]
             yield Finding("warning", text)
 
 
+def too_far(body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+    """Find prescribed displacements, among numbers and their ranges by path, that are larger than the body."""
+    extent = max(high - low for low, high in body.bounds)
+    for path, ends in ranges.items():
+        largest = max(ends, key=abs)
+        if path.startswith("displacements.") and abs(largest) > extent:
+            text = (
+                f"{path} reaches {largest:.3g} m, more than the length of the body, {extent:.3g} m: is it given in "
+                "another unit than metres?"
+            )
+            yield Finding("warning", text)
+
+
 def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], parameters: Collection[str]) -> Materials:
     """Return the materials of a body and of its regions as functions of some of its numbers, by their paths."""
     energy = str(getattr(material, "kind"))  # noqa: B009 - every material has a kind
@@ -273,6 +286,7 @@ class Hyperelastic(Settings):
         return (
             *(Finding("warning", text) for text in self.body.warnings),
             *too_narrow(self.body, self.inclusions),
+            *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
             *moved_points(self.body, points),
             *self._of_followers(),
         )

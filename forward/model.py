@@ -236,6 +236,25 @@ class ForwardModel(Protocol):
         """Take this rank's part (k, U_local) of fields (k, U) in canonical order."""
 
 
+def real(returned: object, what: str) -> FloatArray:
+    """Return what a user's function has returned as an array of real numbers.
+
+    Raises
+    ------
+    ModelError
+        If it is none: texts, complex numbers, rows of different lengths.
+    """
+    try:
+        found = np.asarray(returned)
+        if found.dtype.kind in "biufO":
+            return found.astype(float)
+        given = {"c": "complex numbers", "U": "text", "S": "bytes"}.get(found.dtype.kind, str(found.dtype))
+    except (TypeError, ValueError, OverflowError):
+        given = f"{type(returned).__name__} that holds more than numbers, or rows of different lengths"
+    message = f"the model's {what} returned {given}, expected real numbers"
+    raise ModelError(message)
+
+
 @dataclass(frozen=True)
 class FunctionModel:
     """A forward model made of a Python function of a parameter vector.
@@ -276,7 +295,7 @@ class FunctionModel:
         # Copies: neither the caller nor the function can change a solution afterwards.
         point = np.array(parameters, dtype=float)
         point.flags.writeable = False
-        outputs = np.array(self.function(point), dtype=float, ndmin=1)
+        outputs = np.array(real(self.function(point), "function"), ndmin=1)
         if outputs.shape != (len(self.outputs),):
             message = f"the model's function returned shape {outputs.shape}, expected ({len(self.outputs)},)"
             raise ModelError(message)
@@ -342,7 +361,7 @@ class FunctionSolution:
     def _jacobian(self) -> FloatArray:
         if self.model.jacobian is None:
             raise DerivativeError("this model was given without a jacobian, so it has no derivatives")
-        jacobian = np.asarray(self.model.jacobian(self.parameters), dtype=float)
+        jacobian = real(self.model.jacobian(self.parameters), "jacobian")
         expected = self.outputs.size, self.parameters.size
         if jacobian.size != np.prod(expected) or (jacobian.shape != expected and 1 not in expected):
             message = f"the model's jacobian returned shape {jacobian.shape}, expected {expected}"

@@ -326,3 +326,15 @@ def test_the_schema_refuses_mistakes(validator, change):
 def test_the_command_prints_the_schema(capsys):
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema()
+
+
+def test_a_displacement_larger_than_the_body_is_questioned():
+    document_ = blocks()
+    document_["model"]["displacements"] = [{"on": "x-max", "x": 3e-3, "y": -3.0}]
+    document_["parameters"]["displacements.x-max.x"] = {"kind": "uniform", "lower": 0.0, "upper": 2.0}
+    texts = [finding.text for finding in parse(document_).findings if finding.text.startswith("displacements.")]
+    assert [text.partition(":")[0] for text in texts] == [
+        "displacements.x-max.y reaches -3 m, more than the length of the body, 0.28 m",
+        "displacements.x-max.x reaches 2 m, more than the length of the body, 0.28 m",
+    ]
+    assert any("displacements.x-max.y reaches" in line for line in plan(parse(document_)))

@@ -16,6 +16,7 @@ from tests.launch import ROOT
 from uq.evaluate import Request, SerialEvaluate
 from workflows.config import StudyError, load, parse
 from workflows.plan import plan
+from workflows.results import read_summary
 from workflows.study import run
 
 STUDY = """
@@ -120,6 +121,17 @@ def test_one_line_for_a_model_that_cannot_be_used(changes, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "returned", ["text", ["1", "2"], [1j, 2], np.array([1j, 2]), [[1], [1, 2]], {"a": 1}, b"12", [object(), 1], 10**400]
+)
+@pytest.mark.parametrize("what", ["function", "jacobian"])
+def test_one_line_for_what_is_no_number(monkeypatch, returned, what):
+    monkeypatch.setattr(functions, "flat", lambda p: returned)
+    with pytest.raises(ModelError, match=f"the model's {what} returned .*, expected real numbers") as caught:
+        model(**{what: "tests.functions.flat"}).build(None, ("E", "load")).solve(np.ones(2)).tangent(np.ones(2))
+    assert "\n" not in str(caught.value)
+
+
 def test_one_output_may_be_a_number():
     built = model(function="tests.functions.product", jacobian=None, outputs=("p",)).build(None, ("E",))
     assert built.solve(np.array([3.0])).outputs == pytest.approx([0.3])
@@ -170,6 +182,17 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     with pytest.raises(StudyError, match=r"changing_model\.py has changed; choose another --out"):
         run(changing, "changing", tmp_path / "out", quiet=True)
     sys.modules.pop("changing_model")
+
+
+@pytest.mark.parametrize("text", [b"{}", b"[]", b"", b"nan", b"\xff", b"[" * 5000, b'{"failed": 0}'])
+def test_a_damaged_summary_is_made_again(tmp_path, text):
+    case = study("method.samples=8")
+    assert run(case, "beam", tmp_path / "out", quiet=True) == 0
+    before = (tmp_path / "out" / "results.nc").read_bytes()
+    (tmp_path / "out" / "summary.json").write_bytes(text)
+    assert run(case, "beam", tmp_path / "out", quiet=True) == 0
+    assert (tmp_path / "out" / "results.nc").read_bytes() == before
+    assert read_summary(tmp_path / "out")["failed"] == 0
 
 
 def test_a_study_that_could_not_begin_leaves_no_directory(tmp_path):

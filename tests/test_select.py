@@ -316,6 +316,8 @@ def test_one_line_for_a_mistake(small, old, new, told):
         ("uniaxial,1.1,2,3", "table.csv: line 6: 4 cells, expected 3"),
         ("uniaxial,nan,1", "line 6, stretch: 'nan', expected a number"),
         ("uniaxial,-1,1", "line 6, stretch: -1, expected more than 0"),
+        ("uniaxial,150,1", "line 6, stretch: 150, expected a stretch"),
+        ("uniaxial,1.1,2\nuniaxial,1.1,2", "lines 6 and 7 are the same, expected each measurement once"),
     ],
 )
 def test_one_line_for_a_bad_row(small, row, told):

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external import PythonModel, UmBridgeModel
-from forward.hyperelastic import Hyperelastic, Mistake, Scalar
+from forward.hyperelastic import Hyperelastic, Mistake, Scalar, too_far
 from forward.locking import Decision
 from forward.model import Finding, ModelError
 from forward.settings import UNKNOWN_KIND, Settings, cut, nearest, one_line, shown
@@ -163,7 +163,8 @@ class Study(Settings):
         if not isinstance(self.model, Hyperelastic):
             return ()
         locking = self.model.locking(ranges(self.parameters))
-        return (*self.model.findings, *locking, *findings_of_draws(self._restricted))
+        far = too_far(self.model.body, ranges(self.parameters))
+        return (*dict.fromkeys((*self.model.findings, *far)), *locking, *findings_of_draws(self._restricted))
 
     @model_validator(mode="after")
     def _check(self) -> Study:

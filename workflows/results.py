@@ -79,11 +79,13 @@ def read_dataset(directory: Path) -> xr.Dataset:
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
-    """Read summary.json; nothing if there is none."""
+    """Read summary.json; nothing if there is none, or what stands there is not the summary of a finished study."""
     try:
-        return dict(json.loads((directory / "summary.json").read_text(encoding="utf-8")))
-    except (FileNotFoundError, json.JSONDecodeError):
+        found = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError, RecursionError):
         return None
+    whole = isinstance(found, dict) and {"study", "method", "status", "failed", "provenance"} <= found.keys()
+    return found if whole else None
 
 
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:

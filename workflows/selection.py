@@ -19,7 +19,7 @@ from forward.materials import MATERIALS, constants
 from forward.model import Finding, FloatArray, ForwardModel
 from forward.settings import Settings, nearest, shown
 from inverse.comparison import Candidate, Data
-from inverse.observations import DataError, read_table
+from inverse.observations import DataError, Table, read_table
 from inverse.posterior import NOISE
 from inverse.selection import Select
 from inverse.weights import resampled
@@ -62,6 +62,9 @@ class MeasuredTest(MaterialTest):
                 message = f"{name}: {len(values)} values, expected as many as in at: {len(self.at)}"
                 raise ValueError(message)
         return self
+
+
+LARGEST_STRETCH = 20.0  # beyond, a column holds per cent or lengths
 
 
 class DataFile(Settings):
@@ -125,6 +128,7 @@ class DataFile(Settings):
                 message = f"data: {path} has no column '{column}'; {nearest(column, table.columns)}"
                 raise StudyError(message)
         tests: dict[tuple[str, str, Component], dict[str, list[float]]] = {}
+        _refuse_repeats(table, path)
         for line, row in zip(table.lines, table.rows, strict=True):
             if any(row[column] != word for column, word in self.where.items()):
                 continue
@@ -132,7 +136,7 @@ class DataFile(Settings):
             mode = self.modes.get(word, word)
             sheared = mode == "simple-shear"
             place = f"{path}, line {line}"
-            at = _number(row[self.at], f"{place}, {self.at}", positive=not sheared)
+            at = _stretch(row[self.at], f"{place}, {self.at}", positive=not sheared)
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
@@ -140,7 +144,7 @@ class DataFile(Settings):
                 raise StudyError(message)
             across = None
             if self.across is not None and mode == "biaxial":
-                across = _number(row[self.across], f"{place}, {self.across}", positive=True)
+                across = _stretch(row[self.across], f"{place}, {self.across}", positive=True)
             held = mode in HELD
             for component, (measured, sigma) in self._in_row(row, place, held=held).items():
                 test = tests.setdefault((row[self.group] if self.group else WHOLE, word, component), {})
@@ -553,6 +557,23 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
         raise StudyError(*lines(error, "data")) from None
     return {**document, "data": table.read(folder)}
+
+
+def _refuse_repeats(table: Table, path: Path) -> None:
+    seen: dict[tuple[str, ...], int] = {}
+    for line, row in zip(table.lines, table.rows, strict=True):
+        before = seen.setdefault(tuple(row.values()), line)
+        if before != line:
+            message = f"data: {path}: lines {before} and {line} are the same, expected each measurement once"
+            raise StudyError(message)
+
+
+def _stretch(text: str, place: str, *, positive: bool) -> float:
+    value = _number(text, place, positive=positive)
+    if abs(value) > LARGEST_STRETCH:
+        message = f"data: {place}: {value:g}, expected a stretch (1 is undeformed), or an amount of shear"
+        raise StudyError(message)
+    return value
 
 
 def _number(text: str, place: str, *, positive: bool = False) -> float:
