@@ -296,8 +296,9 @@ class Hyperelastic(Settings):
         followers = [load.label for load in self.loads if isinstance(load, Pressure)]
         if followers and not self.solver.accept_unstable:
             text = (
-                f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. Stability "
-                "is judged by the symmetric part, in which divergence (buckling) shows; flutter shows in no static test."
+                f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. "
+                "Stability is judged by the symmetric part, in which divergence (buckling) shows; "
+                "flutter shows in no static test."
             )
             yield Finding("note", text)
 
