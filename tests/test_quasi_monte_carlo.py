@@ -10,6 +10,7 @@ import pytest
 from pydantic import ValidationError
 from scipy import stats
 
+from benchmarks import skewed
 from forward.model import FunctionModel, SolveError
 from tests.launch import run_script
 from uq import basis, quasi_monte_carlo, taylor
@@ -326,6 +327,36 @@ def test_an_expansion_is_held_beyond_its_samples_where_it_goes_wrong():
     for seed in range(8):  # up to 11 times the standard deviation off, and 95 % intervals that missed it
         data = QuasiMonteCarlo(samples=64, control="chaos", seed=seed).run(inputs, SerialEvaluate(model))
         assert data["std"].item() == pytest.approx(exact, rel=0.15)
+
+
+def test_borehole():
+    """A log-normal parameter that does next to nothing made the standard deviation 4.6e5 ± 4e-7 in place of 28.596."""
+    model = FunctionModel(skewed.borehole, skewed.INPUTS.names, ("flow",), skewed.slopes)
+    for seed in (0, 2):
+        data = QuasiMonteCarlo(samples=256, control="chaos", seed=seed).run(skewed.INPUTS, SerialEvaluate(model))
+        assert data["mean"].item() == pytest.approx(73.739, rel=1e-3)
+        assert data["std"].item() == pytest.approx(28.596, rel=1e-3)
+        assert 1e-5 < data["std_error"].item() / 28.596 < 1e-2
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_log_normal_parameters_with_every_control(control):
+    """Of 1/(1 + a + b), which polynomials of a and b do not approach; the standard deviation was 20 times off."""
+    inputs = Inputs(dict.fromkeys("ab", LogNormal(mean=1.0, std=0.5)))
+    model = FunctionModel(
+        lambda p: 1 / (1 + p[0] + p[1]), ("a", "b"), ("f",), lambda p: [[-1 / (1 + p[0] + p[1]) ** 2] * 2]
+    )
+    x, w = np.polynomial.hermite_e.hermegauss(60)
+    w = w / w.sum()
+    a = inputs.marginals["a"].from_normal(x)[0]
+    f = 1 / (1 + a[:, None] + a[None, :])
+    mean = w @ f @ w
+    std = np.sqrt(w @ (f - mean) ** 2 @ w)
+    within = {"none": 0.2, "tangent": 0.1, "quadratic": 0.03, "chaos": 0.02}[control]
+    for seed in range(4):
+        data = QuasiMonteCarlo(samples=128, control=control, seed=seed).run(inputs, SerialEvaluate(model))
+        assert data["std"].item() == pytest.approx(std, rel=within)
+        assert abs(data["mean"].item() - mean) < 4 * data["mean_error"].item() + 1e-3 * std
 
 
 def test_moments_of_what_is_held():
