@@ -189,7 +189,7 @@ def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
     if errors:
         return f"not to be trusted: {'; '.join([*errors, *warnings])}", NEITHER
     if warnings:
-        return f"doubtful: {'; '.join(warnings)}; but for that, {words[0].lower()}{words[1:]}", DOUBTFUL
+        return f"doubtful: {'; '.join(warnings)}; but for that: {words}", DOUBTFUL
     return words, trust
 
 
