@@ -2,6 +2,7 @@
 
 import json
 import locale
+import random
 import shutil
 import tomllib
 from itertools import product
@@ -487,3 +488,35 @@ def test_derivatives_by_the_numbers_of_regions_in_the_mixed_form(file):
     model = spec(file, body={"degree": 2}, formulation="mixed", regions={"right": REGION}, outputs=FEW)
     point = np.array([1e4, 2e4, 3e4, 1e6, 1.5])
     check_derivatives(built(model, *NUMBERS), point, 0.1 * point, noise=1e-10).require()
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_damaged_meshes_are_one_line_each(tmp_path, binary):
+    """Cut anywhere, with lines that are missing and with numbers that cannot be; some changes leave a mesh."""
+    organ = ROOT / "configs" / "organ.toml"
+    document_ = tomllib.loads(organ.read_text())
+    whole = (organ.parent / document_["model"]["body"]["file"]).read_bytes()
+    if not binary:
+        meshio.write(
+            tmp_path / "text.msh", meshio.gmsh.read(organ.parent / "meshes" / "organ.msh"), "gmsh22", binary=False
+        )
+        whole = (tmp_path / "text.msh").read_bytes()
+    document_["model"]["body"]["file"] = "damaged.msh"
+    chance = random.Random(7)
+    for kind in ("empty", "zeros", *(["cut", "line", "-7", "99999999999999999999", "nan", "1e308", "word"] * 2)):
+        lines = whole.split(b"\n")
+        at = chance.randrange(len(lines))
+        if kind == "line":
+            del lines[at]
+        elif kind not in {"empty", "zeros", "cut"}:
+            words = lines[at].split() or [b""]
+            words[chance.randrange(len(words))] = kind.encode()
+            lines[at] = b" ".join(words)
+        damaged = {"empty": b"", "zeros": bytes(1000), "cut": whole[: chance.randrange(len(whole))]}
+        (tmp_path / "damaged.msh").write_bytes(damaged.get(kind, b"\n".join(lines)))
+        try:
+            parse(document_, folder=tmp_path)
+            said = ()
+        except StudyError as error:
+            said = error.args
+        assert all(line.isprintable() and len(line) <= 620 for line in said), (kind, at)
