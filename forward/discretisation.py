@@ -9,7 +9,9 @@ indefinite. Forces (N) and volumes (m³), metres and pascals share vectors, so n
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, Literal, assert_never
@@ -18,13 +20,14 @@ import numpy as np
 import ufl
 
 from forward import fenicsx, kinematics
+from forward.cost import factor
 from forward.geometry import AXES
 from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.inclusions import stiffness_factor
 from forward.layout import Layout
 from forward.loads import LOAD_SIZES, Gravity, Pressure, Traction
 from forward.materials import MATERIALS, measures
-from forward.model import FloatArray, Work
+from forward.model import FloatArray, SolveError, Work
 from forward.newton import Residual
 from forward.own_mesh import OwnMesh
 from forward.vertex_fields import VertexField
@@ -52,6 +55,8 @@ class Discretisation:
     It is the `System` that Newton's method works on. Meshes, compiled forms and solver objects are made once; forms
     that only derivatives need are compiled when they are first used.
     """
+
+    _deadline: tuple[float, float] | None = None  # end of the time of a solve, and its length
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
         self.spec = spec
@@ -318,8 +323,12 @@ class Discretisation:
 
     def new_solver(self) -> fenicsx.DirectSolver:
         """Return a matrix and a solver of their own for the stiffness."""
+        return self._new_solver(self._stiffness, symmetric=self.symmetric)
+
+    def _new_solver(self, form: Any, *, symmetric: bool) -> fenicsx.DirectSolver:
+        expected = factor(self.spec.body, mixed=self.spec.mixed)
         return fenicsx.DirectSolver(
-            self._stiffness, self._constraints, self.unknowns, self.comm, symmetric=self.symmetric
+            form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
         )
 
     # --- state and parameters ----------------------------------------------------------------------------------------
@@ -451,7 +460,14 @@ class Discretisation:
         return self._residual()
 
     def residual(self, u: FloatArray) -> Residual:
-        """Return the imbalance at u (U_local,)."""
+        """Return the imbalance at u (U_local,).
+
+        Raises
+        ------
+        SolveError
+            If `time_limit` has passed.
+        """
+        self._check_time()
         r = self._imbalance(u)
         reactions = r[self.fixed]
         gap = u[self.fixed] - self._targets
@@ -464,6 +480,23 @@ class Discretisation:
         if self._moves:
             scale = max(scale, fixed)
         return Residual(r, free, scale, apart, self._force_of(lacking))
+
+    @contextmanager
+    def time_limit(self, seconds: float | None) -> Iterator[None]:
+        """Within this context, residuals are refused after so many seconds."""
+        self._deadline = None if seconds is None else (time.monotonic() + seconds, seconds)
+        try:
+            yield
+        finally:
+            self._deadline = None
+
+    def _check_time(self) -> None:
+        if self._deadline is None:
+            return
+        end, seconds = self._deadline
+        if fenicsx.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
+            message = f"the solve took longer than solve_seconds = {seconds:g}"
+            raise SolveError(message, work=self.work)
 
     def _force_of(self, lacking: float) -> float:
         """Force (N) of volumes (m³) that are out of balance; volumes that are rounding have none."""
@@ -579,9 +612,7 @@ class Discretisation:
 
     def new_symmetric_solver(self) -> fenicsx.DirectSolver:
         """Return a matrix and a solver of their own for the symmetric part of the stiffness."""
-        return fenicsx.DirectSolver(
-            self._symmetric_stiffness, self._constraints, self.unknowns, self.comm, symmetric=True
-        )
+        return self._new_solver(self._symmetric_stiffness, symmetric=True)
 
     @cached_property
     def _symmetric_part(self) -> fenicsx.DirectSolver:

@@ -13,14 +13,16 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from forward.hyperelastic import Scalar
+from forward.machine import StopError, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
 from forward.own_modules import Sources, sources
+from forward.patience import TimeLimitError, time_limit
 from forward.settings import Settings, nearest
 
 SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
@@ -66,9 +68,12 @@ class _External(Settings):
         take their place.
     outputs
         The m outputs in their order: names, or blocks with `name` and `unit`.
+    solve_seconds
+        Longest time (s, by the clock) for one evaluation, after which it has failed; none by default.
     """
 
     kind: str
+    solve_seconds: Annotated[float, Field(gt=0)] | None = None
     parameters: dict[Annotated[str, Field(pattern=r"^\S+$")], float] = Field(min_length=1)
     outputs: tuple[Output, ...] = Field(min_length=1)
 
@@ -153,6 +158,8 @@ class PythonModel(_External):
         Dotted path of the derivatives: (d,) → (m, d). Without it, methods that need derivatives refuse the model.
     parameters, outputs
         Names, as of every external model.
+    solve_seconds
+        Longest time (s) for one call; code that does not come back to Python is not interrupted.
     """
 
     kind: Literal["python"] = "python"
@@ -176,8 +183,8 @@ class PythonModel(_External):
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Import function and Jacobian."""
-        function = _guarded(self.function, "function")
-        return function, _guarded(self.jacobian, "jacobian") if self.jacobian else None
+        function = _guarded(self.function, "function", self.solve_seconds)
+        return function, _guarded(self.jacobian, "jacobian", self.solve_seconds) if self.jacobian else None
 
 
 def _imported(module: str) -> ModuleType:
@@ -198,8 +205,8 @@ def _imported(module: str) -> ModuleType:
         sys.dont_write_bytecode = kept
 
 
-def _guarded(path: str, key: str) -> Callable[[FloatArray], Any]:
-    """Import a function; the exceptions that it raises become failed solves."""
+def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray], Any]:
+    """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves."""
     module, _, name = path.rpartition(".")
     try:
         function = getattr(_imported(module), name)
@@ -207,7 +214,9 @@ def _guarded(path: str, key: str) -> Callable[[FloatArray], Any]:
         known = tuple(word for word in dir(_imported(module)) if not word.startswith("_"))
         message = f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}"
         raise ModelError(message) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if out_of_memory(error):
+            raise
         message = f"model.{key}: '{module}' cannot be imported: {_said(error)}"
         raise ModelError(message) from None
     if not callable(function):
@@ -216,10 +225,19 @@ def _guarded(path: str, key: str) -> Callable[[FloatArray], Any]:
 
     def guarded(point: FloatArray) -> Any:
         try:
-            return function(point)
+            with time_limit(seconds):
+                return function(point)
         except SolveError:
             raise
+        except TimeLimitError:
+            message = f"{path} took longer than solve_seconds = {seconds:g}"
+            raise SolveError(message) from None
+        except SystemExit as error:
+            message = f"{path} ended the process: {_said(error)}"
+            raise StopError(message) from None
         except Exception as error:
+            if reason_to_stop(error) is not None:
+                raise
             message = f"{path} raised {_said(error)}"
             raise SolveError(message) from error
 
@@ -264,7 +282,7 @@ class UmBridgeModel(_External):
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Ask the server what it has."""
-        client = Client(self.url, self.name, self.config)
+        client = Client(self.url, self.name, self.config, self.solve_seconds)
         for what, sizes, given in (
             ("parameters", client.inputs, len(self.parameters)),
             ("outputs", client.outputs, len(self.outputs)),
@@ -286,6 +304,8 @@ class Client:
         Of the model; the only one where it is not given.
     config
         Options.
+    seconds
+        Longest time for the answer to one question; None to wait for ever.
 
     Attributes
     ----------
@@ -300,8 +320,9 @@ class Client:
         If the server does not answer, or has no such model.
     """
 
-    def __init__(self, url: str, name: str | None, config: dict[str, Any]) -> None:
+    def __init__(self, url: str, name: str | None, config: dict[str, Any], seconds: float | None = None) -> None:
         self._url = url.rstrip("/")
+        self._seconds = seconds
         info = self._ask("Info", None)
         models = info.get("models", [])
         if name is None and len(models) != 1:
@@ -348,7 +369,7 @@ class Client:
     def _solve(self, what: str, point: FloatArray, more: dict[str, Any]) -> Any:
         ends = np.cumsum(self.inputs)[:-1]
         vectors = [part.tolist() for part in np.split(point, ends)]
-        return self._ask(what, {"input": vectors, "config": self._config} | more, None)["output"]
+        return self._ask(what, {"input": vectors, "config": self._config} | more, self._seconds)["output"]
 
     def _ask(self, what: str, question: dict[str, Any] | None, timeout: float | None = SECONDS_TO_ANSWER) -> Any:
         """Send a question and return the answer."""
@@ -362,7 +383,11 @@ class Client:
                 return json.loads(answer.read())
         except HTTPError as error:
             self._refuse(what, error.code, error.read())
+        except TimeoutError:
+            self._refuse_slowness(what, timeout)
         except URLError as error:
+            if isinstance(error.reason, TimeoutError):
+                self._refuse_slowness(what, timeout)
             message = f"model.url: {self._url} does not answer ({error.reason}), expected an UM-Bridge server"
             raise ModelError(message) from None
         except json.JSONDecodeError:
@@ -371,6 +396,13 @@ class Client:
         except OSError as error:
             message = f"model.url: {self._url} broke off ({_said(error)})"
             raise ModelError(message) from None
+
+    def _refuse_slowness(self, what: str, timeout: float | None) -> NoReturn:
+        if what in {"Evaluate", "Gradient", "ApplyJacobian"}:
+            message = f"{self._url} took longer than solve_seconds = {timeout:g}"
+            raise SolveError(message)
+        message = f"model.url: {self._url} does not answer within {timeout:g} s, expected an UM-Bridge server"
+        raise ModelError(message)
 
     def _refuse(self, what: str, code: int, body: bytes) -> None:
         """Say what a server's error means: a failed solve, or a model that cannot be used."""

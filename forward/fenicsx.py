@@ -20,8 +20,10 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from forward.cost import BYTES_PER_NONZERO, BYTES_PER_UNKNOWN, Factor
 from forward.geometry import AXES, Body
 from forward.location import locate
+from forward.machine import MIB, StopError, headroom, require, reserve_for_linear_algebra
 from forward.model import FloatArray, ModelError, SolveError
 from forward.own_mesh import OwnMesh
 
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 T = TypeVar("T")
+
+reserve_for_linear_algebra()
+basix.create_element(basix.ElementFamily.P, basix.CellType.interval, 1)  # with the linear algebra of DOLFINx, too
 
 _FIVE = dolfinx.__version__.startswith("0.5.")  # else 0.11
 atan2 = ufl.atan_2 if _FIVE else ufl.atan2
@@ -147,6 +152,7 @@ class PointValues:
 
 def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
+    require(BYTES_PER_UNKNOWN * body.nodes / comm.size + SPARE, "the mesh")
     if isinstance(body, OwnMesh):
         return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
@@ -542,6 +548,15 @@ class ScalarAssembler:
         return float(self._comm.allreduce(fem.assemble_scalar(self._form)))
 
 
+ROOM = 60  # for what pivoting adds to the factor, in per cent of MUMPS's own estimate
+MOST_ROOM = 4000
+HOPELESS = 0.6  # part of the memory that a factor is expected to take, without which it is not begun
+SPARE = 64 * MIB  # for what libraries allocate without looking
+SINGULAR = -10  # errors of MUMPS, as its guide numbers them
+TOO_LITTLE_ROOM = {-8, -9, -14, -15, -17, -20}  # more than was estimated is needed: more room helps
+TOO_LITTLE_MEMORY = {-5, -7, -11, -13, -18, -19, -22}
+
+
 class DirectSolver:
     """A stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
 
@@ -560,9 +575,27 @@ class DirectSolver:
         Communicator of the ranks that share the matrix.
     symmetric
         Whether the form is.
+    expected
+        What the factor is expected to be.
+
+    Raises
+    ------
+    StopError
+        If there is no memory for the matrix.
     """
 
-    def __init__(self, form: Any, constraints: list[Any], unknowns: Unknowns, comm: Any, *, symmetric: bool) -> None:
+    def __init__(
+        self,
+        form: Any,
+        constraints: list[Any],
+        unknowns: Unknowns,
+        comm: Any,
+        *,
+        symmetric: bool,
+        expected: Factor,
+    ) -> None:
+        self._expected = expected
+        require(2 * BYTES_PER_NONZERO * expected.nonzeros / comm.size + SPARE, "the stiffness matrix")
         self._form = form
         self._unknowns = unknowns
         self._constraints = constraints
@@ -570,16 +603,9 @@ class DirectSolver:
         self._symmetric = symmetric
         if symmetric:
             self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._ksp = PETSc.KSP().create(comm)
-        self._ksp.setOperators(self._matrix)
-        self._ksp.setType("preonly")
-        self._ksp.pc.setType("cholesky" if symmetric else "lu")
-        self._ksp.pc.setFactorSolverType("mumps")
-        # Room for what pivoting adds to the factor, in per cent of MUMPS's own estimate.
-        self._ksp.pc.setFactorSetUpSolverType()
-        self._ksp.pc.getFactorMatrix().setMumpsIcntl(14, 60)
-        if symmetric:  # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots
-            self._ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
+        self._room = ROOM
+        self._analysed = False
+        self._ksp = self._new_ksp(comm)
         self._right = self._matrix.createVecLeft()
         self._solution = self._matrix.createVecRight()
 
@@ -590,15 +616,59 @@ class DirectSolver:
         ------
         SolveError
             If the matrix is singular or has entries that are not finite.
+        StopError
+            If there is no memory for the factor.
         """
+        unknowns, ranks = self._matrix.getSize()[0], self._ksp.comm.size
+        if not self._analysed:  # the analysis crashes where it finds no memory
+            hopeless = HOPELESS * self._expected.bytes / ranks + SPARE
+            require(hopeless, f"the factor of the stiffness of {unknowns:,} unknowns")
         self._assemble()
-        self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
-        status = self._ksp.pc.getFactorMatrix().getMumpsInfog(1)
-        if status < 0:
-            message = (
-                "the stiffness is singular" if status == -10 else f"the factorisation failed (MUMPS error {status})"
-            )
+        while (status := self._try()) in TOO_LITTLE_ROOM and self._room < MOST_ROOM:
+            self._room *= 4
+            self._renew()
+        self._analysed = True
+        if status >= 0:
+            return
+        if status == SINGULAR:
+            message = "the stiffness is singular"
             raise SolveError(message)
+        needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
+        self._renew()  # or else PETSc would report this failure for ever
+        if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
+            have = headroom()
+            message = (
+                f"memory ran out: the factor of the stiffness of {unknowns:,} unknowns needs {needed:,} MiB"
+                f"{' on one rank' if ranks > 1 else ''}, {have}"
+            )
+            raise StopError(message)
+        message = f"the factorisation failed (MUMPS error {status})"
+        raise SolveError(message)
+
+    def _try(self) -> int:
+        """Factorise; return MUMPS's status, negative where it failed."""
+        self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
+        return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(1))
+
+    def _new_ksp(self, comm: Any) -> Any:
+        ksp = PETSc.KSP().create(comm)
+        ksp.setOperators(self._matrix)
+        ksp.setType("preonly")
+        ksp.pc.setType("cholesky" if self._symmetric else "lu")
+        ksp.pc.setFactorSolverType("mumps")
+        ksp.pc.setFactorSetUpSolverType()
+        ksp.pc.getFactorMatrix().setMumpsIcntl(14, self._room)
+        if (
+            self._symmetric
+        ):  # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots
+            ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
+        return ksp
+
+    def _renew(self) -> None:
+        """Begin with a new factor, which is analysed again."""
+        self._ksp.destroy()
+        self._ksp = self._new_ksp(self._matrix.comm)
+        self._analysed = False
 
     def _assemble(self) -> None:
         self._matrix.zeroEntries()

@@ -118,7 +118,8 @@ class HyperelasticModel:
         body.work = Work()
         body.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters, screen=screen)
-        found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
+        with body.time_limit(self.spec.solver.solve_seconds):
+            found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
         if found.stability >= Stability.COUNTED and body.symmetric:

@@ -48,6 +48,9 @@ class SolverSettings(Settings):
         Shortest fraction of a Newton step that is tried where the whole step is not admissible.
     minimum_load_step
         Smallest load step, as a fraction of the load, before the solver gives up.
+    solve_seconds
+        Longest time (s, by the clock) for one solve, after which it has failed; none by default. It is looked at
+        between iterations. Whether a solve that takes about so long fails depends on the machine.
     accept_unstable
         Whether an equilibrium counts where the stiffness has negative eigenvalues (the body has buckled). Nothing is
         then spent on looking for them.
@@ -60,6 +63,7 @@ class SolverSettings(Settings):
     corrections: Annotated[int, Field(ge=1)] = 40
     minimum_damping: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 8192
+    solve_seconds: Annotated[float, Field(gt=0)] | None = None
     accept_unstable: bool = False
 
 

@@ -22,6 +22,7 @@ from annotated_types import Gt
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
 from forward.settings import Settings, nearest
 
@@ -363,6 +364,8 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
         said = (printed.getvalue().strip().splitlines() or [f"it is no {Path(file).suffix} file that meshio reads"])[0]
         refuse(f"cannot be read as a mesh: {said}{', try .vtu' if file.endswith('.vtk') else ''}")
     except Exception as error:  # readers fail in many ways
+        if out_of_memory(error):
+            raise
         said = (str(error).splitlines() or [""])[0]
         if "gmsh:physical" in said:
             refuse("has cells in no physical group, expected what belongs to one (gmsh: Mesh.SaveAll = 0)")

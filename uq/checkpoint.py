@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields, is_dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import h5py
 import numpy as np
 
+from forward.machine import write_whole
 from forward.model import WORK, ModelError, Stability
 from uq.evaluate import Evaluations, Failure
 
@@ -144,8 +145,9 @@ def _write(
     key: str = "",
     note: str = "",
 ) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    with h5py.File(partial, "w", userblock_size=_HEAD) as file:
+    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    creation.set_userblock(_HEAD)
+    with in_memory(creation) as file:
         for name, block in blocks.items():
             group = file.require_group(name)
             group["points"] = block.points
@@ -163,19 +165,29 @@ def _write(
             if block.fields.size:
                 group["fields"] = block.fields
             group.attrs["note"] = note
-        file.flush()
-    with partial.open("r+b") as written:
-        checksum = _checksum(written, key).encode()
-        written.seek(0)
-        written.write(checksum)
-        written.flush()
-        os.fsync(written.fileno())
-    partial.replace(path)
+        body = image(file)  # without the head
+    write_whole(path, _checksum(BytesIO(body), key).encode().ljust(_HEAD, b"\0") + body)
+
+
+def in_memory(creation: Any = None) -> h5py.File:
+    """Return a new HDF5 file in memory: one on disk that cannot be written to the end kills its process.
+
+    `creation` is the list of properties that the file is created with.
+    """
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
+    access.set_fapl_core(2**20, backing_store=False)
+    return h5py.File(h5py.h5f.create(b"memory", fcpl=creation, fapl=access))
+
+
+def image(file: h5py.File) -> bytes:
+    """Return the bytes of a file in memory."""
+    file.flush()
+    return bytes(file.id.get_file_image())
 
 
 def _checksum(file: BinaryIO, key: str) -> str:
-    """Return a hash of what follows the head of a file, and of what the file was asked for."""
-    file.seek(_HEAD)
+    """Return a hash of the rest of a file, and of what the file was asked for."""
     return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()  # type: ignore[arg-type]
 
 

@@ -13,12 +13,13 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
 
-from forward.model import ForwardModel, ModelError
+from forward.machine import StopError, reason_to_stop
+from forward.model import ForwardModel, ModelError, SolveError
 from uq.checkpoint import Checkpoint
 from uq.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
@@ -27,6 +28,7 @@ Arrived = Callable[[Evaluations, bool], None]
 CHEAP = 1e-3  # seconds below which a block is found sooner than its file is written and read again,
 SELDOM = 0.1  # so that a file of such blocks is written only so often (s)
 _RESULT = 1
+SECONDS_FOR_OTHERS = 5.0  # in which ranks that fail alike come together
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their blocks
 
 
@@ -73,6 +75,32 @@ class Ensemble:
             raise ValueError(message)
         index = world.rank // ranks_per_model
         return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index)
+
+    def together(self, make: Callable[[], T]) -> T:
+        """Return what all ranks make; what is raised on one of them is raised on all; collective.
+
+        A rank that fails alone, while the others wait for it inside what they make, ends the job.
+        """
+        found, error = None, None
+        try:
+            found = make()
+        except (ValueError, SolveError, StopError) as refusal:  # mistakes of the study are ValueErrors
+            error = refusal
+        except BaseException as unexpected:
+            if self.world.size > 1:
+                end_job(self.world, unexpected)
+            raise
+        if self.world.size > 1:
+            here, begin = self.world.Ibarrier(), time.monotonic()
+            while error is not None and not here.Test():
+                if time.monotonic() - begin > SECONDS_FOR_OTHERS:
+                    end_job(self.world, error)
+                time.sleep(0.01)
+            here.Wait()
+            error = next((one for one in self.world.allgather(error) if one is not None), None)
+        if error is not None:
+            raise error
+        return cast("T", found)
 
     def run(
         self,
@@ -123,8 +151,9 @@ class Ensemble:
 
             self._counted = count
             if self.world.rank > 0:
-                while (order := self.world.bcast(None)) is not None:
-                    worker.work(order)
+                with _abort_all(self.world):
+                    while (order := self.world.bcast(None)) is not None:
+                        worker.work(order)
                 return None
             try:
                 return task(EnsembleEvaluate(worker, 0, progress if counted else _unseen, blocks, arrived))
@@ -291,17 +320,16 @@ class _Worker:
     def work(self, order: _Order | int) -> None:
         """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its number."""
         world, sent = self._ensemble.world, []
-        with _abort_all(world):
-            if isinstance(order, int):
-                self.models[order]
-                return
-            for result in self._blocks(order, lambda done, failed: None):
-                if self._ensemble.group.rank == 0 and self._ensemble.index > 0:
-                    sent.append(world.isend(result, dest=0, tag=_RESULT))
-                    sent = [request for request in sent if not request.test()[0]]
-            for request in sent:
-                request.wait()
-            world.barrier()
+        if isinstance(order, int):
+            self.models[order]
+            return
+        for result in self._blocks(order, lambda done, failed: None):
+            if self._ensemble.group.rank == 0 and self._ensemble.index > 0:
+                sent.append(world.isend(result, dest=0, tag=_RESULT))
+                sent = [request for request in sent if not request.test()[0]]
+        for request in sent:
+            request.wait()
+        world.barrier()
 
     def _blocks(self, order: _Order, progress: Callable[[int, int], None]) -> Iterator[tuple[int, Evaluations]]:
         group = self._ensemble.group
@@ -390,12 +418,21 @@ def _abort_all(world: Any) -> Iterator[None]:
     """An exception that only one rank knows of would leave the others waiting for ever: print it and stop them all."""
     try:
         yield
-    except Exception as error:
+    except BaseException as error:
         if world.size == 1:
             raise
-        if isinstance(error, ModelError):
-            sys.stderr.write(f"failed: {error}\n")
-        else:
-            traceback.print_exc()
-        sys.stderr.flush()
-        world.Abort(1)
+        end_job(world, error)
+        raise
+
+
+def end_job(world: Any, error: BaseException) -> None:
+    """End the job of all ranks with exit code 1 for an exception of this rank, in one line where it has a reason."""
+    reason = str(error) if isinstance(error, ModelError | SolveError) else reason_to_stop(error)
+    # Where all ranks fail alike, the first one to speak ends the others.
+    time.sleep(min(0.1 * world.rank, 1.0))
+    if reason is None:
+        traceback.print_exception(error)
+    else:
+        sys.stderr.write(f"{'' if isinstance(error, KeyboardInterrupt) else 'failed: '}{reason}\n")
+    sys.stderr.flush()
+    world.Abort(1)

@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from workflows.config import AnyStudy
@@ -31,24 +31,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         a number cannot be trusted.
     """
     options = _parser().parse_args(arguments)
+    from forward.machine import START, StopError, reason_to_stop, require
+
+    try:
+        require(START, "the program alone")
+    except StopError as error:
+        return _end(f"failed: {error}", FAILED)
     from forward.model import ModelError, SolveError
     from workflows.config import StudyError
 
     try:
-        return int(options.command(options))
+        code = int(options.command(options))
+        sys.stdout.flush()
     except (StudyError, ModelError) as error:
-        _say(str(error))
-        return BAD
-    except (SolveError, FileNotFoundError, PermissionError) as error:
-        _say(f"failed: {error}")
+        return _end(str(error), BAD)
+    except (SolveError, StopError, FileNotFoundError, PermissionError) as error:
+        return _end(f"failed: {error}", FAILED)
+    except BaseException as error:
+        world = _world()
+        if world is not None:
+            from uq.ensemble import end_job
+
+            end_job(world, error)
+        reason = reason_to_stop(error)
+        if reason is None:
+            traceback.print_exc()
+        else:
+            _say(reason if isinstance(error, KeyboardInterrupt) else f"failed: {reason}")
         return FAILED
-    except KeyboardInterrupt:
-        _say("interrupted; the same command continues")
-        return FAILED
-    except Exception:
-        traceback.print_exc()
-        _abort_all()
-        return FAILED
+    return code
+
+
+def _end(text: str, code: int) -> int:
+    _say(text)
+    return code
 
 
 def _say(text: str) -> None:
@@ -59,11 +75,10 @@ def _say(text: str) -> None:
         sys.stderr.write("".join(f"{one_line(line)}\n" for line in text.split("\n")))
 
 
-def _abort_all() -> None:
+def _world() -> Any:
+    """Return all ranks of the job, or None where this process is the only one."""
     mpi = sys.modules.get("mpi4py.MPI")
-    if mpi is not None and mpi.COMM_WORLD.size > 1:
-        sys.stderr.flush()
-        mpi.COMM_WORLD.Abort(FAILED)
+    return None if mpi is None or mpi.COMM_WORLD.size == 1 else mpi.COMM_WORLD
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -107,8 +122,10 @@ def _parser() -> argparse.ArgumentParser:
 def _load(options: argparse.Namespace) -> AnyStudy:
     """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
     from forward.external import PythonModel
+    from forward.machine import reserve_for_linear_algebra
     from workflows.config import Study, load
 
+    reserve_for_linear_algebra()
     study = load(options.study, options.set)
     if isinstance(study, Study) and isinstance(study.model, PythonModel):
         from forward.own_modules import make_visible
@@ -127,8 +144,13 @@ def _check(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     study = _load(options)
+    from forward.machine import SHARED_BY_RANKS, require_files
+    from workflows.signals import heed
     from workflows.study import run
 
+    if "mpi4py.MPI" not in sys.modules:  # or else it has its file
+        require_files(SHARED_BY_RANKS, "MPI")
+    heed()
     return run(study, options.study.stem, options.out or Path("results") / options.study.stem, quiet=options.quiet)
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from forward.cost import ADDRESSES_OF_PROGRAM, BYTES_OF_PROGRAM, BYTES_PER_UNKNOWN, factor
 from forward.finer import finer
 from forward.hyperelastic import Hyperelastic
+from forward.machine import MIB, Headroom, limits
+from forward.model import Finding
 from forward.own_mesh import OwnMesh
 from uq.multilevel import MultilevelMonteCarlo
 from uq.stopping import TEXTBOOK, seconds_per_solve
@@ -14,14 +17,51 @@ from workflows.config import Study, ranges
 if TYPE_CHECKING:
     from forward.geometry import Body
     from forward.locking import Decision
+    from forward.specimen import Specimen
     from workflows.config import AnyStudy
     from workflows.inversion import Inversion, Synthesis
     from workflows.selection import Comparison
 
 
-def bytes_per_model(unknowns: int) -> float:
-    """Predict the memory of one model with the factors of a solution and of a reference, to a factor of two or so."""
-    return float(1.5e8 + 8 * (300 * unknowns + 45 * unknowns ** (4 / 3)))
+def memory(study: AnyStudy) -> float:
+    """Predict the memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements.
+
+    A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen has one.
+    """
+    if isinstance(study, Study):
+        return sum(_of_body(one, 2) for one in study.models if isinstance(one, Hyperelastic))
+    from workflows.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion | Synthesis):
+        return _of_specimen(study.model)
+    return sum(_of_specimen(one) for one in getattr(study, "specimens", {}).values())
+
+
+def _of_specimen(spec: Specimen) -> float:
+    return sum(_of_body(spec.loaded(case), 1) for case in spec.cases)
+
+
+def _of_body(spec: Hyperelastic, factors: int) -> float:
+    return BYTES_PER_UNKNOWN * spec.unknowns + factors * factor(spec.body, mixed=spec.mixed).bytes
+
+
+def shortage(study: AnyStudy, groups: int = 1) -> Finding | None:
+    """Say that the memory of this machine may not do for a study, by so many groups of ranks on it."""
+    need = memory(study)
+    if not need:
+        return None
+    for limit in sorted(limits(), key=lambda one: one.size):
+        wanted = need + of_program(limit)
+        wanted *= 1 if limit.of_each_process else groups
+        if wanted > limit.size:
+            text = f"memory may run out: about {wanted / MIB:,.0f} MiB are needed, {limit}"
+            return Finding("warning", text)
+    return None
+
+
+def of_program(limit: Headroom) -> float:
+    """Memory (bytes) of the program itself, as a limit counts it."""
+    return ADDRESSES_OF_PROGRAM if limit.of_addresses else BYTES_OF_PROGRAM
 
 
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
@@ -29,7 +69,9 @@ SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
 
 def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
-    return [*_planned(study, groups), *(f"{one.severity:10}  {one.text}" for one in study.findings)]
+    short = shortage(study, groups)
+    found = [*study.findings, *([] if short is None else [short])]
+    return [*_planned(study, groups), *(f"{one.severity:10}  {one.text}" for one in found)]
 
 
 def _planned(study: AnyStudy, groups: int) -> list[str]:
@@ -41,7 +83,6 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
     textbook = TEXTBOOK if model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
     each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
-    memory = sum(bytes_per_model(other.unknowns) for other in study.models if isinstance(other, Hyperelastic))
     form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
     up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
     seconds = study.planned * each[0]
@@ -66,7 +107,7 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
         f"parameters  {', '.join(names)}",
         f"outputs     {', '.join(output.name for output in model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
-        f"memory      about {memory / 2**20:,.0f} MiB for each group of ranks",
+        f"memory      about {(memory(study) + BYTES_OF_PROGRAM) / MIB:,.0f} MiB for each group of ranks",
         f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
         f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
     ]

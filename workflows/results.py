@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.machine import write_whole
 from uq.compare import ESTIMATED, gains
 from uq.moments import ESTIMATES
 from workflows.norms import squares
@@ -24,9 +25,7 @@ STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 def write_text(path: Path, text: str) -> None:
     """Write a file under another name and rename it into place."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    write_whole(path, text.encode())
 
 
 def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
@@ -35,7 +34,8 @@ def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Datas
     import h5py
     from xarray.backends import H5NetCDFStore
 
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    from uq.checkpoint import image, in_memory
+
     # HDF5 stamps groups with the time unless it is told not to; netCDF-4 needs the order of creation.
     of_file, of_group = (h5py.h5p.create(kind) for kind in (h5py.h5p.FILE_CREATE, h5py.h5p.GROUP_CREATE))
     order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
@@ -43,14 +43,14 @@ def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Datas
         creation.set_obj_track_times(False)
         creation.set_link_creation_order(order)
         creation.set_attr_creation_order(order)
-    created = h5py.h5f.create(os.fsencode(partial), fcpl=of_file)
-    for name in groups or {}:
-        h5py.h5g.create(created, name.encode(), gcpl=of_group)
-    with h5py.File(created) as file, h5netcdf.File(file, "a") as netcdf:
-        dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
-        for name, part in (groups or {}).items():
-            part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
-    partial.replace(path)
+    with in_memory(of_file) as file:
+        for name in groups or {}:
+            h5py.h5g.create(file.id, name.encode(), gcpl=of_group)
+        with h5netcdf.File(file, "a") as netcdf:
+            dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
+            for name, part in (groups or {}).items():
+                part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
+        write_whole(path, image(file))
 
 
 def read_dataset(directory: Path) -> xr.Dataset:
@@ -64,18 +64,29 @@ def read_dataset(directory: Path) -> xr.Dataset:
     import xarray as xr
 
     path = directory / "results.nc"
+    again = "`tissuq run` with the same study and --out makes it again"
     if not path.exists():
         begun = "; the command that began this one continues it" if (directory / "study.toml").exists() else ""
         message = f"{directory}: holds no results.nc, expected the directory of a finished study{begun}"
+        if read_summary(directory) is not None:
+            message = f"{directory}: results.nc is missing, although the study is finished; {again}"
         raise FileNotFoundError(message)
     try:
         found = xr.load_dataset(path, engine="h5netcdf")
-    except OSError:
-        found = xr.Dataset()
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:  # HDF5 says in many ways that a file is damaged
+        message = f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}"
+        raise FileNotFoundError(message) from None
     if "config" not in found.attrs:
         message = f"{path}: holds no results of a study, expected a file that `tissuq run` has written"
         raise FileNotFoundError(message)
     return found
+
+
+def digest(directory: Path) -> str:
+    """Return the hash of the results of a study, as summary.json keeps it."""
+    return hashlib.sha256((directory / "results.nc").read_bytes()).hexdigest()
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
@@ -269,10 +280,20 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
         parts = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
     for name, part in parts.items():
         path = directory / f"{name}.vtu"
-        partial = path.with_name(f".{os.getpid()}.{path.name}")
-        body_grid(part).save(partial)
-        partial.replace(path)
+        write_whole(path, _vtu(body_grid(part)))
     return path
+
+
+def _vtu(grid: Any) -> bytes:
+    """Return a pyvista grid as a file for ParaView: VTK itself would leave half a file, and not say so."""
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(grid)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return bytes(writer.GetOutputString().encode())
 
 
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import Stability
 from forward.own_modules import Loaded
 from uq import branch
@@ -29,10 +30,12 @@ from uq.sampling import random_points
 from workflows import own_code, verdict, words
 from workflows.config import Study, StudyError, differences, document, dump
 from workflows.locking import measured
+from workflows.plan import memory, of_program, shortage
 from workflows.progress import Progress
 from workflows.results import (
     above_rounding,
     blank_where_still,
+    digest,
     inverted,
     label,
     read_summary,
@@ -95,11 +98,23 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
         If the model cannot be made.
     SolveError
         If the study cannot be finished because the model has no answer.
+    StopError
+        If there is no memory, or no room on disk; what is finished is kept.
 
     Notes
     -----
     Where it fails before anything is solved, the directory is left as it was.
     """
+    try:
+        return _run(study, name, directory, quiet=quiet)
+    except Exception as error:
+        if isinstance(error, StopError) or not out_of_memory(error):
+            raise
+        reason = reason_to_stop(error, memory(study) + of_program(headroom()))
+        raise StopError(reason) from error
+
+
+def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     from mpi4py import MPI
 
     world = MPI.COMM_WORLD
@@ -118,11 +133,12 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     from uq.ensemble import Ensemble
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
+    _warn_of_memory(study, world, quiet=quiet)
     planned = study.solves if hasattr(study, "solves") else study.planned
     progress = Progress(planned, quiet=quiet or world.rank > 0, failures=not _explains(study))
     checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]), loaded)
     try:
-        job = _job(study, ensemble, name, directory, checkpoint)
+        job = ensemble.together(lambda: _job(study, ensemble, name, directory, checkpoint))
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
         kept = checkpoint if job.costly else None
@@ -174,6 +190,17 @@ def _with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations)
     return dataset
 
 
+def _warn_of_memory(study: AnyStudy, world: Any, *, quiet: bool) -> None:
+    """Say on the first rank that the memory of its machine may not do; collective."""
+    from mpi4py import MPI
+
+    here = world.Split_type(MPI.COMM_TYPE_SHARED)
+    short = shortage(study, max(1, here.size // study.parallel.ranks_per_model))
+    here.Free()
+    if short is not None and world.rank == 0 and not quiet:
+        sys.stderr.write(f"{short.severity}: {short.text}\n")
+
+
 def exit_code(summary: Mapping[str, Any]) -> int:
     """Return the exit code of a finished study: 3 where solves failed, or where a number cannot be trusted."""
     doubtful = any(one["severity"] == "error" for one in summary.get("findings", ()))
@@ -182,11 +209,12 @@ def exit_code(summary: Mapping[str, Any]) -> int:
 
 def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
     """Return on all ranks what rank 0 finds, or raise there what it raises."""
-    refusal, found = None, None
+    refusal: Exception | None = None
+    found = None
     if world.rank == 0:
         try:
             found = prepare()
-        except StudyError as error:
+        except (StudyError, StopError) as error:
             refusal = error
     refusal, found = world.bcast((refusal, found))
     if refusal is not None:
@@ -210,6 +238,7 @@ def _leave(
         write_text(directory / name, text)
     checkpoint.consolidate(evaluations)
     # The summary says that the study is finished: only then may the blocks go.
+    summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
     _report(directory)
@@ -564,11 +593,26 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
         message = f"{kept}: is not a study, expected a directory of this study"
         raise StudyError(message) from None
     except OSError as error:
+        reason = reason_to_stop(error)
+        if reason is not None:
+            raise StopError(reason) from None
         message = f"{directory}: cannot be written: {error.strerror}"
         raise StudyError(message) from None
     own_code.refuse_other(directory, study)
+    return _finished(directory)
+
+
+def _finished(directory: Path) -> int | None:
+    """Return the exit code of a study that is finished; None for any other, and where its results are lost."""
     summary = read_summary(directory)
     if summary is None:
+        return None
+    try:
+        intact = digest(directory) == summary["provenance"]["results_sha256"]
+    except FileNotFoundError:
+        intact = False
+    if not intact:
+        sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
         return None
     return exit_code(summary)
 

@@ -1,0 +1,265 @@
+"""Runs that die: no memory, no room on disk, signals, models that end the process or never end."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.launch import ROOT, environment, on_ranks, run_script
+
+TISSUQ = Path(sys.executable).parent / "tissuq"
+MODEL = """
+import os
+import sys
+import time
+
+def value(p):
+    case = os.environ.get("CASE")
+    if case == "exit" and p[0] > 0.5:
+        sys.exit(0)
+    if case == "memory" and p[0] > 0.5:
+        raise MemoryError
+    while case == "loop" and p[0] > 0.7:
+        try:
+            while True:
+                pass
+        except Exception:
+            pass
+    time.sleep(0.05 if case == "slow" else 0)
+    return [p[0], p[0] ** 2]
+"""
+STUDY = """
+[model]
+kind = "python"
+function = "endless.value"
+parameters = { a = 0.5 }
+outputs = ["y", "z"]
+
+[parameters]
+a = { kind = "uniform", lower = 0.0, upper = 1.0 }
+
+[method]
+kind = "monte-carlo"
+samples = 100
+seed = 1
+"""
+FACTORED = ("configs/beam-chaos.toml", "--set", "model.body.cells=[28,6,6]", "--set", 'model.body.cell="tetrahedron"')
+FEW = ("--set", "method.samples=4", "--set", "method.max_order=1")
+
+
+@pytest.fixture
+def study(tmp_path):
+    (tmp_path / "endless.py").write_text(MODEL)
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path / "study.toml"
+
+
+def tissuq(*arguments, ranks=None, case="", limits=()):
+    """Run with limits (kind, size) of the process."""
+
+    def limit():
+        for kind, size in limits:
+            resource.setrlimit(kind, (size, resource.getrlimit(kind)[1]))
+
+    return subprocess.run(
+        on_ranks(ranks, TISSUQ, *arguments),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=environment() | {"CASE": case},
+        check=False,
+        cwd=ROOT,
+        preexec_fn=limit,
+    )
+
+
+def reasons(done):
+    """The lines that say why, without progress and what mpirun adds; and no traceback."""
+    assert "Traceback" not in done.stderr, done.stderr
+    return [line for line in done.stderr.splitlines() if line.startswith(("failed:", "interrupted"))]
+
+
+@pytest.mark.parametrize("mebibytes", [100, 250, 500])
+def test_a_program_without_memory_says_so(study, tmp_path, mebibytes):
+    done = tissuq("run", study, "--out", tmp_path / "out", limits=[(resource.RLIMIT_AS, mebibytes * 2**20)])
+    if done.returncode == 0:  # enough for this model
+        assert mebibytes == 500
+        return
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert reasons(done)[0].startswith("failed: memory ran out: ")
+    assert "MiB are available (limit of the address space, ulimit -v)" in done.stderr
+
+
+@pytest.mark.fem
+@pytest.mark.slow
+def test_a_study_that_runs_out_of_memory_keeps_nothing_of_it(tmp_path):
+    """In the mesh, the first factor, that of the reference and the report; then, with memory, the same bits."""
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    for kibibytes in (650_000, 750_000, 900_000, 1_000_000, 1_100_000, 1_250_000):
+        done = tissuq("run", *FACTORED, *FEW, "--out", out, limits=[(resource.RLIMIT_AS, kibibytes * 1024)])
+        assert done.returncode == 1, kibibytes
+        (reason,) = reasons(done)
+        assert reason.startswith("failed: memory ran out: "), reason
+        assert "available (limit of the address space, ulimit -v)" in reason
+        assert any(line.startswith("warning: memory may run out: about 1,4") for line in done.stderr.splitlines())
+    assert tissuq("run", *FACTORED, *FEW, "--out", out).returncode == 0
+    assert tissuq("run", *FACTORED, *FEW, "--out", whole).returncode == 0
+    assert (out / "results.nc").read_bytes() == (whole / "results.nc").read_bytes()
+
+
+@pytest.mark.fem
+def test_a_factor_without_memory_is_no_failed_sample(tmp_path):
+    out = tmp_path / "out"
+    done = tissuq("run", *FACTORED, *FEW, "--out", out, limits=[(resource.RLIMIT_AS, 850_000 * 1024)])
+    assert done.returncode == 1
+    (reason,) = reasons(done)
+    assert "the factor of the stiffness of 28,899 unknowns needs" in reason
+    assert not list(out.glob("evaluations/*"))
+
+
+def test_check_foresees_that_memory_runs_out():
+    done = tissuq("check", *FACTORED, limits=[(resource.RLIMIT_AS, 1_100_000 * 1024)])
+    assert done.returncode == 0
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("warning"))
+    assert "memory may run out: about 1,4" in line
+    assert "MiB are available (limit of the address space, ulimit -v)" in line
+    assert "warning" not in tissuq("check", *FACTORED).stdout
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+@pytest.mark.parametrize(
+    ("case", "reason"),
+    [
+        ("memory", "failed: memory ran out: "),
+        ("exit", "failed: endless.value ended the process: SystemExit: 0"),
+    ],
+)
+def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
+    done = tissuq("run", study, "--out", tmp_path / "out", ranks=ranks, case=case)
+    assert done.returncode == 1
+    (said,) = reasons(done)
+    assert said.startswith(reason)
+    again = tissuq("run", study, "--out", tmp_path / "out", ranks=ranks)
+    assert again.returncode == 0, again.stderr
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["failed"] == 0
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
+    limited = ("--set", "model.solve_seconds=0.1", "--set", "method.samples=20")
+    done = tissuq("run", study, "--out", tmp_path / "out", *limited, ranks=ranks, case="loop")
+    assert done.returncode == 3, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert 0 < summary["failed"] < 20
+    assert {one["reason"] for one in summary["failures"]} == {"endless.value took longer than solve_seconds = 0.1"}
+    assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_study_says_one_line(study, tmp_path, ranks, number):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        on_ranks(ranks, TISSUQ, "run", study, "--out", out),
+        env=environment() | {"CASE": "slow"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    begin = time.monotonic()
+    while not list(out.glob("evaluations/*.h5")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() - begin < 100
+        time.sleep(0.05)
+    process.send_signal(number)
+    printed, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert printed == ""
+    assert said.splitlines() == ["interrupted; the same command continues"]
+    assert tissuq("run", study, "--out", out).returncode == 0
+
+
+ON_A_SMALL_DISK = """
+import resource, sys
+from mpi4py import MPI  # whose own files may be large
+from workflows.__main__ import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+sys.exit(main(["run", *sys.argv[2:]]))
+"""
+
+
+def test_a_full_disk_stops_a_study_that_the_same_command_continues(study, tmp_path):
+    """No larger file is allowed: study.toml, a block, results, the report."""
+    out = tmp_path / "out"
+    for size in (100, 2_000, 10_000, 50_000):
+        done = run_script(None, ON_A_SMALL_DISK, size, study, "--out", out)
+        assert done.returncode == 1, done.stderr
+        (reason,) = reasons(done)
+        assert "cannot be written: File too large; the same command continues once there is room" in reason
+        assert not list(out.glob("**/.*"))
+    again = tissuq("run", study, "--out", out)
+    assert again.returncode == 0, again.stderr
+    assert (out / "report.html").exists()
+
+
+def test_limits_of_files_that_mpi_cannot_bear_are_said(study, tmp_path):
+    done = tissuq("run", study, "--out", tmp_path / "out", limits=[(resource.RLIMIT_FSIZE, 10_000)])
+    assert done.returncode == 1
+    assert done.stderr == "failed: MPI needs files of 4 MiB, 0.00954 MiB are allowed (ulimit -f)\n"
+
+
+@pytest.mark.fem
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
+def test_a_file_system_that_is_full(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=80k", "tmpfs", disk], check=False, capture_output=True
+    )
+    if mounted.returncode:
+        pytest.skip("cannot mount")
+    try:
+        done = tissuq("run", "configs/tiny.toml", "--out", disk / "out")
+        assert done.returncode == 1, done.stderr
+        (reason,) = reasons(done)
+        assert "cannot be written: No space left on device" in reason
+        subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
+        again = tissuq("run", "configs/tiny.toml", "--out", disk / "out")
+        assert again.returncode == 0, again.stderr
+        whole = tissuq("run", "configs/tiny.toml", "--out", tmp_path / "whole")
+        assert whole.returncode == 0
+        assert (disk / "out" / "results.nc").read_bytes() == (tmp_path / "whole" / "results.nc").read_bytes()
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.parametrize("harm", ["missing", "flipped", "cut"])
+def test_lost_results_are_computed_again(study, tmp_path, harm):
+    out = tmp_path / "out"
+    assert tissuq("run", study, "--out", out).returncode == 0
+    whole = (out / "results.nc").read_bytes()
+    if harm == "missing":
+        (out / "results.nc").unlink()
+    else:
+        spoilt = bytearray(whole if harm == "flipped" else whole[:2000])
+        spoilt[len(spoilt) // 2] ^= 4
+        (out / "results.nc").write_bytes(spoilt)
+    if harm != "flipped":
+        said = tissuq("report", out)
+        assert said.returncode == 1
+        assert len(said.stderr.splitlines()) == 1
+        assert "`tissuq run` with the same study and --out makes it again" in said.stderr
+    done = tissuq("run", study, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "missing or damaged, the study is computed again" in done.stderr
+    assert (out / "results.nc").read_bytes() == whole

@@ -1,0 +1,53 @@
+"""What a run does when it is told to end: one line, and no rank is left waiting."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from threading import Thread, Timer
+from typing import Any
+
+from forward.machine import INTERRUPTED
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+SECONDS_FOR_OTHERS = 1.5  # in which `mpirun`, if it was told too, ends all ranks without a word
+SECONDS_TO_ABORT = 2.0
+
+
+def heed() -> None:
+    """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
+
+    A process alone raises KeyboardInterrupt. Of several ranks the first one speaks and ends the job from a thread of
+    its own, since MPI waits without ever coming back to Python, and `mpirun` kills a second later. The others die of
+    the signal at once, wherever they are, and the job with them.
+    """
+    from mpi4py import MPI
+
+    world = MPI.COMM_WORLD
+    if world.size == 1:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        return
+    if world.rank > 0:
+        for number in ENDING:
+            signal.signal(number, signal.SIG_DFL)
+        return
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    for number in ENDING:
+        signal.signal(number, lambda *_: None)
+    Thread(target=_wait, args=(read, world), daemon=True).start()
+
+
+def _wait(pipe: int, world: Any) -> None:
+    while os.read(pipe, 1)[0] not in ENDING:
+        pass
+    sys.stderr.write(f"{INTERRUPTED}\n")
+    sys.stderr.flush()
+    time.sleep(SECONDS_FOR_OTHERS)
+    fallback = Timer(SECONDS_TO_ABORT, os._exit, [1])
+    fallback.daemon = True
+    fallback.start()
+    world.Abort(1)
