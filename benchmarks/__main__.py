@@ -9,6 +9,7 @@ from benchmarks import (
     buckling,
     calibration,
     chaos,
+    coverage,
     fields,
     inversion,
     levels,
@@ -40,6 +41,7 @@ ALL = {
     "buckling": buckling.main,
     "chaos": chaos.main,
     "skewed": skewed.main,
+    "coverage": coverage.main,
     "scaling": scaling.main,
     "startup": startup.main,
 }

@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scipy import stats
 
 from forward.model import FunctionModel, SolveError
 from tests.launch import run_script
@@ -167,7 +168,7 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     data = run(Chaos(samples=20, max_order=3, gradients=gradients), inputs, function, by_complex_step(function))
     basis = load(data).basis
     points, values = data["points"].to_numpy(), data["values"].to_numpy()[:, 0]
-    errors, stds = [], []
+    errors, means, stds = [], [], []
     for out in range(20):
         others = np.arange(20) != out
         left, right = basis.values(points[others]), values[others]
@@ -177,10 +178,20 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
             right = np.concatenate([right, slopes.ravel()])
         coefficients = np.linalg.lstsq(left, right, rcond=None)[0]
         errors.append(values[out] - (basis.values(points[[out]]) @ coefficients).item())
+        means.append(coefficients[0])
         stds.append(np.linalg.norm(coefficients[1:]))
-    assert data["loo_error"].item() == pytest.approx(np.sqrt(np.mean(np.square(errors))) / values.std(), rel=1e-8)
-    jackknife = np.sqrt(19 / 20 * ((np.array(stds) - data["std"].item()) ** 2).sum())
-    assert data["std_error"].item() == pytest.approx(jackknife, rel=1e-8)
+    errors, means, stds, std = np.array(errors), np.array(means), np.array(stds), data["std"].item()
+    left = np.sqrt((errors**2).mean())
+    assert data["loo_error"].item() == pytest.approx(left / values.std(), rel=1e-8)
+    jackknife = np.sqrt(19 / 20 * ((stds - std) ** 2).sum())
+    # Samples with the fits that have not seen them as controls give another mean and another variance.
+    mean = (means + errors).mean()
+    second = (stds**2 + (means - mean) ** 2 + (values - mean) ** 2 - (values - errors - mean) ** 2).mean()
+    t = stats.t.ppf(0.975, 19) / 1.96
+    other = np.sqrt(second + ((means + errors).std(ddof=1) * t) ** 2 / 20)
+    assert data["std_error"].item() == pytest.approx(
+        np.sqrt(jackknife**2 + (left**2 / 2 / std) ** 2 + (other - std) ** 2 / 4)
+    )
 
 
 @pytest.mark.parametrize("gradients", [True, False])

@@ -124,7 +124,7 @@ def test_an_index_above_its_own_bound_is_an_error(monkeypatch):
     data = run(DerivativeBased(samples=64), ISHIGAMI, ishigami)
     (first, *_) = findings.findings(data)
     assert first.severity == "error"
-    assert "above its bound" in first.text
+    assert "more than its bound by derivatives" in first.text
 
 
 def test_measures_of_ishigami():

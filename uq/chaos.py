@@ -15,18 +15,21 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import FloatArray
-from uq.basis import Basis, gauss, orthonormal
+from uq.basis import gauss, orthonormal
+from uq.doubts import of_centre, of_field, of_indices
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.field_regression import FIELD_DICTIONARY, Projections, solved
+from uq.findings import add
 from uq.indices import coefficient_moments, shares
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
+from uq.moments import Quantiles, Z, quantiles
 from uq.regression import (
     DICTIONARY,
     FULL,
     ROWS_PER_TERM,
+    TRUSTED,
     Data,
-    Fit,
     Regression,
     candidates_of,
     fit_best,
@@ -241,10 +244,14 @@ def expansion_dataset(
         }
     )
     if method.quantiles:
-        dataset = dataset.assign(_distribution(method, inputs, basis, fit))
+        dataset = dataset.assign(_distribution(method, regression))
+    add(dataset, *regression.doubts(evaluate.outputs))
+    missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
+    add(dataset, *of_centre(evaluate.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
     if evaluations.fields.size and method.fields:
-        fields = _field_estimates(evaluations, centre, evaluate.displacements, basis, fit, estimates)
+        fields, rest = _field_estimates(evaluations, centre, evaluate.displacements, regression, estimates)
         dataset = dataset.assign(fields)
+        add(dataset, *of_field(rest, TRUSTED))
     dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:
@@ -255,17 +262,32 @@ def expansion_dataset(
     return dataset
 
 
-def _distribution(
-    method: Report, inputs: Inputs, basis: Basis, fit: Fit
-) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
-    """Quantiles and densities of the outputs, from many points of the expansion."""
-    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** (DRAWN - 12))
+def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
+
+    Where the moments are those of the samples, so are the quantiles; densities are of the expansion with errors at
+    samples that it has not seen, drawn independently.
+    """
+    inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
+    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
     drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
+    central = np.quantile(drawn, method.quantiles, axis=0)
+    half = np.quantile(drawn[: len(drawn) // 2], method.quantiles, axis=0)
+    # No quantile moves by more than the function does; what half of the points say differs by more than all err.
+    error = np.hypot(fit.loo, central - half)
+    found = Quantiles(central, central - Z * error, central + Z * error, error)
+    if regression.controlled.any():
+        rough = regression.controlled
+        if np.ptp(data.weights) == 0:
+            of_samples = quantiles(data.values, method.quantiles)
+            found = Quantiles(*(np.where(rough, *pair) for pair in zip(of_samples, found, strict=True)))
+        which = np.random.default_rng(method.seed).choice(
+            len(data.values), len(drawn), p=data.weights / data.weights.sum()
+        )
+        drawn = np.where(rough, drawn + fit.unseen[which], drawn)
     counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
     return {
-        "quantiles": (("quantile", "output"), np.quantile(drawn, method.quantiles, axis=0)),
-        # No quantile moves by more than the function does.
-        "quantiles_error": (("quantile", "output"), np.tile(fit.loo, (len(method.quantiles), 1))),
+        **found.variables,
         "density": (("output", "bin"), np.array([density for density, _ in counts])),
         "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
     }
@@ -275,24 +297,39 @@ def _field_estimates(
     evaluations: Evaluations,
     centre: Linearisation,
     count: int,
-    basis: Basis,
-    fit: Fit,
+    regression: Regression,
     estimates: dict[str, FloatArray],
-) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
-    """Coefficients, mean and standard deviation of the displacements.
+) -> tuple[dict[str, tuple[tuple[str, ...], FloatArray]], float]:
+    """Coefficients, mean and standard deviation of the displacements, and what the fit leaves of them.
 
-    Their errors are those of the outputs in proportion to the residuals, which come from the same rows.
+    Their errors are those of the outputs in proportion to the residuals, which come from the same rows. Standard
+    deviations have the variance that is left as a further error: residuals, as much larger where the fit has not seen
+    the sample as those of the outputs are.
+
+    Returns
+    -------
+    dict, float
+        The variables, and the rest over the standard deviation of the whole field.
     """
+    basis, fit = regression.basis, regression.fit
     projections = evaluations.fields[fit.chosen.which][:, :count]
     coefficients = solved(fit, projections)
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
     moments = coefficient_moments(coefficients.T, basis.indices)
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
+    rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
+    seen = shares(fit.loo**2, fit.squares / rows)
+    left = max(1.0, float(seen.max(initial=0.0))) * squares / rows
     for name in ("mean", "std"):
         share = np.sqrt(shares(estimates[f"{name}_error"] ** 2, fit.squares).max())
-        fields[f"{name}_error"] = (share * np.sqrt(squares)).reshape(-1, 3)
-    return {
+        error = share * np.sqrt(squares)
+        if name == "std":
+            error = np.hypot(error, shares(left, 2 * moments["std"]))
+        fields[f"{name}_error"] = error.reshape(-1, 3)
+    variables = {
         **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
         "field_coefficients": (("term", "node", "component"), coefficients.reshape(len(coefficients), -1, 3)),
     }
+    variance = float((moments["std"] ** 2).sum())
+    return variables, float(np.sqrt(left.sum() / (variance + left.sum()))) if left.sum() > 0 else 0.0

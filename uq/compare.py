@@ -11,17 +11,18 @@ Points that several methods or budgets ask for are solved once, and charged to e
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
 
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
 
-from forward.model import FloatArray, SolveError
+from forward.model import Finding, FloatArray, SolveError
 from forward.settings import Settings
 from uq.chaos import Chaos
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.findings import add, findings
 from uq.inputs import Inputs, Restricted
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, half_width, ratio
@@ -260,6 +261,7 @@ class Compare(Settings):
         dataset = dataset.assign_coords(estimator=names)
         budgets = f"{len(self.methods)} methods at {len(rows)} budgets"
         dataset.attrs["stopped"] = f"{budgets} in all, {self.repeats} repeats of each, as asked"
+        add(dataset, *_doubts(rows, trials))
         lost = sum(trial.reason is not None for row in trials for trial in row)
         if lost:
             reason = next(trial.reason for row in trials for trial in row if trial.reason is not None)
@@ -344,6 +346,8 @@ class _Trial:
         Processor time (s) of their solves, and of everything else that the method did.
     reason
         Why there is no estimate.
+    doubts
+        What the method found out against its own numbers.
     """
 
     estimates: dict[str, FloatArray]
@@ -352,6 +356,7 @@ class _Trial:
     seconds: float
     own_seconds: float
     reason: str | None = None
+    doubts: tuple[Finding, ...] = ()
 
 
 def _try(method: Sampling, inputs: Inputs, memory: _Memory) -> _Trial:
@@ -364,7 +369,17 @@ def _try(method: Sampling, inputs: Inputs, memory: _Memory) -> _Trial:
         return _Trial(dict.fromkeys(ESTIMATES, nothing), 0.0, recorder.solves, recorder.seconds, 0.0, str(error))
     own = time.process_time() - begin - (memory.clock.seconds - before)
     estimates = {name: found[name].to_numpy() for name in ESTIMATES}
-    return _Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0))
+    doubts = tuple(one for one in findings(found) if one.severity != "note")
+    return _Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0), doubts=doubts)
+
+
+def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]]) -> Iterator[Finding]:
+    """Find the methods that found out something against their own numbers, at which budgets and how often."""
+    for (entry, budget), row in zip(rows, trials, strict=True):
+        told = [trial.doubts[0] for trial in row if trial.doubts]
+        if told:
+            who = f"{entry.label} with {budget} samples, {len(told)} of {len(row)} repeats"
+            yield Finding("warning", f"{who}: {told[0].text}")
 
 
 @dataclass

@@ -23,7 +23,6 @@ Points are independent scrambles of Sobol' points, and errors come from drawing 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
@@ -31,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import Finding, FloatArray, ModelError, SolveError
-from uq import findings
+from forward.model import FloatArray, ModelError, SolveError
 from uq.basis import gauss, hyperbolic, orthonormal
 from uq.distributions import (
     Beta,
@@ -45,7 +43,9 @@ from uq.distributions import (
     TruncatedNormal,
     Uniform,
 )
+from uq.doubts import of_indices, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.findings import add
 from uq.indices import bootstrap, bootstrap_error, shares
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
@@ -62,8 +62,6 @@ SETTLED = 1e-5  # relative change of a Poincaré constant from one degree to twi
 DEGREES = (8, 16, 32, 64)
 ORDER = 6  # largest of the expansion that total indices come from
 RANGE = (0.025, 0.975)
-SIGMAS = 4.0  # standard errors that an index may be above its bound
-ROUNDED = 1e-6  # what an index may be above it besides
 
 
 class DerivativeBased(Amount):
@@ -349,7 +347,7 @@ class _Samples:
         method, inputs = self._method, self._inputs
         points, values, ok = (self._in_order(a) for a in (self.points, self.outputs, self.ok))
         scramble = np.tile(np.arange(method.scrambles), self.each)
-        central, central_error = quantiles_from_replicates(values[ok], scramble[ok], method.quantiles)
+        of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], method.quantiles)
         rounds = [1 << k for k in range(self.each.bit_length()) if self.ok[:, : 1 << k].any(axis=1).sum() > 1]
         moments = {method.scrambles * each: self._moments(each) for each in rounds}
         last = moments[method.scrambles * self.each]
@@ -359,8 +357,7 @@ class _Samples:
         dataset = dataset.assign_coords(quantile=list(method.quantiles), round=list(moments)).assign(
             {
                 **{name: (("output",), getattr(last, name)) for name in ESTIMATES},
-                "quantiles": (("quantile", "output"), central),
-                "quantiles_error": (("quantile", "output"), central_error),
+                **of_quantiles.variables,
                 "points": (("sample", "parameter"), points),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),
@@ -386,25 +383,11 @@ class _Samples:
                     for end in ("", "_error"):
                         dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
                 dataset["loo_error"] = (("output",), regression.fit.relative)
-                findings.add(dataset, *_above_bounds(dataset))
+                add(dataset, *of_indices(dataset))
+        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
         return dataset
-
-
-def _above_bounds(dataset: xr.Dataset) -> Iterator[Finding]:
-    """Say which total indices exceed their own bounds by more than their errors explain."""
-    error = np.hypot(dataset["sobol_total_error"], dataset["total_bound_error"])
-    above = dataset["sobol_total"] - dataset["total_bound"] > SIGMAS * error + ROUNDED
-    for output, parameter in zip(*(axis.tolist() for axis in np.nonzero(above.to_numpy())), strict=True):
-        at = {"output": output, "parameter": parameter}
-        index, bound = (float(dataset[name].isel(at)) for name in ("sobol_total", "total_bound"))
-        yield Finding(
-            "error",
-            f"the total index {index:.3g} of {dataset['parameter'].values[parameter]} for "
-            f"{dataset['output'].values[output]} is above its bound {bound:.3g}: the expansion that it comes from is "
-            "wrong; take the bound, or more samples",
-        )
 
 
 def _descending(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

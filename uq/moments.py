@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ Coefficient = Literal["one", "optimal"]
 SecondMoment = Literal["quadratic", "linear"]
 
 ESTIMATES = ("mean", "mean_error", "std", "std_error")
+ONE_SIDED = 0.975  # probability on one side of a 95 % interval
+Z = 1.96
 EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
 
 
@@ -53,8 +55,8 @@ class Estimates:
     ----------
     mean, mean_error, std, std_error
         In the unit of the quantity. Errors are one standard error; that of the standard deviation is by linearisation.
-    coefficient
-        β₁.
+    coefficient, second_coefficient
+        β₁ and β₂.
     """
 
     mean: FloatArray
@@ -62,12 +64,18 @@ class Estimates:
     std: FloatArray
     std_error: FloatArray
     coefficient: FloatArray
+    second_coefficient: FloatArray
 
     @property
     def relative_error(self) -> FloatArray:
         """Standard error of the mean relative to the mean, or to the standard deviation where that is larger."""
         scale = np.maximum(np.abs(self.mean), self.std)
         return np.where(scale > 0, self.mean_error / np.where(scale > 0, scale, 1), 0)
+
+    @property
+    def relative_std_error(self) -> FloatArray:
+        """Standard error of the standard deviation relative to it."""
+        return ratio(self.std_error, self.std)
 
 
 @dataclass(frozen=True)
@@ -126,7 +134,12 @@ def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, Floa
     return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1))
 
 
-def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | FloatArray = 1.0) -> Estimates:
+def combine(
+    reference: FloatArray,
+    terms: Sequence[Term],
+    coefficient: float | FloatArray = 1.0,
+    second_coefficient: float | FloatArray = 1.0,
+) -> Estimates:
     """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each of samples of its own.
 
     Parameters
@@ -135,8 +148,8 @@ def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | F
         ψ̄ (…).
     terms
         The terms.
-    coefficient
-        β₁ of the terms, for the record.
+    coefficient, second_coefficient
+        β₁ and β₂ of the terms, for the record.
     """
     m1, mean_variance, variance, variance_error = _sums(terms)
     std: FloatArray = np.sqrt(variance)
@@ -144,8 +157,9 @@ def combine(reference: FloatArray, terms: Sequence[Term], coefficient: float | F
         mean=reference + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
-        std_error=_error_of_root(std, variance_error),
+        std_error=error_of_root(std, variance_error),
         coefficient=np.broadcast_to(coefficient, std.shape),
+        second_coefficient=np.broadcast_to(second_coefficient, std.shape),
     )
 
 
@@ -157,7 +171,8 @@ def _sums(terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     # gets the usual n − 1.
     variance = np.maximum(_sum(t.second for t in terms) - m1**2 + mean_variance, 0)
     scatter = _sum((t.second_variance - 4 * m1 * t.covariance + 4 * m1**2 * t.variance) / t.n for t in terms)
-    return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0))
+    # The square of a mean that is known badly errs by more than its slope says.
+    return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0) + 2 * mean_variance**2)
 
 
 def _sum(arrays: Iterable[FloatArray]) -> FloatArray:
@@ -219,7 +234,7 @@ def estimate(
     var2 = np.maximum(m22 - q**2, 0) * bessel
     one = Term(n, m1, q + beta2 * V, var1, cov12, var2)
     _, _, _, variance_error = _sums([one])
-    found = combine(reference, [one], beta1)
+    found = combine(reference, [one], beta1, beta2)
 
     plain1 = np.maximum(mean_of(2, 0) - mean_of(1, 0) ** 2, 0) * bessel
     w1, w2 = mean_of(1, 0), mean_of(2, 0)
@@ -230,6 +245,7 @@ def estimate(
         std=found.std,
         std_error=found.std_error,
         coefficient=found.coefficient,
+        second_coefficient=found.second_coefficient,
         variance_ratio=ratio(plain1, var1, empty=1.0),
         std_variance_ratio=ratio(plain_variance, n * variance_error**2, empty=1.0),
     )
@@ -286,20 +302,28 @@ def estimate_from_replicates(
     # ⟨w⟩² exceeds its square by its variance, which is added back.
     variance = np.maximum(square.mean(axis=0) - m1**2 + mean_variance, 0)
     variance_variance = _scatter(square - 2 * m1 * w) / (R - 1 - 2 * fitted) * (1 / R + leverage1 + leverage2)
+    variance_variance += 2 * mean_variance**2  # as in `_sums`
     std = np.sqrt(variance)
     return Estimates(
         mean=reference + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
-        std_error=_error_of_root(std, np.sqrt(variance_variance)),
+        std_error=error_of_root(std, np.sqrt(variance_variance)),
         coefficient=beta1,
+        second_coefficient=beta2,
     )
 
 
-def _error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:
-    """Error of σ given that of σ²: e/(2σ), and √e at most: what σ could be where the estimate of σ² is nothing."""
-    largest: FloatArray = np.sqrt(variance_error)
-    return ratio(variance_error, np.maximum(2 * std, largest))
+def error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:
+    """Error of σ given the error e of σ².
+
+    e/(2σ) where that is small. An estimate of σ² that is too small claims too small an error: intervals of ln σ² are
+    better (D. G. Bonett, Comput. Stat. Data Anal. 50 (2006) 775–782), of which the upper side, at two errors, is taken:
+    σ (exp(e/σ²) − 1)/2. At most √e: what σ could be where the estimate of σ² is nothing.
+    """
+    with np.errstate(over="ignore"):
+        upper = std / 2 * np.expm1(np.minimum(ratio(variance_error, std**2), 100.0))
+    return np.asarray(np.where(std > 0, np.minimum(upper, np.sqrt(variance_error)), np.sqrt(variance_error)))
 
 
 def _scatter(values: FloatArray) -> FloatArray:
@@ -321,25 +345,53 @@ def ratio(a: FloatArray, b: FloatArray, empty: float = 0.0) -> FloatArray:
         return np.where(both, empty, a / np.where(both, 1, b))
 
 
-def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    """Sample quantiles (k, m) of values (n, m), with standard errors from the order statistics around them.
+class Quantiles(NamedTuple):
+    """Quantiles (k, m) of m quantities, with the ends of 95 % intervals and errors.
 
-    The error is half the distance between the order statistics at p ± √(p(1−p)/n)
-    (H. A. David, H. N. Nagaraja, Order Statistics (2003), section 7.1).
+    Attributes
+    ----------
+    central, lower, upper
+        The quantiles and the ends of their intervals.
+    error
+        The longer of the two sides over the factor of `half_width`: what stands for a standard error.
     """
-    n = len(values)
-    p = np.array(probabilities)
-    spread = np.sqrt(p * (1 - p) / n)
-    return np.quantile(values, p, axis=0), _around(values, p, spread)
+
+    central: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    error: FloatArray
+
+    @property
+    def variables(self) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+        """The quantiles as variables of results."""
+        by = ("quantile", "output")
+        return {
+            "quantiles": (by, self.central),
+            "quantiles_error": (by, self.error),
+            "quantiles_lower": (by, self.lower),
+            "quantiles_upper": (by, self.upper),
+        }
+
+
+def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> Quantiles:
+    """Quantiles of independent samples (n, m), with the order statistics between which 95 % of the quantiles lie.
+
+    X_(a) lies below the p-quantile with probability I_p(a, n + 1 − a), which is also defined for a between whole
+    numbers (A. D. Hutson, J. Appl. Stat. 26 (1999) 343–353). Where a < 1 the interval reaches beyond the samples: there
+    the tail is taken to be exponential, with the mean distance of the outermost quarter.
+    """
+    return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), len(values)), Z)
 
 
 def quantiles_from_replicates(
     values: FloatArray, replicate: NDArray[np.int64], probabilities: tuple[float, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Sample quantiles (k, m) of all values (n, m), with errors from the scatter of the replicates (n,) they belong to.
+) -> Quantiles:
+    """Quantiles of all values (n, m), with intervals from the scatter of the replicates (n,) that they belong to.
 
-    As `quantiles`, with p ± the standard error over the replicates of the share of values below the quantile; a share
-    of n/R values is known to no better than a rounding error, 1/√12 of R/n.
+    As `quantiles`, with the number of independent samples in the place of n that know the share of values below the
+    quantile as well: p(1 − p) over the variance of this share by the replicates, times (1.96/t)², since the scatter of
+    R replicates is known to R − 1 degrees of freedom (E. L. Korn, B. I. Graubard, Surv. Methodol. 24 (1998) 193–201). A
+    share of n/R values is known to no better than a rounding error, 1/√12 of R/n.
     """
     p = np.array(probabilities)
     central = np.quantile(values, p, axis=0)
@@ -349,22 +401,54 @@ def quantiles_from_replicates(
     shares = np.array([below[:, replicate == name].mean(axis=1) for name in names])
     floor = R / len(values) / np.sqrt(12 * R)
     spread = np.maximum(shares.std(axis=0, ddof=1) / np.sqrt(R), floor)
-    errors = [
-        [_around(values[:, [j]], p[[i]], spread[i, [j]])[0, 0] for j in range(values.shape[1])] for i in range(len(p))
-    ]
-    return central, np.array(errors).reshape(central.shape)
+    t = _student(R - 1)
+    return _between(values, p, (p * (1 - p))[:, None] / spread**2 * (Z / t) ** 2, t)
 
 
-def _around(values: FloatArray, p: FloatArray, spread: FloatArray) -> FloatArray:
-    upper = np.quantile(values, np.minimum(p + spread, 1), axis=0)
-    lower = np.quantile(values, np.maximum(p - spread, 0), axis=0)
-    return np.asarray((upper - lower) / 2)
+def _between(values: FloatArray, p: FloatArray, counts: FloatArray, factor: float) -> Quantiles:
+    """Quantiles of values (n, m) whose shares below are as those of so many independent samples (k, m)."""
+    ordered = np.sort(values, axis=0)
+    central = np.quantile(values, p, axis=0)
+    lower = _order_statistic(ordered, _level(p[:, None], counts))
+    upper = -_order_statistic(-ordered[::-1], _level(1 - p[:, None], counts))
+    # Quantiles of few samples are interpolated otherwise, and may lie outside.
+    lower, upper = np.minimum(lower, central), np.maximum(upper, central)
+    return Quantiles(central, lower, upper, np.maximum(upper - central, central - lower) / factor)
+
+
+def _level(p: FloatArray, n: FloatArray) -> FloatArray:
+    """Share a/(n + 1) of the order statistic that lies below the p-quantile with a probability of 97.5 %."""
+    from scipy.special import betainc
+
+    low, high = np.zeros(np.broadcast_shapes(p.shape, n.shape)), (n + 1) * np.ones_like(p)
+    for _ in range(50):
+        middle = (low + high) / 2
+        more = betainc(np.maximum(middle, 1e-300), np.maximum(n + 1 - middle, 1e-300), p) > ONE_SIDED
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return np.asarray(low / (n + 1))
+
+
+def _order_statistic(ordered: FloatArray, share: FloatArray) -> FloatArray:
+    """Return X_(a) (k, m) with a = share·(n + 1), between order statistics (n, m) or below all of them."""
+    n, m = ordered.shape
+    place = share * (n + 1) - 1
+    below = np.clip(np.floor(place).astype(int), 0, n - 1)
+    above = np.minimum(below + 1, n - 1)
+    columns = np.arange(m)
+    at = ordered[below, columns]
+    inside = at + np.clip(place - below, 0, 1) * (ordered[above, columns] - at)
+    few = min(max(2, n // 4), n - 1)
+    # The mean of so few is known to one over their root.
+    tail = (1 + few**-0.5) * (ordered[few] - ordered[:few].mean(axis=0))
+    return np.asarray(np.where(place < 0, ordered[0] + tail * np.log(np.maximum(place + 1, 1e-12)), inside))
 
 
 def half_width(dataset: xr.Dataset) -> float:
     """Standard errors on either side of a 95 % interval of results: more where they come from a few scrambles."""
-    if "scramble" not in dataset:
-        return 1.96
+    return Z if "scramble" not in dataset else _student(int(dataset["scramble"].max()))
+
+
+def _student(freedom: int) -> float:
     from scipy.special import stdtrit
 
-    return float(stdtrit(int(dataset["scramble"].max()), 0.975))
+    return float(stdtrit(freedom, ONE_SIDED))

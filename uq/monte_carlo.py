@@ -12,7 +12,9 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from uq.coordinates import Coordinates
+from uq.doubts import influences, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.findings import add
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, Coefficient, Estimates, Moments, SecondMoment, estimate, monomials, quantiles
@@ -204,15 +206,14 @@ def _dataset(
     stopped: str,
 ) -> xr.Dataset:
     ok = evaluations.ok
-    central, central_error = quantiles(evaluations.outputs[ok], method.quantiles)
+    of_quantiles = quantiles(evaluations.outputs[ok], method.quantiles)
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
     dataset = dataset.assign_coords(quantile=list(method.quantiles))
     by_output = ("output",)
     dataset = dataset.assign(
         {
             **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
-            "quantiles": (("quantile", "output"), central),
-            "quantiles_error": (("quantile", "output"), central_error),
+            **of_quantiles.variables,
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
             "ok": (("sample",), ok),
@@ -231,6 +232,14 @@ def _dataset(
         field = _field_moments(evaluations, inputs, centre, control)
         dataset = dataset.assign(by_node(field, evaluate.displacements))
     dataset.attrs["stopped"] = stopped
+    values, moved = evaluations.outputs[ok], None
+    if control is not None:
+        first = values - centre.middle
+        predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
+        moved = influences(
+            first - scalars.coefficient * predicted, first**2 - scalars.second_coefficient * predicted**2
+        )
+    add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
     if not ok.all():
         which = "plain estimates" if control else "all estimates"
         dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from uq.doubts import influences, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.field_regression import Deviations, fit_deviations
+from uq.findings import add
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import (
@@ -192,7 +194,7 @@ class QuasiMonteCarlo(MonteCarlo):
         scalars: Estimates,
     ) -> xr.Dataset:
         values, ok, scramble = samples.in_order(samples.outputs), samples.in_order(samples.ok), samples.scramble
-        central, central_error = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
+        of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
         # What plain Monte Carlo would claim from as many independent samples.
         plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
         running = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
@@ -202,8 +204,7 @@ class QuasiMonteCarlo(MonteCarlo):
         dataset = dataset.assign(
             {
                 **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
-                "quantiles": (("quantile", "output"), central),
-                "quantiles_error": (("quantile", "output"), central_error),
+                **of_quantiles.variables,
                 "points": (("sample", "parameter"), samples.in_order(samples.points)),
                 "values": (("sample", "output"), values),
                 "ok": (("sample",), ok),
@@ -220,6 +221,7 @@ class QuasiMonteCarlo(MonteCarlo):
             dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
+        add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, samples.influences(scalars)))
         field = samples.field()
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
@@ -355,24 +357,29 @@ class _Samples:
             reasons = "; ".join(sorted(self._reasons)[:3])
             message = f"{answers} of {self._method.scrambles} scrambles have an answer, expected more: {reasons}"
             raise SolveError(message)
-        centre, control = self._centre, self._control
+        centre = self._centre
         ok = self.ok[:, :each]
         some = ok.any(axis=1)
         deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
-        controls = expected = None
-        if control is not None:
-            controls, expected = self._of(control, each)
-            held = self._which_held(each)
-            if self._held is not None and held.any():
-                (C, D), (C_mean, D_mean) = self._of(self._held, each)
-                controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
-                expected = np.where(held, C_mean, expected[0]), np.where(held, D_mean, expected[1])
+        controls, expected = self._controls(each) or (None, None)
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
         return estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
 
-    def _of(self, control: Control, each: int) -> tuple[Pair, Pair]:
+    def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
+        if self._control is None:
+            return None
+        controls, expected = self._of(self._control, each)
+        held = self._which_held(each)
+        if self._held is not None and held.any():
+            (C, D), (C_mean, D_mean) = self._of(self._held, each)
+            controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
+            expected = np.where(held, C_mean, expected[0]), np.where(held, D_mean, expected[1])
+        return controls, expected
+
+    def _of(self, control: Control, each: int) -> tuple[Pair, Pair]:
+        """Return the same of one control."""
         controls = control.predict(control.features(self.points[:, :each]), control.outputs)
         return controls, control.expected(control.outputs)
 
@@ -387,6 +394,16 @@ class _Samples:
             for control in (self._control, self._held)
         )
         return np.asarray(whole.sum(axis=0) > held.sum(axis=0))
+
+    def influences(self, found: Estimates) -> FloatArray | None:
+        """By how much each sample (n, m) that has an answer moves the variance, with controls."""
+        known = self._controls(self.each)
+        if known is None:
+            return None
+        ok = self.in_order(self.ok)
+        C, D = (self.in_order(control)[ok] for control in known[0])
+        first = self.in_order(self.outputs)[ok] - self._centre.outputs
+        return influences(first - found.coefficient * C, first**2 - found.second_coefficient * D)
 
     def field(self) -> Estimates | None:
         """Estimate the moments of the state, where its sums were kept."""

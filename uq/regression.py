@@ -13,17 +13,22 @@ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from forward.model import FloatArray, SolveError
+from forward.model import Finding, FloatArray, SolveError
 from uq.basis import Basis, IntArray, by_degree, hyperbolic, hyperbolic_count, orthonormal
+from uq.doubts import influences, of_expansion, of_tails
 from uq.evaluate import Evaluations
 from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
+from uq.moments import ONE_SIDED, Z, error_of_root
 
+BoolArray = NDArray[np.bool_]
 TRUNCATIONS = (0.5, 0.75, 1.0)
 ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
 FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
@@ -31,6 +36,9 @@ DICTIONARY = 2000  # functions to select from, at most
 FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
 ROUNDING = 1e-13  # relative error below which there is nothing left to select for
 LIKELY = 24  # functions whose inner products are found together
+ROUGH = 0.1  # relative leave-one-out error above which the mean is no better known than the samples say
+TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
+NOTHING = 0.8  # the same, above which a fit says nothing of what the output depends on
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 
 
@@ -192,6 +200,10 @@ class Fit:
         Root mean square (m,) of the leave-one-out errors of the values, and that over their standard deviation.
     squares
         Sum of squares (m,) of the residuals of all rows.
+    held
+        Number (n,) of the fit of `without` that has not seen the sample.
+    unseen
+        Errors (n, m) of the values at each sample by that fit.
     """
 
     chosen: Candidate
@@ -202,6 +214,8 @@ class Fit:
     loo: FloatArray
     relative: FloatArray
     squares: FloatArray
+    held: IntArray
+    unseen: FloatArray
 
 
 @dataclass(frozen=True)
@@ -262,7 +276,9 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     best = min(score for score, *_ in scores)
     # Of those that are as good, the smallest.
     good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
-    return _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
+    fit = _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
+    given = np.argsort(order)
+    return replace(fit, held=fit.held[given], unseen=fit.unseen[given])
 
 
 def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
@@ -400,13 +416,14 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
     residual = right - blocks @ rotated
     coefficients = solve_triangular(triangle, rotated)
     if folds is None:
-        errors = _left_out(blocks, residual, np.arange(n))
+        held = np.arange(n)
+        errors = _left_out(blocks, residual, held)
         terms = chosen.which.size
         moved = solve_triangular(triangle, np.einsum("zrp,zrm->pzm", blocks, errors).reshape(terms, n * m))
         without = np.zeros((n, left.shape[2], m))
         without[:, chosen.which] = coefficients - np.swapaxes(moved.reshape(terms, n, m), 0, 1)
     else:
-        errors = folds.errors
+        held, errors = folds.held, folds.errors
         without = np.zeros((len(folds.which), left.shape[2], m))
         for k, which in enumerate(folds.which):
             kept = folds.held != k
@@ -414,7 +431,9 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
             without[k, which] = solve_triangular(r, q.T @ right[kept].reshape(-1, m))
     squares = (residual**2).sum(axis=(0, 1))
     sampled = _sampled(blocks, residual, triangle)
-    return Fit(chosen, coefficients, without, sampled, triangle, data.size(errors), data.relative(errors), squares)
+    unseen = errors[:, 0] / np.sqrt(data.weights)[:, None]
+    relative = data.relative(errors)
+    return Fit(chosen, coefficients, without, sampled, triangle, data.size(errors), relative, squares, held, unseen)
 
 
 def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
@@ -430,6 +449,22 @@ def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> 
     scaled = (np.swapaxes(axes, 1, 2) @ residual) / np.sqrt(np.maximum(sizes, 1e-10))[:, :, None]
     moved = np.einsum("zrp,zrm->pzm", blocks, axes @ scaled).reshape(-1, n * m)
     return np.asarray(np.sqrt((solve_triangular(triangle, moved).reshape(-1, n, m) ** 2).sum(axis=1)))
+
+
+def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Samples (n, m) of the first two moments of deviations, with fits that have not seen them as controls.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        The samples, and what the deviations are from (m,).
+    """
+    reference = data.values.mean(axis=0)
+    constant = (largest == 0).all(axis=1)
+    mean = (fit.without[:, constant].sum(axis=1) - reference)[fit.held]
+    square = (fit.without[:, ~constant] ** 2).sum(axis=1)[fit.held] + mean**2
+    f = data.values - reference
+    return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, reference
 
 
 @dataclass(frozen=True)
@@ -484,11 +519,30 @@ class Regression:
     def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
         """Return what follows from the coefficients, by output, with standard errors."""
         cautious = None in [m.support for m in self.inputs.marginals.values()]
-        return _estimates(self.fit, self.largest.indices, len(self.data.points), cautious=cautious, of=of)
+        return _estimates(self.fit, self.largest.indices, self.data, cautious=cautious, of=of)
+
+    @property
+    def controlled(self) -> BoolArray:
+        """Of which outputs (m,) the moments are those of the samples, with the fit as control."""
+        return self.fit.relative > TRUSTED
+
+    def doubts(self, names: Sequence[str]) -> Iterator[Finding]:
+        """Find what speaks against the estimates of these outputs."""
+        n = len(self.data.points)
+        yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
+        if np.ptp(self.data.weights) == 0:
+            which = np.flatnonzero(self.controlled)
+            first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
+            yield from of_tails(
+                [names[i] for i in which],
+                self.data.values[:, which],
+                np.ones(which.size),
+                influences(first, second)[:, which],
+            )
 
 
-def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
-    """Moments and indices by output with their standard errors, by the jackknife over samples.
+def _estimates(fit: Fit, largest: IntArray, data: Data, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
+    """Moments and indices by output with their standard errors, by the jackknife over samples and by what it leaves.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
     parts select anew: what the samples chose is uncertain as they are.
@@ -496,25 +550,80 @@ def _estimates(fit: Fit, largest: IntArray, n: int, *, cautious: bool, of: Analy
     The jackknife asks of a fit what it does in the hole that a sample left, and claims too much; a regression with
     independent errors takes the rest, which is smooth, for noise, and claims too little. For the mean, the geometric
     mean of the two is claimed: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
-    jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. For the standard deviation, where
-    the rest that no polynomial takes is a bias, it is the jackknife: 92 to 100 %.
+    jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for each parameter
+    it is the jackknife.
+
+    None of this looks at what no function of the basis takes. So there are other estimates beside, of the samples
+    with fits that have not seen them as controls (`_unseen`): half the distance to them counts as an error, and for the
+    standard deviation the variance λ² that is left, λ the leave-one-out error. Above `ROUGH` their error counts for the
+    mean, and above `TRUSTED` they take the place of
+    those of the fit (docs/decisions/0009-claims-of-expansions.md).
 
     Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
-    there, `cautious`, its norm, the leave-one-out error λ, is added: λ for the standard deviation, as |σ_f − σ_g| ≤
-    ‖f − g‖, and λ/√n for the mean, which keeps the jackknife. (Without, intervals of functions of normal and gamma
-    parameters covered 60 % instead of 95 %.) The indices always have its share (λ/σ)² of the variance.
+    there, `cautious`, its norm λ is added: λ for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the
+    mean, which keeps the jackknife. (Without, intervals of functions of normal and gamma parameters covered 60 %
+    instead of 95 %.)
+
+    Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
     """
     indices = largest[fit.chosen.which]
     central = of(fit.coefficients.T, indices)
     left_out = of(np.swapaxes(fit.without, 1, 2), largest)
-    groups = len(fit.without)
-    share = shares(fit.loo**2, central["std"] ** 2)
-    nothing = np.zeros_like(fit.loo)
-    missing = {"mean": fit.loo / np.sqrt(n) if cautious else nothing, "std": fit.loo if cautious else nothing}
+    groups, n = len(fit.without), len(fit.unseen)
+    seen = _unseen(fit, largest, data)
+    trusted = fit.relative <= TRUSTED
+    tails = fit.loo if cautious else np.zeros_like(fit.loo)
+    bias = shares(fit.loo**2, 2 * central["std"])
+    whole: FloatArray = np.where(trusted, central["std"], seen["std"])
+    share = shares(fit.loo**2, whole**2)
+    further = {
+        "mean": np.sqrt(
+            tails**2 / n
+            + (seen["mean"] - central["mean"]) ** 2 / 4
+            + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
+        ),
+        "std": np.sqrt(tails**2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
+    }
     for name, values in left_out.items():
         spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
-        if name == "mean" and not cautious:
+        if name == "mean" and not cautious and n > 2 * largest.shape[1]:
             spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
-        unseen = missing.get(name, share)
-        central[f"{name}_error"] = np.hypot(spread, unseen.reshape(-1, *(1,) * (spread.ndim - 1)))
+        if name in further:
+            known = np.hypot(seen[f"{name}_error"], tails if name == "std" else 0.0)
+            if name == "mean":
+                known = np.maximum(known, np.hypot(spread, tails / np.sqrt(n)))
+            central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), known)
+            central[name] = np.where(trusted, central[name], seen[name])
+        else:
+            by_index = (-1, *(1,) * (spread.ndim - 1))
+            something = (fit.relative <= NOTHING).reshape(by_index)
+            central[f"{name}_error"] = np.where(something, np.hypot(spread, share.reshape(by_index)), np.nan)
+            central[name] = np.where(something, central[name], np.nan)
     return central
+
+
+def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
+    """Moments by output from the samples, each with a fit that has not seen it as control, and their standard errors.
+
+    With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and so for the square: unbiased for
+    independent samples, however bad the fits are; where they are constants it is plain Monte Carlo.
+    """
+    from scipy.special import stdtrit
+
+    weights = (data.weights / data.weights.sum())[:, None]
+    independent = 1 / (weights**2).sum()  # as many samples of equal weight know as much
+    student = float(stdtrit(max(len(data.values) - 1, 1), ONE_SIDED)) / Z
+    first, second, reference = _unseen_samples(fit, largest, data)
+    mean = (weights * first).sum(axis=0)
+    second = second - 2 * mean * first + mean**2
+    scale = student / np.sqrt(max(independent - 1, 1))
+    mean_error = scale * np.sqrt((weights * (first - mean) ** 2).sum(axis=0))
+    variance = (weights * second).sum(axis=0)
+    variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
+    std = np.sqrt(np.maximum(variance + mean_error**2, 0.0))
+    return {
+        "mean": reference + mean,
+        "mean_error": mean_error,
+        "std": std,
+        "std_error": error_of_root(std, variance_error),
+    }

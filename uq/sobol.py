@@ -24,7 +24,9 @@ from pydantic import Field
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import nearest
 from uq.chaos import LARGEST, Chaos, expansion_dataset
+from uq.doubts import of_indices, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.findings import add
 from uq.indices import (
     Analysis,
     ExchangedVariances,
@@ -43,7 +45,7 @@ from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
 from uq.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, by_node
-from uq.regression import Regression
+from uq.regression import NOTHING, Regression
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.stopping import Amount
 
@@ -238,6 +240,7 @@ class Sobol(Amount):
             except SolveError:
                 continue  # too few for an expansion
         dataset = dataset.assign(_running(running)).assign_coords(index_round=list(running))
+        add(dataset, *regression.doubts(dataset["output"].to_numpy().tolist()), *of_indices(dataset))
         return _with_maps(dataset) if self.fields else dataset
 
     # --- from given data -----------------------------------------------------------------------------------------
@@ -254,8 +257,7 @@ class Sobol(Amount):
             raise FileNotFoundError(message)
         dataset = source.drop_vars([name for name in ("node_position", "cell_nodes", "unit") if name in source])
         dataset.attrs = {"stopped": f"from the results of {self.source}: {source.attrs.get('stopped', 'samples')}"}
-        if "note" in source.attrs:
-            dataset.attrs["note"] = source.attrs["note"]
+        dataset.attrs |= {name: source.attrs[name] for name in ("note", "findings") if name in source.attrs}
         if not self.fields:
             dataset = dataset.drop_dims([dim for dim in ("node",) if dim in dataset.dims])
         if "multi_index" not in source:
@@ -270,10 +272,12 @@ class Sobol(Amount):
             return self._with_indices(dataset, inputs, regression)
         coefficients, indices = source["coefficients"].to_numpy().T, source["multi_index"].to_numpy()
         found = self._analysis(inputs)(coefficients, indices)
+        nothing = source["loo_error"].to_numpy() > NOTHING
         for name in set(found) & set(DIMENSIONS):
             # The samples' derivatives, which errors of other indices would need, are not kept.
             kept = f"{name}_error"
             found[kept] = source[kept].to_numpy() if kept in source else np.full_like(found[name], np.nan)
+            found[name][nothing] = np.nan
         dataset = dataset.assign(_by_output(found))
         return _with_maps(dataset) if self.fields else dataset
 
@@ -295,6 +299,7 @@ class Sobol(Amount):
                 break
             rows.extend(2 * rows.each)
         dataset = rows.dataset(found)
+        add(dataset, *of_indices(dataset))
         amount = f"{R * rows.each} rows of {K} solves of Sobol' points"
         error = f"errors of the indices up to {reached:.2g}"
         dataset.attrs["stopped"] = self.why_stopped(reached, error, rows.each, last, amount)
@@ -553,7 +558,7 @@ class _Rows:
         whole = np.repeat(self.ok, K)
         independent = whole & (np.arange(whole.size) % K < 2)  # A and B
         values = self.outputs.reshape(whole.size, -1)
-        central, central_error = quantiles_from_replicates(values[independent], part[independent], method.quantiles)
+        of_quantiles = quantiles_from_replicates(values[independent], part[independent], method.quantiles)
         rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
         moments = {each: self._moments(each) for each in rounds}
         running = {each * self._parts * K: self.indices(each) for each in rounds}
@@ -564,8 +569,7 @@ class _Rows:
         ).assign(
             {
                 **{name: (by_output, getattr(moments[self.each], name)) for name in ESTIMATES},
-                "quantiles": (("quantile", "output"), central),
-                "quantiles_error": (("quantile", "output"), central_error),
+                **of_quantiles.variables,
                 **_by_output(found),
                 "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
                 "values": (("sample", "output"), values),
@@ -579,6 +583,8 @@ class _Rows:
                 **self.field(),
             }
         )
+        last = moments[self.each].relative_std_error
+        add(dataset, *of_tails(self._evaluate.outputs, values[independent], last))
         lost = int((~self.ok).sum())
         if lost:
             dataset.attrs["note"] = (
