@@ -20,8 +20,11 @@ START = 240 * MIB  # Python with NumPy, pydantic and the buffer below
 BLAS_BUFFER = 160 * MIB  # OpenBLAS takes 128 MiB for its buffer, and tries for ever where it cannot have them
 SHARED_BY_RANKS = 4 * MIB  # file by which MPI lets ranks share memory
 PETSC_OUT_OF_MEMORY = 55  # PETSC_ERR_MEM
-# How other libraries say it: C++, the dynamic loader, a compiler, the operating system.
+# How other libraries say it: C++, the dynamic loader, a compiler, the operating system, MUMPS through PETSc.
 OUT_OF_MEMORY = (
+    "infog(1)=-5",
+    "infog(1)=-7",
+    "infog(1)=-13",
     "bad_alloc",
     "cannot allocate memory",
     "failed to map segment",

@@ -63,6 +63,7 @@ def test_exceptions_that_mean_no_memory():
         numpy_said.value,
         petsc,
         RuntimeError("std::bad_alloc"),
+        RuntimeError("error code 76\n[0] Error reported by MUMPS in solve phase: INFOG(1)=-13"),
         OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
         ImportError("libpetsc.so: failed to map segment from shared object"),
     ):
