@@ -168,6 +168,7 @@ def cells() -> Iterator[Case]:
                 {
                     "body": body,
                     "material": {"kind": "neo-hookean", "C1": 5e3, "D1": 5e4},
+                    "formulation": "displacement",  # of which the condition does not depend on units
                     "clamp": ["x-min"],
                     "loads": [{"kind": "traction", "on": "x-max", "direction": [0, 0, -1], "size": traction}],
                     "outputs": [{"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "z"}],
