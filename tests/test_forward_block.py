@@ -139,7 +139,9 @@ def test_patch_of_distorted_cells(corners, cell, degree):
     body.at_load(1.0)
     u = solve(body, spec.solver, np.zeros(spec.unknowns)).state
     places = np.asarray(body.space.tabulate_dof_coordinates())
-    np.testing.assert_allclose(u.reshape(-1, 3), places @ (body.deformation - np.eye(3)).T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        u[: places.size].reshape(-1, 3), places @ (body.deformation - np.eye(3)).T, rtol=0, atol=1e-9
+    )
 
     body.at_load(1.0)
     body.set_state(u)
