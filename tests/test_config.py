@@ -240,6 +240,7 @@ def test_overrides():
     ("assignment", "message"),
     [
         ("method.samples", "expected KEY=VALUE"),
+        ("=3", "expected KEY=VALUE"),
         ("method.samples.x=1", "'samples' is a value, not a block"),
         ("model.loads.wind.density=1", "no element is called 'wind'"),
         ("method.sampels=1", "did you mean 'samples'"),
@@ -338,3 +339,9 @@ def test_a_displacement_larger_than_the_body_is_questioned():
         "displacements.x-max.x reaches 2 m, more than the length of the body, 0.28 m",
     ]
     assert any("displacements.x-max.y reaches" in line for line in plan(parse(document_)))
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
+    study = tmp_path / "study.toml"
+    study.write_text(starter("chaos"), encoding="utf-8-sig")
+    assert load(study).method.kind == "chaos"

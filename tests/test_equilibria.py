@@ -242,6 +242,25 @@ def test_without_refusals_nothing_is_said(inputs):
     assert branch.counts([evaluations(points, none)])["screened"] == 20
 
 
+@pytest.mark.parametrize(
+    ("continued", "words"), [(True, "The expansion goes on"), (False, "missing from the estimates")]
+)
+def test_where_solves_failed_is_found(inputs, continued, words):
+    points = inputs.points(random_points(0, 0, 60, 2))
+    failed = points[:, 0] > 120
+    states = evaluations(points, failed, np.zeros(60, dtype=np.int8))
+    (one,) = branch.findings(inputs, states, continued=continued)
+    assert one.severity == "warning"
+    assert f"{failed.sum()} of 60 samples have no answer: all with loads.traction.size ≥ 12" in one.text
+    assert words in one.text
+
+
+def test_failures_here_and_there_have_no_bound(inputs):
+    points = inputs.points(random_points(0, 0, 60, 2))
+    failed = np.sin(37 * points[:, 0]) > 0.5
+    assert branch.separated(inputs, points, failed, ~failed) == "no bound of the parameters tells them from the others"
+
+
 def test_what_the_screen_missed_is_an_error(inputs):
     points = inputs.points(random_points(0, 0, 20, 2))
     refused = np.arange(20) < 2

@@ -109,6 +109,7 @@ def write(directory: Path, dataset: xr.Dataset) -> Path:
     summary = {
         "study": "cube",
         "method": dataset.attrs["method"],
+        "status": "complete",
         "stopped": dataset.attrs.get("stopped", "one linearisation"),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
         "evaluations": 1 + dataset.sizes.get("sample", 0),
@@ -160,7 +161,7 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         words.with_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0])) + " m",
         f"worth {words.worth(float(sag['variance_ratio']))} plain samples for the mean",
         "2.6667 × 10⁻⁴ m/(kg/m³)",
-        "norm of the derivative",
+        "root mean square of the derivative",
         "none failed",
         "4 min 10 s",
         "122; 2.0 a solve",
@@ -366,22 +367,30 @@ def test_body_is_drawn(sampled):
     assert drawn["std"].startswith(PNG)
 
 
-@pytest.mark.parametrize("missing", ["results.nc", "summary.json"])
-def test_missing_results_are_named(tmp_path, sampled, missing):
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [
+        ("results.nc", r"results\.nc is missing, although the study is finished; `tissuq run` .* makes it again"),
+        ("summary.json", r"holds no summary\.json, expected the directory of a finished study"),
+    ],
+)
+def test_missing_results_are_named(tmp_path, sampled, missing, words):
     out = write(tmp_path / "out", sampled)
     (out / missing).unlink()
-    with pytest.raises(FileNotFoundError, match=f"holds no {missing}, expected the directory of a finished study"):
+    with pytest.raises(FileNotFoundError, match=words):
         write_report(out)
 
 
-@pytest.mark.parametrize("content", [b"hello", None])
-def test_foreign_results_are_refused(tmp_path, sampled, content):
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"hello", r"results\.nc: is damaged"), (None, r"results\.nc: holds no results of a study")]
+)
+def test_foreign_results_are_refused(tmp_path, sampled, content, words):
     out = write(tmp_path / "out", sampled)
     if content is None:
         xr.Dataset({"x": 1.0}).to_netcdf(out / "results.nc", engine="h5netcdf")
     else:
         (out / "results.nc").write_bytes(content)
-    with pytest.raises(FileNotFoundError, match=r"results\.nc: holds no results of a study"):
+    with pytest.raises(FileNotFoundError, match=words):
         write_report(out)
 
 
@@ -454,6 +463,18 @@ def test_pictures_have_axes_with_units(sampled):
 def test_histogram_is_a_density(sampled):
     bars = plots.histogram(sampled, "sag").patches
     assert sum(bar.get_width() * bar.get_height() for bar in bars) == pytest.approx(1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_output_that_does_not_vary_is_drawn(sampled):
+    still = sampled.assign(values=xr.full_like(sampled["values"], 0.1)).drop_vars("variance_ratio")
+    assert plots.standard_error(still, "sag").get_yscale() == "linear"
+
+
+def test_a_value_far_off_does_not_make_millions_of_bins(sampled):
+    values = sampled["values"].copy()
+    values[0] = 1e12
+    assert len(plots.histogram(sampled.assign(values=values), "sag").patches) <= 200
 
 
 def test_tornado_has_the_strongest_parameter_on_top(sampled):

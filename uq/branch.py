@@ -1,4 +1,4 @@
-"""Where a stable branch of equilibria ends: what samples that were refused as unstable say about the parameters.
+"""Where the model has no answer: what samples that failed, or were refused as unstable, say about the parameters.
 
 A perfect column under a dead load has no stable straight state beyond its first buckling load, and the one it takes
 then is not found from the straight ones. What is computed from the other samples is about the branch that they are on.
@@ -19,7 +19,7 @@ SHOWN = 0.1  # share of the largest that a parameter must have in a direction to
 
 
 def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> Iterator[Finding]:
-    """Say where samples were refused, and what that does to estimates.
+    """Say where samples have no answer, and what that does to estimates.
 
     Parameters
     ----------
@@ -43,6 +43,18 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         else:
             text += "Estimates are of the stable branch alone, that is, over the samples that have an answer."
         yield Finding("error" if continued else "warning", text)
+    failed = ~ok & ~refused
+    count = int(failed.sum())
+    if count:
+        text = f"{count} of {total} samples have no answer: {separated(inputs, evaluations.points, failed, ok)}. "
+        if continued:
+            text += (
+                "The expansion goes on there as it is elsewhere, which neither samples nor errors cover: its moments, "
+                "quantiles and indices hold only if the outputs do so too."
+            )
+        else:
+            text += "They are missing from the estimates, or are taken to follow the control."
+        yield Finding("warning", text)
     missed = int((known == Stability.MISSED).sum())
     if missed:
         screened = int((known == Stability.SCREENED).sum())
@@ -103,6 +115,8 @@ def _words(
         last = sign * (sign * x[ok]).max()
         return f"all with {what} {sides[0]} {first:.5g}, none with {what} {sides[1]} {last:.5g}"
     inside = int(((sign * x >= sign * first) & ok).sum())
+    if 2 * inside > ok.sum():
+        return "no bound of the parameters tells them from the others"
     others = "1 other has" if inside == 1 else f"{inside} others have"
     return f"all with {what} {sides[0]} {first:.5g}, where {others} an answer"
 

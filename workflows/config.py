@@ -356,7 +356,7 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
 def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
     """Read a study from a TOML file; overrides and errors as of `parse`."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors on Windows begin files with a mark
     except RecursionError:
         message = f"{path}: lists or tables are nested too deeply"
         raise StudyError(message) from None
@@ -433,7 +433,7 @@ def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 
 def _override(blocks: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
-    if not equals:
+    if not equals or not key.strip():
         message = f"--set {assignment}: expected KEY=VALUE, such as method.samples=512"
         raise StudyError(message)
     try:

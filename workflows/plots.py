@@ -23,6 +23,7 @@ Estimated = Literal["mean", "std"]
 Cost = Literal["solves", "cpu_seconds"]
 FIRST_SHOWN = 8  # estimates from fewer samples say nothing
 BARS = 15  # parameters that a tornado chart shows
+MOST_BINS = 200
 SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
@@ -86,10 +87,11 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
         ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
     ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
     _count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
-    ax.yaxis.set_minor_locator(NullLocator())
+    if any((error > 0).any() for *_, error in series):  # an output that does not vary has none
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
+        ax.yaxis.set_minor_locator(NullLocator())
     ax.set_ylabel(f"standard error of {_quantity(dataset, output)}")
     ax.legend()
     return ax
@@ -104,7 +106,9 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     else:
         values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
         spread = np.ptp(values) > 1e-12 * np.abs(values).max()
-        ax.hist(values, bins="auto" if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
+        ax.hist(
+            values, bins=_bins(values) if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white"
+        )
     ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
     for i, probability in enumerate(dataset["quantile"].to_numpy()):
         place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
@@ -124,6 +128,14 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
     ax.legend()
     return ax
+
+
+def _bins(values: NDArray[np.float64]) -> int:
+    """Return the number of bins of NumPy's "auto", but no more than can be drawn: one value far off makes millions."""
+    quarter, three_quarters = np.percentile(values, [25, 75])
+    width = 2 * (three_quarters - quarter) / len(values) ** (1 / 3)
+    fewest = np.log2(len(values)) + 1
+    return int(np.ceil(min(max(fewest, np.ptp(values) / width if width > 0 else 0), MOST_BINS)))
 
 
 def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:

@@ -178,11 +178,11 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
 
 
 def _with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
-    """Add how the stability of each sample was looked at, and say where a stable branch ends."""
-    if not branch.counts([evaluations]):
-        return dataset
+    """Add how the stability of each sample was looked at, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
     add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
+    if not branch.counts([evaluations]):
+        return dataset
     if "points" in dataset and dataset.points.dims == ("sample", "parameter"):
         known = branch.by_sample(dataset.points.to_numpy(), evaluations)
         meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)

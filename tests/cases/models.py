@@ -1,0 +1,24 @@
+"""Models of the cases: the borehole of Worley (1987) and an oscillation after Genz (1984)."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+WAVES = np.array([9.0, 7.25, 1.85, 7.03])
+
+
+def borehole(p: NDArray[np.complex128]) -> list[complex]:
+    """Flow (m³/yr) through a borehole."""
+    rw, r, Tu, Hu, Tl, Hl, L, Kw = p
+    ratio = np.log(r / rw)
+    return [2 * np.pi * Tu * (Hu - Hl) / ratio / (1 + Tu / Tl + 2 * L * Tu / (ratio * Kw * rw**2))]
+
+
+def borehole_jacobian(p: ArrayLike) -> list[list[float]]:
+    """Its derivatives, by complex steps."""
+    step = 1e-30
+    return [[(borehole(row)[0] / step).imag for row in np.asarray(p) + 1j * step * np.eye(8)]]
+
+
+def oscillation(p: ArrayLike) -> float:
+    """More waves than a few dozen samples show."""
+    return float(np.cos(0.6 * np.pi + WAVES @ np.asarray(p)))
