@@ -3,7 +3,8 @@
 Entries and operations of a factor follow from nested dissection of the lattice of nodes: A. George, SIAM J. Numer.
 Anal. 10 (1973) 345–363. A box is cut across its longest direction by a layer of nodes, and so on; a layer of s unknowns
 that borders on r others (of the layers before it) takes s³/3 + s²r + sr² operations and s²/2 + sr entries. The
-constants turn them into those of MUMPS with an ordering of its choice (`python -m benchmarks predictions`).
+constants turn them into those of MUMPS with an ordering of its choice. Times are of one core of a 2.8 GHz processor,
+with the counts of iterations of a block and of a beam that bends far (`python -m benchmarks predictions`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,31 @@ BYTES_PER_NONZERO = 16.0  # of the matrix
 BYTES_PER_UNKNOWN = 3e3  # mesh, spaces, vectors
 BYTES_OF_PROGRAM = 2.5e8  # Python with all libraries
 ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never touched
+# Processor times (s).
+ASSEMBLY = {
+    ("hexahedron", 1): 1.4e-5,
+    ("hexahedron", 2): 2.4e-4,
+    ("tetrahedron", 1): 1.5e-6,
+    ("tetrahedron", 2): 2.3e-5,
+}
+RESIDUAL = {("hexahedron", 1): 7e-7, ("hexahedron", 2): 5e-6, ("tetrahedron", 1): 2e-7, ("tetrahedron", 2): 8e-7}
+OF_PRESSURES = 1.25  # of an assembly with pressures over one without
+PER_ENTRY, PER_OPERATION = 1.6e-8, 4.4e-11  # of a factorisation
+PER_NONZERO = 6e-8  # of the matrix and the analysis before the first factorisation
+PER_ENTRY_SOLVED = 2e-9  # of a back-substitution
+TOGETHER = 0.65  # of a back-substitution for one of many right-hand sides over one alone
+START = 3.0  # of the program, with all that it imports
+COMPILATION = 6.0  # of the forms of a body that are not compiled yet, one second each
+REPORT = 3.5  # of results and their report
+CALL = 2e-4  # of any of them on a body of no size
+# Counts, in bodies that are slender (and turn as they bend) and in others.
+SLENDER = 3.0  # longest extent over the shortest
+NEWTON = {True: 5.5, False: 4.0}  # factorisations from zero
+CORRECTIONS = {True: 10, False: 7}  # with a reference factor
+ACTIONS = 7  # products with the stiffness for the screen of a sample, each like a residual
+DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen, each of two stiffnesses
+SUBSTITUTIONS = 18  # for the natural modes, and as many for each direction
+FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and corrections that they take then
 
 
 class Meshed(Protocol):
@@ -65,6 +91,77 @@ class Factor:
     def bytes(self) -> float:
         """Memory while and after it is made, with that of the matrix."""
         return BYTES_PER_ENTRY * self.entries + BYTES_PER_NONZERO * self.nonzeros
+
+
+@dataclass(frozen=True)
+class Times:
+    """Predicted processor times (s) of solves of a body, on one core.
+
+    Attributes
+    ----------
+    assembly, residual
+        Of the stiffness and of the forces out of balance.
+    setup
+        Of the matrix and its analysis, which one solver needs once.
+    factorisation, substitution
+        Of one factor, and of one right-hand side with it.
+    slender
+        Whether the body is.
+    """
+
+    assembly: float
+    residual: float
+    setup: float
+    factorisation: float
+    substitution: float
+    slender: bool
+
+    @property
+    def textbook(self) -> float:
+        """A solve by Newton's method from zero."""
+        return NEWTON[self.slender] * (self.assembly + self.factorisation + self.substitution + 2 * self.residual)
+
+    @property
+    def first(self) -> float:
+        """The first solve."""
+        return self.setup + self.textbook
+
+    @property
+    def corrected(self) -> float:
+        """A solve from a prediction with the factor of a reference, and the screen of its stability."""
+        corrections = CORRECTIONS[self.slender]
+        return (corrections + 2) * self.substitution + (corrections + ACTIONS) * self.residual
+
+    def reference(self, parameters: int) -> float:
+        """The factor of a reference, and the vectors for the screen of stability."""
+        directions = min(parameters, DIRECTIONS)
+        vectors = 2 * directions * self.assembly + SUBSTITUTIONS * (1 + directions) * self.substitution
+        return self.setup + self.assembly + self.factorisation + vectors
+
+    def tangents(self, parameters: int) -> float:
+        """All derivatives of outputs and state of a solution whose factor is at hand."""
+        return 15 * CALL + parameters * (2 * TOGETHER * self.substitution + self.residual)
+
+    def tangents_of_sample(self, parameters: int) -> float:
+        """All derivatives of the outputs of a solution that was found with the factor of a reference."""
+        if parameters > FEW:
+            return self.assembly + self.factorisation + self.tangents(parameters)
+        return NEAR * parameters * (self.substitution + self.residual)
+
+
+def times(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Times:
+    """Predict the times of a body; without symmetry of the stiffness, LU is twice LDLᵀ."""
+    triangles = 1 if symmetric else 2
+    extents = [high - low for low, high in body.bounds]
+    found, kind, more = factor(body, mixed=mixed), (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
+    return Times(
+        CALL + more * ASSEMBLY[kind] * body.cell_count,
+        CALL + RESIDUAL[kind] * body.cell_count,
+        CALL + PER_NONZERO * found.nonzeros,
+        CALL + triangles * (PER_ENTRY * found.entries + PER_OPERATION * found.operations),
+        CALL + triangles * PER_ENTRY_SOLVED * found.entries,
+        max(extents) > SLENDER * min(extents),
+    )
 
 
 def factor(body: Meshed, *, mixed: bool) -> Factor:

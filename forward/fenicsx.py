@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import os
 import shutil
 import sysconfig
 import tempfile
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from forward.cost import BYTES_PER_NONZERO, BYTES_PER_UNKNOWN, Factor
 from forward.geometry import AXES, Body
 from forward.location import locate
-from forward.machine import MIB, StopError, headroom, require, reserve_for_linear_algebra
+from forward.machine import MIB, StopError, compiled_forms, headroom, require, reserve_for_linear_algebra
 from forward.model import FloatArray, ModelError, SolveError
 from forward.own_mesh import OwnMesh
 
@@ -74,8 +73,7 @@ def _cache_directory() -> Path:
     except (OSError, StopIteration):
         processor = ""
     made_for = [processor, str(sysconfig.get_config_var("SOABI")), dolfinx.__version__, *_FLAGS]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "tissuq" / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
+    return compiled_forms() / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
 
 
 _CACHE = _cache_directory()

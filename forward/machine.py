@@ -67,6 +67,11 @@ class Headroom:
         return f"{self.size / MIB:,.0f} MiB are available ({self.limit})"
 
 
+def compiled_forms() -> Path:
+    """Folder of forms that were compiled before, in a subfolder for each version of what they depend on."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tissuq"
+
+
 def limits() -> list[Headroom]:
     """Return what the machine, the limits of this process and its control group leave."""
     return list(_limits())

@@ -263,3 +263,21 @@ def test_lost_results_are_computed_again(study, tmp_path, harm):
     assert done.returncode == 0, done.stderr
     assert "missing or damaged, the study is computed again" in done.stderr
     assert (out / "results.nc").read_bytes() == whole
+
+
+@pytest.mark.parametrize("harm", ["none", "cut"])
+def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
+    """Their summaries have no hash of the results: these count where they can be read."""
+    out = tmp_path / "out"
+    assert tissuq("run", study, "--out", out).returncode == 0
+    summary = json.loads((out / "summary.json").read_text())
+    del summary["provenance"]["results_sha256"]
+    (out / "summary.json").write_text(json.dumps(summary))
+    whole = (out / "results.nc").read_bytes()
+    if harm == "cut":
+        (out / "results.nc").write_bytes(whole[:2000])
+    again = tissuq("run", study, "--out", out)
+    assert again.returncode == 0, again.stderr
+    assert ("finished before, nothing to do" in again.stdout) == (harm == "none")
+    assert ("computed again" in again.stderr) == (harm == "cut")
+    assert (out / "results.nc").read_bytes() == whole

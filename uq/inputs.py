@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,19 +184,26 @@ class Inputs:
         """
         if self.admissible is None or not self.admissible.names:
             return 1.0
-        from scipy.special import ndtri
-
         names = [name for name in self.names if name in self.admissible.names]
         pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)
         few = Inputs({name: self.marginals[name] for name in names}, pairs)
         if len(names) <= CORNERS:
             z = width * np.array([-FARTHEST, FARTHEST])
-            ends = [marginal.from_normal(z)[0] for marginal in few.marginals.values()]
-            corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
-            if self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all():
+            supports = [marginal.support for marginal in few.marginals.values()]
+            if None not in supports and self._admits_corners(names, supports):  # a larger box, which takes no quantiles
                 return 1.0
+            if self._admits_corners(names, [marginal.from_normal(z)[0] for marginal in few.marginals.values()]):
+                return 1.0
+        from scipy.special import ndtri
+
         points = few.from_normals(width * ndtri(sobol_points(0, 0, 0, POINTS, len(names))))[0]
         return float(self.admissible.admissible(dict(zip(names, points.T, strict=True))).mean())
+
+    def _admits_corners(self, names: Sequence[str], ends: Sequence[Any]) -> bool:
+        """Whether there is a model at every corner of a box with these two ends along each of the named parameters."""
+        assert self.admissible is not None
+        corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
+        return bool(self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all())
 
 
 @runtime_checkable

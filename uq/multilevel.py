@@ -87,13 +87,6 @@ class MultilevelMonteCarlo(Amount):
         """Number of solves of the linearisations and pilots on all meshes: how many more, these decide."""
         return self.levels + self.pilot * (2 * self.levels - 1)
 
-    def seconds_to_begin(self, unknowns: Sequence[int], slower: float = 1.0) -> float:
-        """Predict the time of these solves on meshes of so many unknowns, each so much slower than a predicted one."""
-        each = [seconds_per_solve(n) for n in unknowns]
-        coarser = [0.0, *each]
-        pairs = zip(each, coarser, strict=False)
-        return sum(TEXTBOOK * here + slower * self.pilot * (here + there) for here, there in pairs)
-
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
 

@@ -85,8 +85,10 @@ class Amount(Settings):
 
 
 def seconds_per_solve(unknowns: int) -> float:
-    """Predict the time of one solve from a tangent prediction on one core, to a factor of two or so.
+    """Weigh solves on nested meshes of so many unknowns against each other, in seconds.
 
+    Methods choose numbers of samples by it: it follows from the unknowns alone, and stays as it is, so that results do
+    too. What `check` says of times is better (`forward.cost`), and may become better still.
     Fitted to 0.011, 0.067 and 0.98 s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core;
     `python -m benchmarks realisation`). Inputs so wide that the prediction fails take several times as long.
     """

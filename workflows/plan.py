@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
-from forward.cost import ADDRESSES_OF_PROGRAM, BYTES_OF_PROGRAM, BYTES_PER_UNKNOWN, factor
+from forward.cost import (
+    ADDRESSES_OF_PROGRAM,
+    BYTES_OF_PROGRAM,
+    BYTES_PER_UNKNOWN,
+    COMPILATION,
+    REPORT,
+    START,
+    Times,
+    factor,
+    times,
+)
 from forward.finer import finer
 from forward.hyperelastic import Hyperelastic
-from forward.machine import MIB, Headroom, limits
+from forward.loads import Pressure
+from forward.machine import MIB, Headroom, compiled_forms, limits
 from forward.model import Finding
 from forward.own_mesh import OwnMesh
+from uq.chaos import Chaos
+from uq.compare import Compare
+from uq.derivative_based import DerivativeBased
 from uq.multilevel import MultilevelMonteCarlo
-from uq.stopping import TEXTBOOK, seconds_per_solve
+from uq.quasi_monte_carlo import QuasiMonteCarlo
 from workflows.config import Study, ranges
 
 if TYPE_CHECKING:
@@ -80,16 +95,12 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
     if study.body is None:
         return _external(study)
     method, model, body = study.method, study.body, study.body.body
-    textbook = TEXTBOOK if model.solver.kind == "newton" else 1
     sizes = [model.unknowns for model in study.meshes]
-    each = [seconds_per_solve(unknowns) * textbook for unknowns in sizes]
+    each = [_each(study, one) for one in study.meshes]
     form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
     up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
-    seconds = study.planned * each[0]
     if isinstance(method, MultilevelMonteCarlo):
         up_to, later = "", " for linearisations and pilots, which decide how many more"
-        seconds = method.seconds_to_begin(sizes, textbook)
-    seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf")) / groups
     names = [*study.parameters]
     for field in model.fields:
         paths = field.paths(body)
@@ -108,9 +119,88 @@ def _planned(study: AnyStudy, groups: int) -> list[str]:
         f"outputs     {', '.join(output.name for output in model.outputs)}",
         f"solves      {up_to}{study.planned:,}{later}",
         f"memory      about {(memory(study) + BYTES_OF_PROGRAM) / MIB:,.0f} MiB for each group of ranks",
-        f"time        {up_to}about {_duration(seconds)} on {groups} core{'s' if groups > 1 else ''}"
-        f" (rough; {each[0]:.2g} s a solve{' on the coarsest mesh' if later else ''}){later and ', then more'}",
+        *_told(parts(study), groups, up_to, later and ", then more"),
     ]
+
+
+class Part(NamedTuple):
+    """What a part of a study takes: predicted processor time (s), what for, and whether groups of ranks share it."""
+
+    seconds: float
+    what: str
+    shared: bool = False
+
+
+def _times(spec: Hyperelastic) -> Times:
+    return times(spec.body, mixed=spec.mixed, symmetric=not any(isinstance(load, Pressure) for load in spec.loads))
+
+
+def _each(study: Study, spec: Hyperelastic) -> float:
+    """Seconds of a sample without derivatives."""
+    found = _times(spec)
+    return found.textbook if spec.solver.kind == "newton" else found.corrected
+
+
+def parts(study: Study) -> list[Part]:
+    """Predict what a study of a body takes, part by part.
+
+    Samples are the most that there may be; those that multilevel methods add after their pilots are not known.
+    """
+    method, dimension = study.method, len(study.inputs.names)
+    found = [_times(one) for one in study.meshes]
+    each = [_each(study, one) for one in study.meshes]
+    samples, textbook = study.planned - len(found), 0
+    seconds = samples * each[0]
+    if isinstance(method, MultilevelMonteCarlo):
+        seconds = method.pilot * (2 * sum(each) - each[-1])
+    elif isinstance(method, Compare):
+        textbook = method.textbook
+        seconds -= textbook * each[0]
+        if method.mesh_error:
+            other = study.models[-1]
+            assert isinstance(other, Hyperelastic)
+            seconds += _times(other).first - each[0]
+    seconds += textbook * found[0].textbook
+    seconds += _with_tangents(study, samples) * found[0].tangents_of_sample(dimension)
+    seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and study.meshes[0].solver.kind != "newton"
+    return [
+        Part(START, "start of the program"),
+        *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
+        Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
+        Part(sum(one.tangents(dimension) for one in found), "its tangents"),
+        *([Part(sum(one.reference(dimension) for one in found), "reference factor")] if corrected else []),
+        *([Part(seconds, f"{samples:,} further solves, {each[0]:.2g} s each", shared=True)] if samples > 0 else []),
+        Part(REPORT, "results and report"),
+    ]
+
+
+def _with_tangents(study: Study, samples: int) -> int:
+    """Number of samples whose derivatives are asked for, too."""
+    method = study.method
+    if isinstance(method, Chaos):
+        return samples if method.gradients and method.fit == "regression" else 0
+    if isinstance(method, QuasiMonteCarlo):
+        return max(0, samples - method.limit)  # those that its control variate is fitted to
+    return samples if isinstance(method, DerivativeBased) else 0
+
+
+def _compiled_before() -> bool:
+    """Whether forms were compiled on this machine; which, only a run can tell."""
+    return any(compiled_forms().glob("forms-*/*/"))
+
+
+def _told(found: Sequence[Part], groups: int, up_to: str, more: str) -> list[str]:
+    """Say what a study takes by the clock, if every group of ranks has a core, and of what that is the sum."""
+    by_clock = [part.seconds / (groups if part.shared else 1) for part in found]
+    cores = f"{groups} core{'s' if groups > 1 else ''}"
+    lines = [f"time        {up_to}about {_duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]
+    lines += [f"            {_duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
+    if _compiled_before():
+        lines.append(
+            f"            and {COMPILATION:.0f} s or more where the forms of this kind of body are not compiled yet"
+        )
+    return lines
 
 
 def _formulation(decision: Decision) -> str:
@@ -156,22 +246,26 @@ def _inversion(study: Inversion) -> list[str]:
     usable = [m for m in study.measurements if m is not None]
     counts = [int(m.observations.measured.sum()) for m in usable]
     moved = [int((m.moved > 0).sum()) for m in usable]
-    each = seconds_per_solve(spec.unknowns) * len(spec.cases)
+    cases = [_times(spec.loaded(case)) for case in spec.cases]
+    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
     if study.field:
         unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
         seconds = (
-            each * TEXTBOOK * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD)
-            + 2 * study.method.solves(field=True) * each
+            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(field=True) * each
         )
     else:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
-        seconds = each * (TEXTBOOK * 15 * study.method.starts + study.method.solves(field=False))
+        seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
     checked = "not asked for: nothing will be said to be trusted"
     if study.method.mesh_check:
         try:
-            unknowns = 8 * spec.unknowns if isinstance(spec.body, OwnMesh) else finer(spec).unknowns
-            once = seconds_per_solve(unknowns) * len(spec.cases) * TEXTBOOK
+            if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
+                unknowns, once = 8 * spec.unknowns, 8**2 * textbook
+            else:
+                fine = finer(spec)
+                unknowns = fine.unknowns
+                once = sum(_times(fine.loaded(case)).textbook for case in fine.cases)
             seconds += once
             checked = f"one solve of {unknowns:,} displacements, about {_duration(once)}"
         except ValueError as error:
@@ -197,7 +291,7 @@ def _moved(count: int, farthest: float) -> str:
 
 def _synthesis(study: Synthesis) -> list[str]:
     spec, sets = study.specimen, len(study.method.fraction)
-    seconds = seconds_per_solve(spec.unknowns) * TEXTBOOK * len(spec.cases) * sets
+    seconds = sets * sum(_times(spec.loaded(case)).textbook for case in spec.cases)
     return [
         f"method      {study.method.kind}",
         *_found(spec.body),
@@ -231,6 +325,8 @@ def _comparison(study: Comparison) -> list[str]:
 
 
 def _duration(seconds: float) -> str:
+    if seconds < 9.5:
+        return f"{seconds:.2g} s"
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

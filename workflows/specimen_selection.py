@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from forward.cost import times
 from forward.geometry import AXES, Vector, tolerance
 from forward.hyperelastic import Mistake
 from forward.settings import Settings
@@ -20,7 +21,6 @@ from inverse.observations import DataError, read
 from inverse.selection import Select
 from uq.distributions import Distribution
 from uq.inputs import Inputs
-from uq.stopping import seconds_per_solve
 from workflows.config import Correlation, Parallel, StudyError, mistakes_of_parameters, ranges, refused
 from workflows.priors import mistakes_of_materials
 from workflows.selection import WHOLE, Comparison
@@ -250,8 +250,8 @@ class SpecimenSelection(Comparison):
     @property
     def seconds_per_solve(self) -> float:
         """Processor time of a solve of all load cases, roughly, averaged over the candidates."""
-        sizes = [len(specimen.cases) * seconds_per_solve(specimen.unknowns) for specimen in self.specimens.values()]
-        return sum(sizes) / len(sizes)
+        bodies = [specimen.loaded(case) for specimen in self.specimens.values() for case in specimen.cases]
+        return sum(times(one.body, mixed=one.mixed).corrected for one in bodies) / len(self.specimens)
 
     def described(self, name: str) -> str:
         """Material and mesh of a candidate."""

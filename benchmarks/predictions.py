@@ -1,0 +1,109 @@
+"""What `tissuq check` predicts against what solves take, in processor time."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks.beams import beam
+from forward.cost import times
+from uq.linearisation import Linearisation
+from uq.sampling import random_points
+
+T = TypeVar("T")
+DRAWS = 3
+CUBE = "model.body.size=[5,5,5]"  # m: so large that its weight strains it by some per cent
+SIZES: tuple[tuple[tuple[int, int, int], str], ...] = (
+    ((3, 3, 3), CUBE),
+    ((20, 1, 1), ""),
+    ((7, 7, 7), CUBE),
+    ((33, 3, 3), ""),
+    ((10, 10, 10), CUBE),
+    ((40, 5, 5), ""),
+)
+LARGE = ((15, 15, 15), CUBE)
+PARTS = ("first solve", "reference", "tangents", "sample", "textbook")
+
+
+def main() -> None:
+    """Print predicted and measured times of a cube and of the published, slender beam, cells of degree 2.
+
+    Each time is measured once, the sample on a few random draws, with compiled forms and `OMP_NUM_THREADS=1`.
+    """
+    if os.environ.get("OMP_NUM_THREADS") != "1":
+        sys.stderr.write("set OMP_NUM_THREADS=1: threads that wait spend processor time, too\n")
+        return
+    print("| body | cells | form | unknowns | " + " | ".join(f"{part} (s)" for part in PARTS) + " | ratios |")
+    print("|---|---|---|---:|" + "---|" * (len(PARTS) + 1))
+    found = [
+        _row(cells, change, cell, form)
+        for cells, change in SIZES
+        for form in ("displacement", "mixed")
+        for cell in ("hexahedron", "tetrahedron")
+    ]
+    found.append(_row(*LARGE, "hexahedron", "displacement"))
+    for part, ratios in zip(PARTS, np.array(found).T, strict=True):
+        print(f"\n{part}: predicted over measured {ratios.min():.2f} to {ratios.max():.2f}", end="")
+    print()
+
+
+def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]:
+    """Print a row; return predicted over measured times."""
+    gc.collect()  # PETSc's objects of the row before
+    a, b, c = cells
+    changes = [f"model.body.cell={cell!r}", f"model.formulation={form!r}", *([change] if change else [])]
+    study = beam((a, b, c), *changes)
+    assert study.body is not None
+    inputs, d = study.inputs, len(study.inputs.names)
+    model = study.body.build(MPI.COMM_SELF, inputs.names)
+    textbook = study.body.model_copy(update={"solver": study.body.solver.model_copy(update={"kind": "newton"})})
+    forced = textbook.build(MPI.COMM_SELF, inputs.names)
+    tiny = beam((1, 1, 1), *changes)
+    small = tiny.model.build(MPI.COMM_SELF, inputs.names).solve(inputs.mean)
+    small.tangent(np.eye(d)), small.state_tangent(np.eye(d))  # compiles
+    first, solution = _timed(lambda: model.solve(inputs.mean))
+    tangents, (slopes, outputs) = _timed(lambda: (solution.state_tangent(np.eye(d)), solution.tangent(np.eye(d))))
+    gathered, by_parameter = model.gather(solution.state[None]), model.gather(slopes)
+    assert gathered is not None
+    assert by_parameter is not None
+    centre = Linearisation(
+        inputs.mean, solution.outputs, outputs.T, gathered[0], by_parameter, inputs.coordinates, inputs.std
+    )
+    assert centre.prediction is not None
+    predict, reference = centre.prediction.on(model)
+    once, _ = _timed(lambda: (model.reference.prepare(reference), model.reference.prepare_screen()))
+    points = inputs.points(random_points(1, 0, DRAWS, d))
+    samples = sum(_timed(lambda at=at: model.solve(at, predict(at), reference))[0] for at in points) / DRAWS
+    slow, _ = _timed(lambda: forced.solve(points[0]))
+    model_times = times(study.body.body, mixed=study.body.mixed)
+    predicted = np.array(
+        [
+            model_times.first,
+            model_times.reference(d),
+            model_times.tangents(d),
+            model_times.corrected,
+            model_times.first,  # with its analysis, as it is the first of this model
+        ]
+    )
+    measured = np.array([first, once, tangents, samples, slow])
+    ratios = predicted / measured
+    print(
+        f"| {'cube' if change else 'beam'} | {a} × {b} × {c}, {cell} | {form} | {study.body.unknowns:,} | "
+        + " | ".join(f"{p:.2g}, {m:.2g}" for p, m in zip(predicted, measured, strict=True))
+        + f" | {', '.join(f'{ratio:.2f}' for ratio in ratios)} |",
+        flush=True,
+    )
+    return [float(ratio) for ratio in ratios]
+
+
+def _timed(what: Callable[[], T]) -> tuple[float, T]:
+    begin = time.process_time()
+    found = what()
+    return time.process_time() - begin, found
