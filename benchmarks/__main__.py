@@ -22,6 +22,7 @@ from benchmarks import (
     stability,
     startup,
     streaming,
+    tails,
     throughput,
     variance,
 )
@@ -37,6 +38,7 @@ ALL = {
     "calibration": calibration.main,
     "selection": selection.main,
     "streaming": streaming.main,
+    "tails": tails.main,
     "stability": stability.main,
     "locking": locking.main,
     "predictions": predictions.main,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from benchmarks import tails
 from benchmarks.coverage import CASES, Vectorised, measure
 from forward.model import FunctionModel
 from uq import chaos
@@ -130,6 +131,19 @@ def test_heavy_tails_are_told(method):
         for s in range(10)
     ]
     assert told == [[]] * 10
+
+
+def test_samples_that_look_log_normal_are_told_whatever_their_largest():
+    """1/ω: a third of the sets of 64 samples have no large one."""
+    case = next(case for case in tails.cases() if case.name == "1/ω, cv 1")
+    for seed in range(12):
+        assert severities(MonteCarlo(samples=64, seed=seed).run(case.inputs, Vectorised(case))) == ["warning"]
+
+
+def test_expansions_tell_what_is_beyond_their_samples():
+    case = next(case for case in tails.cases() if case.name == "product, cv 2")
+    told = [severities(Chaos(samples=16, seed=seed).run(case.inputs, Vectorised(case))) for seed in range(4)]
+    assert all("warning" in one for one in told)
 
 
 def test_comparisons_say_what_their_methods_found_out():

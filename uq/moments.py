@@ -10,6 +10,10 @@ L = Σ_i ∂ψ/∂ω_i(ω̄)(ω_i − ω̄_i), with E[L] = 0 and E[L²] = V know
 docs/decisions/0003-second-moment-control.md), β₁ = β₂ = 0 is plain Monte Carlo. Everything follows from the means of
 w^a L^b, a + b ≤ 4, which are sums and so can be added up in any grouping.
 
+An error of a control costs efficiency and never bias, but where it grows faster than the quantity (a polynomial of a
+parameter with tails), its second moment is known from where no sample is, and neither scatter nor claim are worth much.
+So a control that leaves more of the scatter than there was is dropped: β = 0, see `_helps`.
+
 Either expectation may also be a sum of independently estimated terms (a telescoping sum over meshes): see `combine`.
 """
 
@@ -33,6 +37,7 @@ SecondMoment = Literal["quadratic", "linear"]
 ESTIMATES = ("mean", "mean_error", "std", "std_error")
 ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
+MORE = 0.5  # over n − 1: share of the scatter of n samples by which a control must leave more of it to be dropped
 EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
 
 
@@ -124,11 +129,15 @@ def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, Floa
     first, second
         Samples (n, …) that have the wanted moments as expectations, n ≥ 2.
     controls
-        Controls (n, …) of both, with expectation zero; their coefficients are 1.
+        Controls (n, …) of both, with expectation zero; their coefficients are 1, or 0 where they do not help.
     """
-    if controls is not None:
-        first, second = first - controls[0], second - controls[1]
     n = len(first)
+    if controls is not None:
+        left = first - controls[0]
+        first = np.where(_helps(_scatter(left), _scatter(first), n), left, first)
+        moved = 2 * first.mean(axis=0) * first
+        left = second - controls[1]
+        second = np.where(_helps(_scatter(left - moved), _scatter(second - moved), n), left, second)
     m1, m2 = first.mean(axis=0), second.mean(axis=0)
     covariance = ((first - m1) * (second - m2)).sum(axis=0) / (n - 1)
     return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1))
@@ -170,9 +179,20 @@ def _sums(terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     # The squared mean exceeds the square of the expectation by its variance, which is added back: plain Monte Carlo
     # gets the usual n − 1.
     variance = np.maximum(_sum(t.second for t in terms) - m1**2 + mean_variance, 0)
-    scatter = _sum((t.second_variance - 4 * m1 * t.covariance + 4 * m1**2 * t.variance) / t.n for t in terms)
+    scatter = _sum(_scatter_of_variance(t, m1) / t.n for t in terms)
     # The square of a mean that is known badly errs by more than its slope says.
     return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0) + 2 * mean_variance**2)
+
+
+def _scatter_of_variance(one: Term, m1: FloatArray | None = None) -> FloatArray:
+    """Variance of r₂ − 2m₁r₁, by which a sample moves the estimate of σ²; m₁ is the term's own if none is given."""
+    m1 = one.first if m1 is None else m1
+    return np.asarray(one.second_variance - 4 * m1 * one.covariance + 4 * m1**2 * one.variance)
+
+
+def _helps(left: FloatArray, whole: FloatArray, n: int) -> NDArray[np.bool_]:
+    """Whether a control leaves less than the whole scatter of n samples; few must show it by more."""
+    return np.asarray(left <= (1 + MORE / (n - 1)) * whole)
 
 
 def _sum(arrays: Iterable[FloatArray]) -> FloatArray:
@@ -200,7 +220,7 @@ def estimate(
     control_variance
         V = E[L²] (…); without it the estimators are those of plain Monte Carlo.
     coefficient
-        β₁ = 1, or the one that is optimal on these samples.
+        β₁ = 1, or 0 for a control that does not help; or the one that is optimal on these samples.
     second_moment
         Whether L² − V controls the second moment ("quadratic") or not ("linear", as published).
     """
@@ -223,22 +243,25 @@ def estimate(
     if second_moment == "linear":
         beta2 = zero
 
-    bessel = n / (n - 1)
-    m1 = mean_of(1, 0) - beta1 * mean_of(0, 1)  # of r1 = w − β₁L
-    q = mean_of(2, 0) - beta2 * mean_of(0, 2)  # of r2 = w² − β₂L²
-    m11 = mean_of(2, 0) - 2 * beta1 * mean_of(1, 1) + beta1**2 * mean_of(0, 2)
-    m12 = mean_of(3, 0) - beta1 * mean_of(2, 1) - beta2 * mean_of(1, 2) + beta1 * beta2 * mean_of(0, 3)
-    m22 = mean_of(4, 0) - 2 * beta2 * mean_of(2, 2) + beta2**2 * mean_of(0, 4)
-    var1 = np.maximum(m11 - m1**2, 0) * bessel
-    cov12 = (m12 - m1 * q) * bessel
-    var2 = np.maximum(m22 - q**2, 0) * bessel
-    one = Term(n, m1, q + beta2 * V, var1, cov12, var2)
+    def reduced(beta1: FloatArray, beta2: FloatArray) -> Term:
+        bessel = n / (n - 1)
+        m1 = mean_of(1, 0) - beta1 * mean_of(0, 1)  # of r1 = w − β₁L
+        q = mean_of(2, 0) - beta2 * mean_of(0, 2)  # of r2 = w² − β₂L²
+        m11 = mean_of(2, 0) - 2 * beta1 * mean_of(1, 1) + beta1**2 * mean_of(0, 2)
+        m12 = mean_of(3, 0) - beta1 * mean_of(2, 1) - beta2 * mean_of(1, 2) + beta1 * beta2 * mean_of(0, 3)
+        m22 = mean_of(4, 0) - 2 * beta2 * mean_of(2, 2) + beta2**2 * mean_of(0, 4)
+        var1 = np.maximum(m11 - m1**2, 0) * bessel
+        return Term(n, m1, q + beta2 * V, var1, (m12 - m1 * q) * bessel, np.maximum(m22 - q**2, 0) * bessel)
+
+    plain = reduced(zero, zero)
+    beta1 = np.where(_helps(reduced(beta1, zero).variance, plain.variance, n), beta1, 0.0)
+    beta2 = np.where(
+        _helps(_scatter_of_variance(reduced(beta1, beta2)), _scatter_of_variance(reduced(beta1, zero)), n), beta2, 0.0
+    )
+    one = reduced(beta1, beta2)
     _, _, _, variance_error = _sums([one])
     found = combine(reference, [one], beta1, beta2)
 
-    plain1 = np.maximum(mean_of(2, 0) - mean_of(1, 0) ** 2, 0) * bessel
-    w1, w2 = mean_of(1, 0), mean_of(2, 0)
-    plain_variance = (mean_of(4, 0) - w2**2 - 4 * w1 * (mean_of(3, 0) - w1 * w2) + 4 * w1**2 * (w2 - w1**2)) * bessel
     return Moments(
         mean=found.mean,
         mean_error=found.mean_error,
@@ -246,8 +269,8 @@ def estimate(
         std_error=found.std_error,
         coefficient=found.coefficient,
         second_coefficient=found.second_coefficient,
-        variance_ratio=ratio(plain1, var1, empty=1.0),
-        std_variance_ratio=ratio(plain_variance, n * variance_error**2, empty=1.0),
+        variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
+        std_variance_ratio=ratio(_scatter_of_variance(plain), n * variance_error**2, empty=1.0),
     )
 
 
@@ -275,9 +298,10 @@ def estimate_from_replicates(
     expected
         E[C] and E[D] (…).
     coefficient
-        β = 1, or the slope of the regression over the replicates: not the points but the replicates say what is left
-        for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20 (2005) 1–31). Its errors count the
-        fitted slopes and the distance of the controls from what is expected, as in any regression; R > 3.
+        β = 1, or 0 for a control that does not help; or the slope of the regression over the replicates: not the points
+        but the replicates say what is left for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20
+        (2005) 1–31). Its errors count the fitted slopes and the distance of the controls from what is expected, as in
+        any regression; R > 3.
 
     Returns
     -------
@@ -295,7 +319,13 @@ def estimate_from_replicates(
         else:
             beta1, leverage1 = _regression(w, c)
             beta2, leverage2 = _regression(square, d)
-        w, square = w - beta1 * c, square - beta2 * d
+        helps = _helps(_scatter(w - beta1 * c), _scatter(w), R)
+        beta1, leverage1 = np.where(helps, beta1, 0.0), np.where(helps, leverage1, 0.0)
+        w = w - beta1 * c
+        moved = 2 * w.mean(axis=0) * w
+        helps = _helps(_scatter(square - beta2 * d - moved), _scatter(square - moved), R)
+        beta2, leverage2 = np.where(helps, beta2, 0.0), np.where(helps, leverage2, 0.0)
+        square = square - beta2 * d
     fitted = int(expected is not None and coefficient == "optimal")
     m1 = w.mean(axis=0)
     mean_variance = _scatter(w) / (R - 1 - fitted) * (1 / R + leverage1)

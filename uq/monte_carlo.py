@@ -12,7 +12,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
 from uq.coordinates import Coordinates
-from uq.doubts import influences, of_tails
+from uq.doubts import influences, of_control, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.findings import add
 from uq.inputs import Inputs
@@ -234,6 +234,8 @@ def _dataset(
     dataset.attrs["stopped"] = stopped
     values, moved = evaluations.outputs[ok], None
     if control is not None:
+        if control[1] == "quadratic":
+            add(dataset, *of_control(evaluate.outputs, "tangent", scalars))
         first = values - centre.middle
         predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
         moved = influences(

@@ -8,7 +8,7 @@ their scatter gives an honest standard error without any assumption on the smoot
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
-from uq.doubts import influences, of_tails
+from uq.doubts import influences, of_control, of_tails
 from uq.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.field_regression import Deviations, fit_deviations
 from uq.findings import add
@@ -34,7 +34,7 @@ from uq.moments import (
     ratio,
 )
 from uq.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
-from uq.regression import FULL, ROWS_PER_TERM
+from uq.regression import FULL, ROWS_PER_TERM, beyond
 from uq.sampling import check_scrambles, power_of_two, sobol_points
 from uq.taylor import Control, expansion, held_expansion, quadratic, tangent
 
@@ -219,6 +219,7 @@ class QuasiMonteCarlo(MonteCarlo):
         )
         if self.control != "none":
             dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
+            add(dataset, *of_control(evaluate.outputs, self.control, scalars))
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
         add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, samples.influences(scalars)))
@@ -364,7 +365,25 @@ class _Samples:
         controls, expected = self._controls(each) or (None, None)
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
-        return estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
+        found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
+        unseen = np.where(found.second_coefficient == 0, 0.0, self._unseen(each))
+        return replace(found, std_error=np.hypot(found.std_error, unseen))
+
+    def _unseen(self, each: int) -> FloatArray:
+        """Error (m,) of the standard deviation from where a polynomial controls what no sample has seen.
+
+        With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
+        about 2λ√b σ, with λ in proportion to that at the samples, which have 1 − b of the variance. A tangent does not
+        grow faster than what it stands for.
+        """
+        control = self._control
+        controls = self._controls(each)
+        if control is None or controls is None or self._method.control == "tangent":
+            return np.zeros(self.outputs.shape[2])
+        ok = self.ok[:, :each]
+        outside = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
+        left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
+        return np.asarray(left.std(axis=0) * np.sqrt(outside) / np.maximum(1 - outside, 1 / ok.sum()))
 
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""

@@ -13,7 +13,7 @@ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, SolveError
 from uq.basis import Basis, IntArray, by_degree, hyperbolic, hyperbolic_count, orthonormal
-from uq.doubts import influences, of_expansion, of_tails
+from uq.doubts import influences, of_expansion, of_reach, of_tails
 from uq.evaluate import Evaluations
 from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
 from uq.moments import ONE_SIDED, Z, error_of_root
+from uq.sampling import sobol_points
 
 BoolArray = NDArray[np.bool_]
 TRUNCATIONS = (0.5, 0.75, 1.0)
@@ -39,6 +40,7 @@ LIKELY = 24  # functions whose inner products are found together
 ROUGH = 0.1  # relative leave-one-out error above which the mean is no better known than the samples say
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 NOTHING = 0.8  # the same, above which a fit says nothing of what the output depends on
+POINTS = 4096  # at which an expansion says where its variance comes from
 PATIENCE = 30  # functions that may be selected without a gain before the selection ends
 
 
@@ -467,6 +469,20 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, reference
 
 
+def beyond(
+    inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Share (m,) of the variance of functions times coefficients (P, m) from where tails pass all points (n, d)."""
+    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    if not tails.any():
+        return np.zeros(coefficients.shape[1])
+    drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(tails)))
+    outside = (((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails).any(axis=1)
+    values = functions(drawn) @ coefficients
+    squares = (values - values.mean(axis=0)) ** 2
+    return shares(squares[outside].sum(axis=0), squares.sum(axis=0))
+
+
 @dataclass(frozen=True)
 class Regression:
     """A fit to samples and what it was chosen from.
@@ -519,7 +535,12 @@ class Regression:
     def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
         """Return what follows from the coefficients, by output, with standard errors."""
         cautious = None in [m.support for m in self.inputs.marginals.values()]
-        return _estimates(self.fit, self.largest.indices, self.data, cautious=cautious, of=of)
+        return _estimates(self.fit, self.largest.indices, self.data, self.beyond if cautious else None, of)
+
+    @property
+    def beyond(self) -> FloatArray:
+        """Share (m,) of the variance of the fit from where there are no samples."""
+        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)
 
     @property
     def controlled(self) -> BoolArray:
@@ -530,6 +551,7 @@ class Regression:
         """Find what speaks against the estimates of these outputs."""
         n = len(self.data.points)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
+        yield from of_reach(names, self.beyond, self.fit.relative, n)
         if np.ptp(self.data.weights) == 0:
             which = np.flatnonzero(self.controlled)
             first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
@@ -541,7 +563,9 @@ class Regression:
             )
 
 
-def _estimates(fit: Fit, largest: IntArray, data: Data, *, cautious: bool, of: Analysis) -> dict[str, FloatArray]:
+def _estimates(
+    fit: Fit, largest: IntArray, data: Data, outside: FloatArray | None, of: Analysis
+) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples and by what it leaves.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
@@ -560,8 +584,9 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, *, cautious: bool, of: A
     those of the fit (docs/decisions/0009-claims-of-expansions.md).
 
     Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
-    there, `cautious`, its norm λ is added: λ for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and λ/√n for the
-    mean, which keeps the jackknife. (Without, intervals of functions of normal and gamma parameters covered 60 %
+    there its norm is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the mean, which keeps
+    the jackknife. Samples know it as λ; they are where 1 − b of the variance is, b the share `outside` them, and in
+    proportion it is λ/(1 − b). (Without, intervals of functions of normal and gamma parameters covered 60 %
     instead of 95 %.)
 
     Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
@@ -572,7 +597,8 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, *, cautious: bool, of: A
     groups, n = len(fit.without), len(fit.unseen)
     seen = _unseen(fit, largest, data)
     trusted = fit.relative <= TRUSTED
-    tails = fit.loo if cautious else np.zeros_like(fit.loo)
+    cautious = outside is not None
+    tails = np.zeros_like(fit.loo) if outside is None else fit.loo / np.maximum(1 - outside, 1 / n)
     bias = shares(fit.loo**2, 2 * central["std"])
     whole: FloatArray = np.where(trusted, central["std"], seen["std"])
     share = shares(fit.loo**2, whole**2)
