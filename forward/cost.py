@@ -28,10 +28,10 @@ ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never tou
 ASSEMBLY = {
     ("hexahedron", 1): 1.4e-5,
     ("hexahedron", 2): 2.4e-4,
-    ("tetrahedron", 1): 1.5e-6,
+    ("tetrahedron", 1): 2.9e-6,
     ("tetrahedron", 2): 2.3e-5,
 }
-RESIDUAL = {("hexahedron", 1): 7e-7, ("hexahedron", 2): 5e-6, ("tetrahedron", 1): 2e-7, ("tetrahedron", 2): 8e-7}
+RESIDUAL = {("hexahedron", 1): 1.2e-6, ("hexahedron", 2): 5e-6, ("tetrahedron", 1): 2e-7, ("tetrahedron", 2): 8e-7}
 OF_PRESSURES = 1.25  # of an assembly with pressures over one without
 PER_ENTRY, PER_OPERATION = 1.6e-8, 4.4e-11  # of a factorisation
 PER_NONZERO = 6e-8  # of the matrix and the analysis before the first factorisation
