@@ -18,7 +18,7 @@
 # `TISSUQ_INVERSION=results/stiffness-field` shows the whole one.
 #
 # So coarse a mesh errs by more than the data do. The size of the errors is therefore inferred too, by
-# `method.noise`; the sentence below, which also stands at the head of the report, says whether that was enough.
+# `method.noise`; the findings below, which also stand at the head of the report, say whether that was enough.
 
 # %%
 # %matplotlib inline
@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
+from uq.findings import findings
 from workflows import inversion_report, plots
 from workflows.config import load
 from workflows.results import read_dataset
@@ -40,7 +41,7 @@ if not (directory / "results.nc").exists():
     run(load(CONFIGS / "stiffness-field.toml", coarse), "field", directory, quiet=True)
 data = read_dataset(directory)
 one = data.isel(data_set=0)
-print(*inversion_report.findings(data), sep="\n")
+print(*(f"{one.severity}: {one.text}" for one in findings(data)), sep="\n")
 
 # %% [markdown]
 # ## What was found

@@ -133,7 +133,7 @@ def test_patch_of_distorted_cells(corners, cell, degree):
         for c in "xyz"
     )
     outputs = ({"kind": "volume-change", "name": "V"}, {"kind": "strain-energy", "name": "W"}, *points)
-    spec = body_of(corners, cell, degree, clamp=tuple(FACES), outputs=outputs)
+    spec = body_of(corners, cell, degree, clamp=tuple(FACES), outputs=outputs, formulation="displacement")
     body = MovedBoundary(spec, MPI.COMM_SELF, ())
     body.set_parameters(np.empty(0))
     body.at_load(1.0)

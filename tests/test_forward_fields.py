@@ -9,6 +9,7 @@ from mpi4py import MPI
 from forward.conformance import check_derivatives
 from forward.fields import ROBIN, Matern, RandomField, correlation
 from forward.geometry import Block, Box
+from forward.model import Stability
 from tests.bodies import loaded_body
 from tests.launch import run_script
 from uq import linearisation
@@ -238,7 +239,7 @@ def shared(ensemble):
     def task(evaluate):
         centre = linearise(inputs, evaluate)
         points = inputs.points(random_points(0, 0, 6, len(inputs.names)))
-        fields = _JointMoments(centre.point, centre.state, centre.slopes)
+        fields = _JointMoments(inputs.coordinates, centre.state, centre.slopes)
         found = evaluate(Request(points, tangents=True, fields=fields, start=centre.prediction))
         assert found.ok.all(), found.failures
         return {"outputs": found.outputs, "tangents": found.tangents, "fields": found.fields}
@@ -377,7 +378,9 @@ def test_samples_are_corrected_from_the_state_at_the_mean(noisy, monkeypatch):
     assert len(prediction.slopes) == 0
     found = evaluate(Request(study.inputs.points(random_points(0, 0, 8, 20)), tangents=True, start=prediction))
     assert found.ok.all()
-    assert (found.work[:, 2] == 0).all()  # no factorisation
+    # No factorisation but where negative eigenvalues are counted.
+    assert (found.work[:, 2] == (found.stability == Stability.COUNTED)).all()
+    assert (found.work[:, 2] == 0).any()
     plain = evaluate(Request(found.points, tangents=True))
     np.testing.assert_allclose(found.outputs, plain.outputs, rtol=1e-7)
     np.testing.assert_allclose(found.tangents, plain.tangents, atol=1e-5 * np.abs(plain.tangents).max())
