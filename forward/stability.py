@@ -7,7 +7,7 @@ lowest natural modes, the combination x with the smallest Rayleigh quotient xᵀ
 inverse iteration, z = K̄⁻¹Kx, and the smallest quotient of both is an upper bound for the lowest eigenvalue of K over
 that of K̄: 1 at the reference, negative where the screen has *found* an instability. What it does not find may still be
 there, so states with small quotients are counted, as are those whose stiffness does not resemble K̄ in these vectors,
-and others at random (docs/decisions/0008-stability.md).
+and others at random (docs/decisions/0010-stability.md).
 
 Natural modes alone see nothing of a compressed block, of an arch, or of a cantilever that buckles sideways.
 

@@ -5,7 +5,7 @@ closed forms, or Gauss rules around a point of the distribution, so that none is
 Chaospy's own hold to six digits where there is no closed form, and not at all for beta(a, b) with a + b = 2, a ≠ b,
 and for normals that are cut beyond eight standard deviations.
 
-Polynomials are of the coordinate in which they converge (`logarithmic`), see docs/decisions/0008-coordinates.md.
+Polynomials are of the coordinate in which they converge (`logarithmic`), see docs/decisions/0009-coordinates.md.
 """
 
 from __future__ import annotations

@@ -581,7 +581,7 @@ def _estimates(
     with fits that have not seen them as controls (`_unseen`): half the distance to them counts as an error, and for the
     standard deviation the variance λ² that is left, λ the leave-one-out error. Above `ROUGH` their error counts for the
     mean, and above `TRUSTED` they take the place of
-    those of the fit (docs/decisions/0009-claims-of-expansions.md).
+    those of the fit (docs/decisions/0011-claims-of-expansions.md).
 
     Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
     there its norm is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the mean, which keeps
