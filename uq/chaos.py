@@ -23,7 +23,7 @@ from uq.findings import add
 from uq.indices import coefficient_moments, shares
 from uq.inputs import Inputs
 from uq.linearisation import Linearisation, linearise, local_dataset
-from uq.moments import Quantiles, Z, quantiles
+from uq.moments import Quantiles, Z, quantiles, student
 from uq.regression import (
     DICTIONARY,
     FULL,
@@ -46,6 +46,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
 GROWTH = 1.5  # of the design, from one look at the tolerance to the next
 DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
+QUARTERS = 4
 BINS = 80
 
 
@@ -272,9 +273,10 @@ def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tup
     uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
     drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
     central = np.quantile(drawn, method.quantiles, axis=0)
-    half = np.quantile(drawn[: len(drawn) // 2], method.quantiles, axis=0)
-    # No quantile moves by more than the function does; what half of the points say differs by more than all err.
-    error = np.hypot(fit.loo, central - half)
+    # No quantile moves by more than the function does. Quarters of the points are Sobol' points too.
+    quarters = [np.quantile(part, method.quantiles, axis=0) for part in np.split(drawn, QUARTERS)]
+    factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
+    error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
     found = Quantiles(central, central - Z * error, central + Z * error, error)
     if regression.controlled.any():
         rough = regression.controlled

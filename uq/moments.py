@@ -431,7 +431,7 @@ def quantiles_from_replicates(
     shares = np.array([below[:, replicate == name].mean(axis=1) for name in names])
     floor = R / len(values) / np.sqrt(12 * R)
     spread = np.maximum(shares.std(axis=0, ddof=1) / np.sqrt(R), floor)
-    t = _student(R - 1)
+    t = student(R - 1)
     return _between(values, p, (p * (1 - p))[:, None] / spread**2 * (Z / t) ** 2, t)
 
 
@@ -475,10 +475,11 @@ def _order_statistic(ordered: FloatArray, share: FloatArray) -> FloatArray:
 
 def half_width(dataset: xr.Dataset) -> float:
     """Standard errors on either side of a 95 % interval of results: more where they come from a few scrambles."""
-    return Z if "scramble" not in dataset else _student(int(dataset["scramble"].max()))
+    return Z if "scramble" not in dataset else student(int(dataset["scramble"].max()))
 
 
-def _student(freedom: int) -> float:
+def student(freedom: int) -> float:
+    """Return the standard errors on either side of a 95 % interval for so many degrees of freedom."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, ONE_SIDED))

@@ -26,7 +26,7 @@ from uq.doubts import influences, of_expansion, of_reach, of_tails
 from uq.evaluate import Evaluations
 from uq.indices import Analysis, coefficient_moments, shares
 from uq.inputs import Inputs
-from uq.moments import ONE_SIDED, Z, error_of_root
+from uq.moments import Z, error_of_root, student
 from uq.sampling import sobol_points
 
 BoolArray = NDArray[np.bool_]
@@ -634,15 +634,12 @@ def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
     With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and so for the square: unbiased for
     independent samples, however bad the fits are; where they are constants it is plain Monte Carlo.
     """
-    from scipy.special import stdtrit
-
     weights = (data.weights / data.weights.sum())[:, None]
     independent = 1 / (weights**2).sum()  # as many samples of equal weight know as much
-    student = float(stdtrit(max(len(data.values) - 1, 1), ONE_SIDED)) / Z
     first, second, reference = _unseen_samples(fit, largest, data)
     mean = (weights * first).sum(axis=0)
     second = second - 2 * mean * first + mean**2
-    scale = student / np.sqrt(max(independent - 1, 1))
+    scale = student(max(len(data.values) - 1, 1)) / Z / np.sqrt(max(independent - 1, 1))
     mean_error = scale * np.sqrt((weights * (first - mean) ** 2).sum(axis=0))
     variance = (weights * second).sum(axis=0)
     variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
