@@ -440,7 +440,7 @@ def point_weights(
     rank, how far it is from there (m). The rank that is nearest, and of several the first, has the point.
     """
     msh, comm = space.mesh, space.mesh.comm
-    lists = msh.geometry.dofmap
+    lists = msh.geometry.dofmap if _FIVE else msh.geometry.dofmaps[0]
     corners = lists.array.reshape(_cell_map(msh).size_local + _cell_map(msh).num_ghosts, -1) if _FIVE else lists
     found = locate(msh.geometry.x[np.asarray(corners)[: _cell_map(msh).size_local]], points)
     every = np.array(comm.allgather(found.distances))

@@ -377,9 +377,9 @@ class Beta(_Bounded):
         return np.asarray(btdtr(self.a, self.b, np.clip(u, 0.0, 1.0)))
 
     def _inverse(self, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        from scipy.special import btdtri
+        from scipy.special import betaincinv
 
-        u, rest = btdtri(self.a, self.b, p), btdtri(self.b, self.a, q)
+        u, rest = betaincinv(self.a, self.b, p), betaincinv(self.b, self.a, q)
         u, rest = np.where(p <= q, u, 1 - rest), np.where(p <= q, 1 - u, rest)
         with np.errstate(divide="ignore"):
             return u, self._log(u, rest)
