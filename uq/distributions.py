@@ -372,9 +372,9 @@ class Beta(_Bounded):
         return np.asarray(xlogy(self.a - 1, u) + xlogy(self.b - 1, rest) - betaln(self.a, self.b))
 
     def _cumulative(self, u: FloatArray) -> FloatArray:
-        from scipy.special import btdtr
+        from scipy.special import betainc
 
-        return np.asarray(btdtr(self.a, self.b, np.clip(u, 0.0, 1.0)))
+        return np.asarray(betainc(self.a, self.b, np.clip(u, 0.0, 1.0)))
 
     def _inverse(self, p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         from scipy.special import betaincinv
