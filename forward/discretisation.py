@@ -34,7 +34,7 @@ from forward.vertex_fields import VertexField
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
-VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖ / ‖∫q dX‖ that is rounding: J−1 is a difference of numbers near 1
+VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that is rounding, over displacements as a part of the body
 _OPS = SimpleNamespace(
     ln=ufl.ln,
     exp=ufl.exp,
@@ -43,10 +43,16 @@ _OPS = SimpleNamespace(
     sin=ufl.sin,
     cos=ufl.cos,
     atan2=fenicsx.atan2,
+    sinh=ufl.sinh,
     tr=ufl.tr,
     det=ufl.det,
+    inv=ufl.inv,
+    inner=ufl.inner,
+    outer=ufl.outer,
     positive=lambda x: ufl.max_value(x, 0.0),
+    near=lambda z, limit, inside, outside: ufl.conditional(ufl.lt(abs(z), limit), inside, outside),
 )
+_OPS.log1p, _OPS.expm1 = kinematics.log1p_of(_OPS), kinematics.expm1_of(_OPS)
 
 
 class Discretisation:
@@ -93,13 +99,9 @@ class Discretisation:
         self.J = ufl.det(self.F)
         self._fibres = [fenicsx.constant(self.mesh, unit) for unit in spec.fibres]
         self._of_stretches = "l1" in measures(spec.energy)
-        self._gradient = ufl.variable(self.F) if self._of_stretches else self.F
-        self._measures = self.measures_of(self._gradient)
-        if not self._of_stretches:
-            self._measures = {
-                name: tuple(map(ufl.variable, measure)) if name == "I4" else ufl.variable(measure)
-                for name, measure in self._measures.items()
-            }
+        self._gradient = ufl.variable(ufl.grad(self.u)) if self._of_stretches else ufl.grad(self.u)
+        self._deformation = kinematics.deformation(_OPS, self._gradient, ufl.Identity(3))
+        self._measures = self._measures_of_the_energy()
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._loads = self._virtual_works()
@@ -121,21 +123,26 @@ class Discretisation:
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
-    def measures_of(self, F: Any) -> dict[str, Any]:
-        """Return what the energy is a function of, by name, from a deformation gradient as UFL."""
+    def _measures_of_the_energy(self) -> dict[str, Any]:
+        """What the energy is a function of, by name, as variables of forms; those of stretches are of the gradient."""
+        names, at = measures(self.spec.energy), self._deformation
         if self._of_stretches:
-            stretches = kinematics.principal_stretches(_OPS, F, ufl.Identity(3))
-            return {**dict(zip(("l1", "l2", "l3"), stretches, strict=True)), "J": ufl.det(F)}
-        found = dict(zip(("I1", "I2", "J"), kinematics.invariants(ufl, F), strict=True))
-        fibres = {"I4": tuple(kinematics.fibre_stretch(ufl, F, fibre) for fibre in self._fibres)}
-        return found | fibres if self._fibres else found
+            strains = kinematics.principal_strains(_OPS, at)
+            logarithms = kinematics.isochoric([_OPS.log1p(strain) / 2 for strain in strains])
+            return dict(zip(("l1", "l2", "l3"), logarithms, strict=True)) | {"j": at.dilation}
+        found = {name: kinematics.measure(_OPS, name, at, self._fibres) for name in names}
+        return {
+            name: tuple(map(ufl.variable, value)) if isinstance(value, tuple) else ufl.variable(value)
+            for name, value in found.items()
+        }
 
-    def energy_of(self, measures: dict[str, Any]) -> Any:
-        """Energy density of its measures, as UFL; in the mixed form, without that of the change of volume."""
+    @cached_property
+    def energy(self) -> Any:
+        """Energy density; in the mixed form, without that of the change of volume."""
         values = self._material
         if self.p is not None:
             values["D1"] = 0
-        return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *measures.values(), **values)
+        return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *self._measures.values(), **values)
 
     @cached_property
     def _regions(self) -> dict[str, Any]:
@@ -190,24 +197,25 @@ class Discretisation:
         In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
         keeps its digits however small it is.
         """
-        energy, J, p = self.energy_of(self._measures), self._measures["J"], self._pressure
+        energy, j, p = self.energy, self._measures.get("j", self._deformation.dilation), self._pressure
         if p is None:
-            return energy, energy, self.J - 1
+            return energy, energy, self._deformation.dilation
         bulk = 2 * self.stiffness_factor * self._material["D1"]
         of_pressure = p**2 / (2 * bulk)
-        return energy + of_pressure, energy + p * (J - 1) - of_pressure, p / bulk
+        return energy + of_pressure, energy + p * j - of_pressure, p / bulk
+
+    def stress_of(self, density: Any) -> Any:
+        """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
+        if self._of_stretches:
+            return ufl.diff(density, self._gradient)
+        slopes = {name: ufl.diff(density, found) for name, found in self._measures.items() if name != "i4"}
+        of_fibres = [ufl.diff(density, longer) for longer in self._measures.get("i4", ())]
+        fibres = list(zip(self._fibres, of_fibres, strict=True)) if of_fibres else []
+        return kinematics.nominal_stress(_OPS, self.F, self._deformation, slopes, fibres)
 
     def _variation_of(self, density: Any) -> Any:
         """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
-        if self._of_stretches:
-            P = ufl.diff(density, self._gradient)
-        else:
-            found = self._measures
-            of_I1, of_I2, of_J = (ufl.diff(density, found[name]) for name in ("I1", "I2", "J"))
-            of_I4 = [ufl.diff(density, squared) for squared in found.get("I4", ())]
-            fibres = list(zip(self._fibres, of_I4, strict=True))
-            P = kinematics.nominal_stress(ufl, self.F, (of_I1, of_I2, of_J), fibres)
-        work = ufl.inner(P, ufl.grad(self.test))
+        work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
         return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
 
     def derivative(self, form: Any) -> Any:
@@ -479,7 +487,7 @@ class Discretisation:
         scale = float(self._load.value) * self._external
         if self._moves:
             scale = max(scale, fixed)
-        return Residual(r, free, scale, apart, self._force_of(lacking))
+        return Residual(r, free, scale, apart, self._force_of(lacking, u))
 
     @contextmanager
     def time_limit(self, seconds: float | None) -> Iterator[None]:
@@ -498,29 +506,43 @@ class Discretisation:
             message = f"the solve took longer than solve_seconds = {seconds:g}"
             raise SolveError(message, work=self.work)
 
-    def _force_of(self, lacking: float) -> float:
+    def _force_of(self, lacking: float, u: FloatArray) -> float:
         """Force (N) of volumes (m³) that are out of balance; volumes that are rounding have none."""
-        if self.p is None or lacking <= VOLUME_ROUNDING * self._volumes_size:
+        if self.p is None:
             return 0.0
-        return lacking * self._force_per_volume()
+        strained = min(1.0, self.norm(u) / self._extent)
+        return 0.0 if lacking <= VOLUME_ROUNDING * strained * self._volumes_size else lacking * self._force_per_volume()
+
+    @cached_property
+    def _extent(self) -> float:
+        """Norm of the distances (m) of the nodes from their mean: what displacements are compared with."""
+        places = fenicsx.node_coordinates(self.space)
+        count, *sums = self.total(np.array([len(places), *places.sum(axis=0)])).tolist()
+        return self.norm(self.with_pressures((places - np.array(sums) / count).ravel()))
 
     def rounding(self, u: FloatArray, scale: float) -> float:
         """What the size of a residual with this scale (N) cannot be expected to fall below at u (U_local,).
 
-        Stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ without loads, where δX is a small stretch (more
-        of them where it is along one axis only). In a body that is turned or strained far, the last digits of u weigh
-        more: ‖F(u (1 ± ε)) − F(u)‖, of which so much counts as still leaves four digits of the loads.
+        Measures keep their digits however small u is, so that what its last digits weigh is what rounding leaves:
+        ‖F(u (1 ± ε)) − F(u)‖, of which so much counts as still leaves four digits of the loads. A body without loads
+        has no such scale; there, stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ, where δX is a small
+        stretch (more of them where it is along one axis only).
         """
+        if scale == 0:
+            return self._rounding_without_loads()
+        last_digits = np.where(np.arange(self.size) % 2 == 0, 1.0, -1.0) * np.finfo(float).eps
+        change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
+        change[self.fixed] = 0
+        return min(2 * self.norm(change), 1e-4 * scale)
+
+    def _rounding_without_loads(self) -> float:
         if self._rounding is None:
             load = self._load.value.copy()
             self._load.value = 0.0
             few = 4 if self.p is None else 16
             self._rounding = few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
             self._load.value = load
-        last_digits = np.where(np.arange(self.size) % 2 == 0, 1.0, -1.0) * np.finfo(float).eps
-        change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
-        change[self.fixed] = 0
-        return max(self._rounding, min(2 * self.norm(change), 1e-4 * scale))
+        return self._rounding
 
     def on_target(self, u: FloatArray) -> FloatArray:
         """Return u (U_local,) with the prescribed unknowns at their targets."""

@@ -24,7 +24,8 @@ from annotated_types import Gt
 from pydantic import Field, model_validator
 
 from forward.admissible import objection
-from forward.materials import MATERIALS, constants, measured, measures
+from forward.kinematics import dilation_of, of_stretches
+from forward.materials import MATERIALS, constants, measures
 from forward.model import FloatArray, FunctionModel, FunctionSolution, InadmissibleError, Reference, SolveError
 from forward.settings import Settings
 
@@ -219,24 +220,37 @@ class HomogeneousModel:
 
 
 class _Kinematics(NamedTuple):
-    """Stretches of a mode with x prescribed, z prescribed across and y free; y where the volume does not change."""
+    """Stretches of a mode with x prescribed, z prescribed across and y free; y where the volume does not change.
+
+    All stretches stand less one, so that small ones keep their digits; in simple shear, x is the amount of shear.
+    """
 
     stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of sympy, x, z, y
-    incompressible: Callable[[Any, Any], Any] | None  # of x, z; nothing is free where there is none
+    incompressible: Callable[[Any, Any, Any], Any] | None  # of sympy, x, z; nothing is free where there is none
     share: int = 1  # prescribed stretches that are x
     alike: tuple[tuple[int, int], ...] = ()  # directions in which the specimen is stretched alike, and so must be made
 
 
 _MODES: dict[str, _Kinematics] = {
-    "uniaxial": _Kinematics(lambda ops, x, z, y: (x, y, y), lambda x, z: x ** (-0.5), alike=((1, 2),)),
-    "equibiaxial": _Kinematics(lambda ops, x, z, y: (x, x, y), lambda x, z: x ** (-2.0), share=2, alike=((0, 1),)),
-    "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),
-    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda x, z: 1 / (x * z)),  # z = 1
-    # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
-    "simple-shear": _Kinematics(
-        lambda ops, x, z, y: (ops.sqrt(1 + x**2 / 4) + x / 2, ops.sqrt(1 + x**2 / 4) - x / 2, 1), None
+    "uniaxial": _Kinematics(
+        lambda ops, x, z, y: (x, y, y),
+        lambda ops, x, z: -x / (ops.sqrt(1 + x) * (1 + ops.sqrt(1 + x))),
+        alike=((1, 2),),
     ),
+    "equibiaxial": _Kinematics(
+        lambda ops, x, z, y: (x, x, y), lambda ops, x, z: -x * (2 + x) / (1 + x) ** 2, share=2, alike=((0, 1),)
+    ),
+    "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda ops, x, z: -(x + z + x * z) / ((1 + x) * (1 + z))),
+    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda ops, x, z: -(x + z + x * z) / ((1 + x) * (1 + z))),
+    # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
+    "simple-shear": _Kinematics(lambda ops, x, z, y: (_sheared(ops, x) + x / 2, _sheared(ops, x) - x / 2, 0), None),
 }
+
+
+def _sheared(ops: Any, gamma: Any) -> Any:
+    """√(1 + γ²/4) − 1."""
+    return gamma**2 / 4 / (1 + ops.sqrt(1 + gamma**2 / 4))
+
 
 Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray, FloatArray]]
 
@@ -247,7 +261,7 @@ def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]])
     Where a face is free, the material must be alike on both sides of each plane of the mode (reflections leave the
     families of fibres as they are, up to their sign), and in the directions that are stretched alike.
     """
-    if ("I4" in measures(energy)) != bool(fibres):
+    if ("i4" in measures(energy)) != bool(fibres):
         return f"material '{energy}': {'expected fibres' if not fibres else 'has no fibres'}"
     if mode == "simple-shear" or not fibres:
         return None
@@ -285,91 +299,192 @@ def reading(
     component, cauchy
         Which stress, as of `MaterialTest`.
     """
-    import sympy
-
     kinematics = _MODES[mode]
-    x = sympy.Symbol("x", real=True, positive=None if mode == "simple-shear" else True)
-    z, y = sympy.symbols("z y", positive=True)
-    theta = dict(zip(names, sympy.symbols(names, real=True), strict=True))
     confined = kinematics.incompressible is None
     incompressible = "D1" in constants(MATERIALS[energy]) and "D1" not in names
-    values = theta if not incompressible else theta | {"D1": sympy.Integer(0)}
-    a, b, c = stretches = kinematics.stretches(sympy, x, z, y)
-    J = sympy.Integer(1) if incompressible or confined else a * b * c
-    squared = tuple(
-        (f + x * g) ** 2 + g**2 + h**2 if confined else (a * f) ** 2 + (b * g) ** 2 + (c * h) ** 2 for f, g, h in fibres
-    )
-    W = MATERIALS[energy](_operators(), *measured(energy, stretches, J, squared).values(), **values)
-    if incompressible and kinematics.incompressible is not None:
-        W = W.subs(y, _exact(kinematics.incompressible(x, z)))
-    along, across = W.diff(x) / kinematics.share, W.diff(z)
-    if cauchy and not confined:
-        along, across = along * x / J, across * z / J
-    P = {"P1": along, "P2": across, "P1-P2": along - across}[component]
-    if mode == "pure-shear":
-        W, P = W.subs(z, 1), P.subs(z, 1)
-
-    def compiled(expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
-        symbols = [x, z, y, *theta.values()]
-        function: Callable[..., Sequence[Any]] = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
-        return function
-
     free = not incompressible and not confined
-    # Beyond where an energy ends, its derivatives may be numbers.
-    defined, value, slope = compiled([W]), compiled([P]), compiled([P, *(P.diff(s) for s in theta.values())])
-    if free:
-        g = W.diff(y)
-        balance = compiled([g, g.diff(y)])
-        others = compiled([P.diff(y), g.diff(y), *(g.diff(s) for s in theta.values())])
+    energies = _of_measures(energy, names, len(fibres))
+    ways = [_of_stretches(mode, name, incompressible=incompressible, fibres=fibres) for name in measures(energy)]
+    share = {"P1": (1, 0), "P2": (0, 1), "P1-P2": (1, -1)}[component]
+
+    def shares(x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[Any, Any, Any]:
+        """What the nominal stresses along x and z are multiplied by, and the relative slope of both along y."""
+        along, across = share[0] / kinematics.share, share[1]
+        if not cauchy or confined:
+            return along, across, 0.0
+        J = 1.0 if incompressible else 1 + dilation_of(kinematics.stretches(np, x, z, y))
+        both = 2 if mode == "uniaxial" else 1  # faces that are free
+        return along * (1 + x) / J, across * (1 + z) / J, 0.0 if incompressible else -both / (1 + y)
+
+    def balance(x: FloatArray, z: FloatArray, y: FloatArray, theta: FloatArray) -> tuple[Any, Any]:
+        """∂W/∂y and ∂²W/∂y²."""
+        m, _, _, by_y = _joined([way.first(x, z, y) for way in ways])
+        *_, by_yy = _joined([way.second(x, z, y) for way in ways])
+        _, by_m = energies.first(m, theta)
+        turned = [_sum(row, by_y) for row in energies.second(m, theta)]
+        return _sum(by_m, by_y), _sum(turned, by_y) + _sum(by_m, by_yy)
 
     def read(
         at: FloatArray, across: FloatArray, constants_: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray]:
         shape = np.broadcast_shapes(at.shape, constants_.shape[1:])
-        lateral = np.ones(shape)
+        x, z = (at, across - 1) if confined else (at - 1, across - 1)
+        y = np.zeros(shape)
         with np.errstate(all="ignore"):
-            if not confined:
-                assert kinematics.incompressible is not None
-                lateral = np.broadcast_to(kinematics.incompressible(at, across), shape)
+            if kinematics.incompressible is not None:
+                y = np.broadcast_to(kinematics.incompressible(np, x, z), shape)
             if free:
-                lateral = _lateral(lambda y: balance(at, across, y, *constants_), lateral)
-            arguments = (at, across, lateral, *constants_)
-            results = np.array([np.broadcast_to(r, shape) for r in (slope if derivatives else value)(*arguments)])
-            results = np.where(np.isfinite(defined(*arguments)[0]), results, np.nan)
-            stress, by_constant = results[0], results[1:]
-            if free and derivatives:
-                P_y, g_y, *g_theta = others(*arguments)
-                by_constant = by_constant - np.array([np.broadcast_to(P_y / g_y * g_t, shape) for g_t in g_theta])
-        return stress, by_constant
+                y = _lateral(lambda y: balance(x, z, y, constants_), y)
+            m, by_x, by_z, by_y = _joined([way.first(x, z, y) for way in ways])
+            W, by_m = energies.first(m, constants_)
+            a, b, slope = shares(x, z, y)
+            stress = a * _sum(by_m, by_x) + b * _sum(by_m, by_z)
+            # Beyond where an energy ends, its derivatives may be numbers.
+            stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
+            if not derivatives:
+                return stress, np.zeros((0, *shape))
+            mixed = energies.mixed(m, constants_)
+            found = [a * _sum(row, by_x) + b * _sum(row, by_z) for row in mixed]
+            if free:
+                by_xy, by_zy, by_yy = _joined([way.second(x, z, y) for way in ways])
+                turned = [_sum(row, by_y) for row in energies.second(m, constants_)]
+                g_y = _sum(turned, by_y) + _sum(by_m, by_yy)
+                along, aside = _sum(turned, by_x) + _sum(by_m, by_xy), _sum(turned, by_z) + _sum(by_m, by_zy)
+                by_lateral = a * along + b * aside + slope * stress
+                found = [one - by_lateral * _sum(row, by_y) / g_y for one, row in zip(found, mixed, strict=True)]
+            by_constant = np.array([np.broadcast_to(one, shape) for one in found]).reshape(len(names), *shape)
+        return stress, np.where(np.isfinite(stress), by_constant, np.nan)
 
     return read
 
 
+def _sum(left: Sequence[Any], right: Sequence[Any]) -> Any:
+    """Σ_i left_i right_i."""
+    return sum(a * b for a, b in zip(left, right, strict=True))
+
+
+class _Energies(NamedTuple):
+    """An energy W of measures m and constants θ: functions of (m, θ)."""
+
+    first: Callable[[Any, Any], tuple[Any, list[Any]]]  # W and ∂W/∂m
+    second: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂m∂m
+    mixed: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂θ∂m, for each θ
+
+
+@cache
+def _of_measures(energy: str, names: tuple[str, ...], families: int) -> _Energies:
+    import sympy
+
+    m: list[Any] = []
+    given: list[Any] = []
+    for name in measures(energy):
+        own = sympy.symbols([f"{name}_{k}" for k in range(families if name == "i4" else 1)])
+        m += own
+        given.append(tuple(own) if name == "i4" else own[0])
+    theta = sympy.symbols(names)
+    values = dict(zip(names, theta, strict=True))
+    if "D1" in constants(MATERIALS[energy]):
+        values.setdefault("D1", sympy.Integer(0))
+    W = MATERIALS[energy](_operators(), *given, **values)
+    slopes = [sympy.diff(W, one) for one in m]
+    first = _compiled([*m, *theta], [W, *slopes])
+    second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m])
+    mixed = _compiled([*m, *theta], [slope.diff(one) for one in theta for slope in slopes])
+    n = len(m)
+
+    def rows(found: Sequence[Any]) -> list[list[Any]]:
+        return [list(found[i : i + n]) for i in range(0, len(found), n)]
+
+    def value_and_slopes(m: Any, theta: Any) -> tuple[Any, list[Any]]:
+        value, *by_m = first(*m, *theta)
+        return value, by_m
+
+    return _Energies(
+        value_and_slopes, lambda m, theta: rows(second(*m, *theta)), lambda m, theta: rows(mixed(*m, *theta))
+    )
+
+
+class _Paths(NamedTuple):
+    """Measures m of a mode, as functions of its stretches (x, z, y) less one."""
+
+    first: Callable[[Any, Any, Any], list[list[Any]]]  # m, and its derivatives by x, z and y
+    second: Callable[[Any, Any, Any], list[list[Any]]]  # derivatives of that by y, by x, z and y
+
+
+def _joined(parts: Sequence[list[list[Any]]]) -> list[list[Any]]:
+    """Join the lists of several measures, each in its place."""
+    return [[one for found in same for one in found] for same in zip(*parts, strict=True)]
+
+
+@cache
+def _of_stretches(
+    mode: Mode, name: str, *, incompressible: bool, fibres: tuple[tuple[float, float, float], ...]
+) -> _Paths:
+    import sympy
+
+    kinematics, ops = _MODES[mode], _operators()
+    x, z, y = symbols = sympy.symbols("x z y")
+    across = y
+    if incompressible and kinematics.incompressible is not None:
+        across = kinematics.incompressible(sympy, x, z)
+    confined = kinematics.incompressible is None
+    e, f, g = stretches = kinematics.stretches(sympy, x, z, across)
+    dilation = sympy.Integer(0) if incompressible or confined else dilation_of(stretches)
+    longer = tuple(
+        2 * x * a * b + x**2 * b**2 if confined else e * (2 + e) * a**2 + f * (2 + f) * b**2 + g * (2 + g) * c**2
+        for a, b, c in fibres
+    )
+    known = of_stretches(ops, stretches, dilation, longer)
+    m = list(known[name]) if name == "i4" else [known[name]]
+    by_y = [sympy.diff(one, y) for one in m]
+    first = _compiled(symbols, [*m, *(sympy.diff(one, way) for way in (x, z) for one in m), *by_y])
+    second = _compiled(symbols, [one.diff(way) for way in (x, z, y) for one in by_y])
+    n = len(m)
+
+    def rows(found: Sequence[Any]) -> list[list[Any]]:
+        return [list(found[i : i + n]) for i in range(0, len(found), n)]
+
+    return _Paths(lambda *at: rows(first(*at)), lambda *at: rows(second(*at)))
+
+
+def _compiled(symbols: Sequence[Any], expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
+    import sympy
+
+    function: Callable[..., Sequence[Any]] = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
+    return function
+
+
 def _operators() -> SimpleNamespace:
     import sympy
+    from sympy.codegen.cfunctions import expm1, log1p
 
     def positive(x: Any) -> Any:
         return sympy.Piecewise((x, x > 0), (0, True))
 
-    return SimpleNamespace(ln=sympy.log, exp=sympy.exp, sqrt=sympy.sqrt, positive=positive)
+    def near(z: Any, limit: float, inside: Any, outside: Any) -> Any:
+        return sympy.Piecewise((inside, z**2 < limit**2), (outside, True))
 
-
-def _exact(expression: Any) -> Any:
-    """Powers with exponents such as −1/2 as exact numbers, so that SymPy can combine them."""
-    import sympy
-
-    return sympy.nsimplify(expression)
+    return SimpleNamespace(
+        ln=sympy.log,
+        log1p=log1p,
+        exp=sympy.exp,
+        expm1=expm1,
+        sinh=sympy.sinh,
+        sqrt=sympy.sqrt,
+        positive=positive,
+        near=near,
+    )
 
 
 def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
-    """Solve ∂W/∂y = 0 by Newton's method in ln y, in steps of at most a factor of two; NaN where it does not settle."""
+    """Solve ∂W/∂y = 0 by Newton's method in ln(1 + y), in steps of at most a factor of two; NaN where none settles."""
     y = np.array(start)
     for _ in range(ITERATIONS):
         g, g_y = balance(y)
-        # At the minimum of W(ln y) the slope of y g is y² g_y + y g; away from it |·| keeps the direction downhill.
-        curvature = np.abs(y * y * g_y + y * g)
-        step = np.clip(-y * g / curvature, -np.log(2), np.log(2))
-        y = y * np.exp(step)
+        # At the minimum of W the slope of (1+y) g is (1+y)² g_y + (1+y) g; away from it |·| keeps the way downhill.
+        curvature = np.abs((1 + y) ** 2 * g_y + (1 + y) * g)
+        step = np.clip(-(1 + y) * g / curvature, -np.log(2), np.log(2))
+        y = y + (1 + y) * np.expm1(step)
         if np.nanmax(np.abs(step), initial=0.0) < ROUNDED:
             break
     return np.where(np.abs(step) < 1e-8, y, np.nan)

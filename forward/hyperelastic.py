@@ -51,7 +51,7 @@ else:
             tuple(
                 create_model(
                     energy.__name__.title().replace("_", ""),
-                    __base__=_Fibrous if "I4" in measures(energy) else Settings,
+                    __base__=_Fibrous if "i4" in measures(energy) else Settings,
                     __doc__=energy.__doc__,
                     kind=(Literal[name], name),
                     **{

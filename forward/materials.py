@@ -1,15 +1,25 @@
 """Strain energies of hyperelastic materials: one plain function each.
 
-A function takes the operators `ops` (``ln``, ``exp``, ``sqrt``, ``positive``: the larger of x and 0), measures of the
-deformation by their names in `measures`, and its constants as keyword-only arguments. UFL reads it for finite elements,
-SymPy for closed forms. The names of the keyword-only arguments *are* the names of the parameters in studies and
-results, and their annotations are the units, and the values with which there is an energy; which ones together make a
-material that is stable at rest is said in `forward.admissible`. All energies are in J/m³ and vanish, with
-their stress, in the undeformed body.
+A function takes the operators `ops` (``ln``, ``log1p``, ``exp``, ``expm1``, ``sinh``, ``sqrt``; ``positive``: the
+larger of x and 0; ``near``: one or another as |z| is below a limit or not), measures of the deformation by their names,
+and its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The names of the
+keyword-only arguments *are* the names of the parameters in studies and results, and their annotations are the units,
+and the values with which there is an energy; which ones together make a material that is stable at rest is said in
+`forward.admissible`. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
+
+Measures vanish in the undeformed body, and `forward.kinematics` computes them from ∇u without a difference of numbers
+near one. An energy is written so that it is none either: it keeps its digits however small the strains are.
+
+    i1, i2      Ī1 − 3 and Ī2 − 3, with Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2
+    j           J − 1
+    l1, l2, l3  ln λ̄_i, with λ̄_i = J^(−1/3) λ_i; their sum is zero
+    i4          the tuple of I4_f − 1 of the families f of fibres
+    trace       tr E, with E = (C − I)/2
+    square      E:E
 
 An energy that splits into an isochoric and a volumetric part has a constant called D1, and its volumetric part is
-exactly D1(J−1)²: with D1 = 0 it is the isochoric part, of Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2 and λ̄_i = J^(−1/3) λ_i,
-and of fibres. No other energy may call a constant D1.
+exactly D1(J−1)²: with D1 = 0 it is the isochoric part, of i1, i2, l1, l2 and l3, and of fibres. No other energy may
+call a constant D1.
 """
 
 from __future__ import annotations
@@ -22,87 +32,98 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 from annotated_types import Ge, Gt, Unit
 
+from forward.kinematics import atanh_rest, dilation_of, expm1_of, log1p_of, of_stretches
+
 Number = Annotated[Any, Unit("Pa")]
 NonNegative = Annotated[Any, Ge(0), Unit("Pa")]
 Ratio = Annotated[Any, Unit("1")]
 PositiveRatio = Annotated[Any, Gt(0), Unit("1")]
 
 
-def mooney_rivlin(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Number, C2: Number, D1: Number) -> Any:
+def mooney_rivlin(ops: Any, i1: Any, i2: Any, j: Any, *, C1: Number, C2: Number, D1: Number) -> Any:
     """Compressible Mooney–Rivlin: W = C1(Ī1−3) + C2(Ī2−3) + D1(J−1)².
 
     Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2; C1, C2, D1 in Pa. Small strain: μ = 2(C1+C2), κ = 2 D1.
     Source: R. S. Rivlin, Phil. Trans. R. Soc. A 241 (1948) 379–397.
     """
-    return C1 * (J ** (-2 / 3) * I1 - 3) + C2 * (J ** (-4 / 3) * I2 - 3) + D1 * (J - 1) ** 2
+    return C1 * i1 + C2 * i2 + D1 * j**2
 
 
-def neo_hookean(ops: Any, I1: Any, I2: Any, J: Any, *, C1: Number, D1: Number) -> Any:
+def neo_hookean(ops: Any, i1: Any, j: Any, *, C1: Number, D1: Number) -> Any:
     """Neo-Hookean with isochoric split: W = C1(Ī1−3) + D1(J−1)².
 
     C1, D1 in Pa. Small strain: μ = 2 C1, κ = 2 D1.
     """
-    return C1 * (J ** (-2 / 3) * I1 - 3) + D1 * (J - 1) ** 2
+    return C1 * i1 + D1 * j**2
 
 
-def neo_hookean_coupled(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number, lmbda: Number) -> Any:
+def neo_hookean_coupled(ops: Any, i1: Any, j: Any, *, mu: Number, lmbda: Number) -> Any:
     """Coupled compressible neo-Hookean: W = μ/2 (I1−3) − μ ln J + λ/2 (ln J)².
 
-    mu, lmbda: the Lamé constants in Pa.
+    mu, lmbda: the Lamé constants in Pa. Written with I1 = J^(2/3) Ī1, and with what a change of volume alone leaves of
+    (I1−3)/2 − ln J: for y = J^⅓ and z = (y−1)/(y+1), by ln y = 2 artanh z, that is
+    3/2 (y²−1) − 3 ln y = 3/2 (y−1)² (y+3)/(y+1) − 6 (artanh z − z).
     Source: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), eq. 6.27.
     """
-    return mu / 2 * (I1 - 3) - mu * ops.ln(J) + lmbda / 2 * ops.ln(J) ** 2
+    y = (1 + j) ** (1 / 3)
+    h = j / (1 + y + y**2)  # y − 1
+    volume = 3 / 2 * h**2 * (y + 3) / (y + 1) - 6 * atanh_rest(ops, h / (2 + h))
+    return mu / 2 * y**2 * i1 + mu * volume + lmbda / 2 * ops.log1p(j) ** 2
 
 
-def yeoh(ops: Any, I1: Any, I2: Any, J: Any, *, C10: Number, C20: Number, C30: Number, D1: Number) -> Any:
+def yeoh(ops: Any, i1: Any, j: Any, *, C10: Number, C20: Number, C30: Number, D1: Number) -> Any:
     """Yeoh: W = C10(Ī1−3) + C20(Ī1−3)² + C30(Ī1−3)³ + D1(J−1)².
 
     C10, C20, C30, D1 in Pa; C20 is negative for materials that soften before they stiffen. Small strain: μ = 2 C10,
     κ = 2 D1.
     Source: O. H. Yeoh, Rubber Chem. Technol. 66 (1993) 754–771.
     """
-    shear = J ** (-2 / 3) * I1 - 3
-    return C10 * shear + C20 * shear**2 + C30 * shear**3 + D1 * (J - 1) ** 2
+    return C10 * i1 + C20 * i1**2 + C30 * i1**3 + D1 * j**2
 
 
-def gent(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number, Jm: PositiveRatio, D1: Number) -> Any:
+def gent(ops: Any, i1: Any, j: Any, *, mu: Number, Jm: PositiveRatio, D1: Number) -> Any:
     """Gent: W = −(μ Jm/2) ln(1 − (Ī1−3)/Jm) + D1(J−1)².
 
     mu, D1 in Pa; Jm is what Ī1−3 stays below: there the chains are stretched out, and beyond there is no energy (finite
     elements find NaN). Small strain: μ = mu, κ = 2 D1.
     Source: A. N. Gent, Rubber Chem. Technol. 69 (1996) 59–61.
     """
-    # Half the logarithm of x is that of √x, whose derivatives too are no numbers where x < 0; those of ln x are finite.
-    left = ops.sqrt(1 - (J ** (-2 / 3) * I1 - 3) / Jm)
-    return -mu * Jm * ops.ln(left) + D1 * (J - 1) ** 2
+    # −½ ln x is −ln √x = 2 artanh((1 − √x)/(1 + √x)), whose derivatives too are no numbers where x < 0: those of ln x
+    # are finite.
+    used = i1 / Jm
+    z = used / (1 + ops.sqrt(1 - used)) ** 2
+    return 2 * mu * Jm * (z + atanh_rest(ops, z)) + D1 * j**2
 
 
-def demiray(ops: Any, I1: Any, I2: Any, J: Any, *, a: Number, b: PositiveRatio, D1: Number) -> Any:
+def demiray(ops: Any, i1: Any, j: Any, *, a: Number, b: PositiveRatio, D1: Number) -> Any:
     """Demiray (isotropic Fung): W = a/(2b) (exp(b(Ī1−3)) − 1) + D1(J−1)².
 
     a, D1 in Pa; b is dimensionless. Small strain: μ = a, κ = 2 D1.
     Source: H. Demiray, J. Biomech. 5 (1972) 309–311.
     """
-    return a / (2 * b) * (ops.exp(b * (J ** (-2 / 3) * I1 - 3)) - 1) + D1 * (J - 1) ** 2
+    return a / (2 * b) * ops.expm1(b * i1) + D1 * j**2
 
 
-def saint_venant_kirchhoff(ops: Any, I1: Any, I2: Any, J: Any, *, lmbda: Number, mu: Number) -> Any:
+def saint_venant_kirchhoff(ops: Any, trace: Any, square: Any, *, lmbda: Number, mu: Number) -> Any:
     """Saint Venant–Kirchhoff: W = λ/2 (tr E)² + μ E:E with E = (C − I)/2.
 
-    lmbda, mu: the Lamé constants in Pa. tr E = (I1−3)/2 and E:E = (tr C² − 2 tr C + 3)/4 with tr C² = I1² − 2 I2.
+    lmbda, mu: the Lamé constants in Pa.
     For large rotations with small strains: under compression it softens until it collapses without resistance.
     Source: G. A. Holzapfel, Nonlinear Solid Mechanics (2000), section 6.5.
     """
-    return lmbda / 8 * (I1 - 3) ** 2 + mu / 4 * (I1**2 - 2 * I2 - 2 * I1 + 3)
+    return lmbda / 2 * trace**2 + mu * square
 
 
-def blatz_ko(ops: Any, I1: Any, I2: Any, J: Any, *, mu: Number) -> Any:
+def blatz_ko(ops: Any, i2: Any, j: Any, *, mu: Number) -> Any:
     """Blatz–Ko foam: W = μ/2 (I2/J² + 2J − 5).
 
-    mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4.
+    mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4. Written with I2 = J^(4/3) Ī2, and with what
+    a change of volume alone leaves: for y = J^⅓, 3/y² + 2y³ − 5 = (y−1)² (2y³ + 4y² + 6y + 3)/y².
     Source: P. J. Blatz, W. L. Ko, Trans. Soc. Rheol. 6 (1962) 223–251.
     """
-    return mu / 2 * (I2 / J**2 + 2 * J - 5)
+    y = (1 + j) ** (1 / 3)
+    h = j / (1 + y + y**2)  # y − 1
+    return mu / 2 * (i2 + h**2 * (2 * y**3 + 4 * y**2 + 6 * y + 3)) / y**2
 
 
 def ogden(
@@ -110,7 +131,7 @@ def ogden(
     l1: Any,
     l2: Any,
     l3: Any,
-    J: Any,
+    j: Any,
     *,
     mu1: Number,
     alpha1: Ratio,
@@ -123,18 +144,20 @@ def ogden(
     """Ogden with three terms: W = Σ_k μ_k/α_k (λ̄₁^α_k + λ̄₂^α_k + λ̄₃^α_k − 3) + D1(J−1)².
 
     λ̄_i = J^(−1/3) λ_i; mu1, mu2, mu3, D1 in Pa; the exponents are dimensionless and not zero, and μ_k α_k > 0 for each
-    term makes the energy convex. Small strain: μ = ½ Σ μ_k α_k, κ = 2 D1.
+    term makes the energy convex. Small strain: μ = ½ Σ μ_k α_k, κ = 2 D1. Since the logarithms l_i of λ̄_i have no sum,
+    with y = exp(−α l₃/2) a term is 4y sinh²(α (l₁−l₂)/4) + (y−1)² (2y+1)/y², a sum of squares.
     Source: R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565–584.
     """
-    scale = J ** (-1 / 3)
-    total = D1 * (J - 1) ** 2
+    total = D1 * j**2
     for mu, alpha in ((mu1, alpha1), (mu2, alpha2), (mu3, alpha3)):
-        total += mu / alpha * sum((scale * stretch) ** alpha - 1 for stretch in (l1, l2, l3))
+        h = ops.expm1(-alpha * l3 / 2)
+        y = 1 + h
+        total += mu / alpha * (4 * y * ops.sinh(alpha * (l1 - l2) / 4) ** 2 + h**2 * (2 * y + 1) / y**2)
     return total
 
 
 def holzapfel_gasser_ogden(
-    ops: Any, I1: Any, I2: Any, J: Any, I4: Any, *, c: Number, k1: NonNegative, k2: PositiveRatio, D1: Number
+    ops: Any, i1: Any, j: Any, i4: Any, *, c: Number, k1: NonNegative, k2: PositiveRatio, D1: Number
 ) -> Any:
     """Holzapfel–Gasser–Ogden: W = c/2 (Ī1−3) + Σ_f k1/(2 k2) (exp(k2 ⟨I4_f−1⟩²) − 1) + D1(J−1)².
 
@@ -144,8 +167,8 @@ def holzapfel_gasser_ogden(
     Source: G. A. Holzapfel, T. C. Gasser, R. W. Ogden, J. Elasticity 61 (2000) 1–48; I4 as in D. R. Nolan et al., J.
     Mech. Behav. Biomed. Mater. 39 (2014) 48–60.
     """
-    fibres = sum(ops.exp(k2 * ops.positive(squared - 1) ** 2) - 1 for squared in I4)
-    return c / 2 * (J ** (-2 / 3) * I1 - 3) + k1 / (2 * k2) * fibres + D1 * (J - 1) ** 2
+    fibres = sum(ops.expm1(k2 * ops.positive(longer) ** 2) for longer in i4)
+    return c / 2 * i1 + k1 / (2 * k2) * fibres + D1 * j**2
 
 
 Energy = Callable[..., Any]
@@ -165,16 +188,18 @@ MATERIALS: dict[str, Energy] = {
 
 
 _COMPLEX = SimpleNamespace(
-    ln=cmath.log, exp=cmath.exp, sqrt=cmath.sqrt, positive=lambda x: x if complex(x).real > 0 else 0.0
+    ln=cmath.log,
+    exp=cmath.exp,
+    sinh=cmath.sinh,
+    sqrt=cmath.sqrt,
+    positive=lambda x: x if complex(x).real > 0 else 0.0,
+    near=lambda z, limit, inside, outside: inside if abs(z) < limit else outside,
 )
+_COMPLEX.log1p, _COMPLEX.expm1 = log1p_of(_COMPLEX), expm1_of(_COMPLEX)
 
 
 def measures(energy: str | Energy) -> tuple[str, ...]:
-    """Return what an energy, or that of a kind of material, is a function of, by name and in its order.
-
-    I1 and I2 are invariants of C = FᵀF, J = det F; l1, l2, l3 are the principal stretches; I4 is the tuple of the
-    squared stretches of the families of fibres.
-    """
+    """Return what an energy, or that of a kind of material, is a function of, by name and in its order."""
     _, *names = (
         name
         for name, p in inspect.signature(_energy_of(energy)).parameters.items()
@@ -183,11 +208,11 @@ def measures(energy: str | Energy) -> tuple[str, ...]:
     return tuple(names)
 
 
-def measured(energy: str | Energy, stretches: tuple[Any, Any, Any], J: Any, I4: tuple[Any, ...] = ()) -> dict[str, Any]:
-    """Return the measures of an energy from principal stretches, J and the squared stretches of fibres."""
-    a, b, c = (stretch**2 for stretch in stretches)
-    known = dict(zip(("l1", "l2", "l3"), stretches, strict=True))
-    known |= {"I1": a + b + c, "I2": a * b + b * c + c * a, "J": J, "I4": I4}
+def measured(
+    energy: str | Energy, ops: Any, less_one: tuple[Any, Any, Any], dilation: Any, fibres: tuple[Any, ...] = ()
+) -> dict[str, Any]:
+    """Return the measures of an energy from principal stretches less one, J − 1, and the I4 − 1 of fibres."""
+    known = of_stretches(ops, less_one, dilation, fibres)
     return {name: known[name] for name in measures(energy)}
 
 
@@ -234,13 +259,14 @@ def small_strain_moduli(energy: str | Energy, values: Mapping[str, float]) -> tu
 
     def curvature(path: Callable[[complex], tuple[Any, Any, Any]], h: float) -> float:
         def slope(at: float) -> float:
-            a, b, c = stretches = path(complex(at, tiny))
-            return float(complex(W(_COMPLEX, *measured(W, stretches, a * b * c).values(), **values)).imag / tiny)
+            less_one = path(complex(at, tiny))
+            known = measured(W, _COMPLEX, less_one, dilation_of(less_one))
+            return float(complex(W(_COMPLEX, *known.values(), **values)).imag / tiny)
 
         return (8 * (slope(h) - slope(-h)) - slope(2 * h) + slope(-2 * h)) / (12 * h)
 
-    shear = curvature(lambda h: (cmath.exp(h), cmath.exp(-h), 1.0), 1e-3)
-    return shear / 4, curvature(lambda h: (1 + h, 1 + h, 1 + h), 1e-3) / 9
+    shear = curvature(lambda h: (_COMPLEX.expm1(h), _COMPLEX.expm1(-h), 0.0), 1e-3)
+    return shear / 4, curvature(lambda h: (h, h, h), 1e-3) / 9
 
 
 def _energy_of(energy: str | Energy) -> Energy:

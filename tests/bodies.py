@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import sympy as sp
+from sympy.codegen.cfunctions import expm1, log1p
 
 from forward import kinematics
 from forward.hyperelastic import Hyperelastic
@@ -57,6 +58,12 @@ SYMPY = SimpleNamespace(
     tr=sp.trace,
     det=lambda F: F.det(),
     inner=lambda a, b: (a.T * b)[0],
+    outer=lambda a, b: a * b.T,
+    inv=lambda A: A.inv(),
+    sinh=sp.sinh,
+    log1p=log1p,
+    expm1=expm1,
+    near=lambda z, limit, inside, outside: sp.Piecewise((inside, z**2 < limit**2), (outside, True)),
 )
 OUTPUTS = (
     {"kind": "max-displacement", "name": "largest"},
@@ -73,9 +80,9 @@ OUTPUTS = (
 
 def energy_density(kind, F, fibres=(), **constants):
     """Energy density by SymPy of a deformation gradient, in symbols or numbers; not of principal stretches."""
-    known = dict(zip(("I1", "I2", "J"), kinematics.invariants(SYMPY, F), strict=True))
-    known["I4"] = tuple(kinematics.fibre_stretch(SYMPY, F, sp.Matrix(fibre)) for fibre in fibres)
-    return LAWS[kind](SYMPY, *(known[name] for name in measures(kind)), **constants)
+    at = kinematics.deformation(SYMPY, F - sp.eye(3), sp.eye(3))
+    along = [sp.Matrix(fibre) for fibre in fibres]
+    return LAWS[kind](SYMPY, *(kinematics.measure(SYMPY, name, at, along) for name in measures(kind)), **constants)
 
 
 def loaded_body(material, *, density=600.0, traction=1e3, pressure=2e3, **changes):

@@ -1,7 +1,6 @@
 """Strain energies: closed forms of their moduli, what vanishes in the undeformed body, and the isochoric split."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -73,7 +72,7 @@ def test_small_strain_moduli_of_any_compressibility(ratio):
 def test_energy_and_stress_vanish_in_the_undeformed_body(kind):
     variables = sp.Matrix(3, 3, sp.symbols("F:9"))
     identity = dict(zip(variables, sp.eye(3), strict=True))
-    W = energy_density(kind, variables, SKEW if "I4" in measures(kind) else (), **symbols(kind))
+    W = energy_density(kind, variables, SKEW if "i4" in measures(kind) else (), **symbols(kind))
     assert sp.nsimplify(W.subs(identity)) == 0
     for variable in (variables[0, 0], variables[1, 1], variables[0, 1], variables[2, 0]):
         assert sp.nsimplify(sp.simplify(sp.diff(W, variable).subs(identity))) == 0
@@ -87,8 +86,8 @@ def test_what_is_called_D1_multiplies_the_whole_volumetric_part(kind):
     named = symbols(kind)
 
     def W(change, **values):
-        stretches = (change * a, change * b, change * c)
-        return MATERIALS[kind](SYMPY, *measured(kind, stretches, change**3 * J).values(), **(named | values))
+        less_one = (change * a - 1, change * b - 1, change * c - 1)
+        return MATERIALS[kind](SYMPY, *measured(kind, SYMPY, less_one, change**3 * J - 1).values(), **(named | values))
 
     isochoric = W(1, D1=0)
     assert sp.simplify(W(1) - isochoric - named["D1"] * (J - 1) ** 2) == 0
@@ -163,15 +162,16 @@ def test_fibres_bear_tension_only():
 def test_stress_of_fibres():
     """P by the slopes of the energy against differences of the energy, with two skew families."""
     values = VALUES["holzapfel-gasser-ogden"]
-    ops = SimpleNamespace(**vars(SYMPY), inv=lambda A: A.inv(), outer=lambda a, b: a * b.T)
-    names = sp.symbols("I1 I2 J I4 I6")
-    W = MATERIALS["holzapfel-gasser-ogden"](SYMPY, *names[:3], names[3:], **values)
+    names = sp.symbols("i1 j i4 i6")
+    W = MATERIALS["holzapfel-gasser-ogden"](SYMPY, *names[:2], names[2:], **values)
     numbers = sp.Matrix(F)
+    deformation = kinematics.deformation(SYMPY, numbers - sp.eye(3), sp.eye(3))
     fibres = [sp.Matrix(fibre) for fibre in SKEW]
-    at = dict(zip(names[:3], kinematics.invariants(SYMPY, numbers), strict=True))
-    at |= {name: kinematics.fibre_stretch(SYMPY, numbers, a) for name, a in zip(names[3:], fibres, strict=True)}
+    found = {name: kinematics.measure(SYMPY, name, deformation, fibres) for name in ("i1", "j", "i4")}
+    at = dict(zip(names, (found["i1"], found["j"], *found["i4"]), strict=True))
     slopes = [W.diff(name).subs(at) for name in names]
-    P = kinematics.nominal_stress(ops, numbers, slopes[:3], list(zip(fibres, slopes[3:], strict=True)))
+    by_name = dict(zip(("i1", "j"), slopes[:2], strict=True))
+    P = kinematics.nominal_stress(SYMPY, numbers, deformation, by_name, list(zip(fibres, slopes[2:], strict=True)))
     for i, j in ((0, 0), (0, 1), (2, 1)):
         step = np.zeros((3, 3))
         step[i, j] = 1e-5
@@ -189,9 +189,11 @@ def test_ogden_stress_and_stiffness_where_stretches_are_equal():
     mesh = fenicsx.mesh_body(MPI.COMM_SELF, unloaded_body("ogden").body)[0]
     space = fenicsx.vector_space(mesh, 1)
     u, along = fenicsx.function(space), fenicsx.function(space)
-    gradient = ufl.variable(ufl.Identity(3) + ufl.grad(u))
-    stretches = kinematics.principal_stretches(_OPS, gradient, ufl.Identity(3))
-    W = MATERIALS["ogden"](_OPS, *stretches, ufl.det(gradient), **values)
+    gradient = ufl.variable(ufl.grad(u))
+    deformation = kinematics.deformation(_OPS, gradient, ufl.Identity(3))
+    strains = kinematics.principal_strains(_OPS, deformation)
+    logarithms = kinematics.isochoric([_OPS.log1p(strain) / 2 for strain in strains])
+    W = MATERIALS["ogden"](_OPS, *logarithms, deformation.dilation, **values)
     P = ufl.diff(W, gradient)
     point = np.array([[0.2, 0.2, 0.2]])
     values_at = [fenicsx.PointValues(form, point, space, MPI.COMM_SELF) for form in (P, ufl.derivative(P, u, along))]

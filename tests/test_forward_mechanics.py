@@ -55,7 +55,9 @@ def exact(material, F):
 def of_stretches(block, F):
     """The same of an energy of principal stretches, from the eigenvectors of C: P = F Σ ∂W/∂λ_k n_k⊗n_k / λ_k."""
     l = sp.symbols("l1:4", positive=True)
-    W = materials.MATERIALS[block["kind"]](SYMPY, *l, l[0] * l[1] * l[2], **rationals(block))
+    J = l[0] * l[1] * l[2]
+    isochoric = [sp.log(stretch) - sp.log(J) / 3 for stretch in l]
+    W = materials.MATERIALS[block["kind"]](SYMPY, *isochoric, J - 1, **rationals(block))
     functions = sp.lambdify([l], [W, *(W.diff(stretch) for stretch in l)], "mpmath")
     with mpmath.workdps(30):
         F = mpmath.matrix([[mpmath.mpf(str(f)) for f in row] for row in np.asarray(F).tolist()])
@@ -73,9 +75,10 @@ def lateral_stretch(material, stretches):
     block = ALL_MATERIALS[material.split()[0]]
     free = sp.Symbol("free", positive=True)
     a, b, c = (free if s is None else sp.Rational(str(s)) for s in stretches)
-    fibres = (a**2,) if "fibres" in block else ()  # along x
+    fibres = (a**2 - 1,) if "fibres" in block else ()  # along x
     law = materials.MATERIALS[block["kind"]]
-    W = law(SYMPY, *materials.measured(law, (a, b, c), a * b * c, fibres).values(), **rationals(block))
+    known = materials.measured(law, SYMPY, (a - 1, b - 1, c - 1), a * b * c - 1, fibres)
+    W = law(SYMPY, *known.values(), **rationals(block))
     with mpmath.workdps(30):
         value = float(mpmath.findroot(sp.lambdify(free, sp.diff(W, free), "mpmath"), 1))
     return [value if s is None else s for s in stretches]
