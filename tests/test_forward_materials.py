@@ -70,29 +70,30 @@ def test_small_strain_moduli_of_any_compressibility(ratio):
 
 @pytest.mark.parametrize("kind", [kind for kind in MATERIALS if kind != "ogden"])
 def test_energy_and_stress_vanish_in_the_undeformed_body(kind):
-    variables = sp.Matrix(3, 3, sp.symbols("F:9"))
-    identity = dict(zip(variables, sp.eye(3), strict=True))
-    W = energy_density(kind, variables, SKEW if "i4" in measures(kind) else (), **symbols(kind))
-    assert sp.nsimplify(W.subs(identity)) == 0
-    for variable in (variables[0, 0], variables[1, 1], variables[0, 1], variables[2, 0]):
-        assert sp.nsimplify(sp.simplify(sp.diff(W, variable).subs(identity))) == 0
+    fibres = SKEW if "i4" in measures(kind) else ()
+    assert energy_density(kind, sp.eye(3), fibres, **VALUES[kind]) == 0
+    for i, j in ((0, 0), (1, 1), (0, 1), (2, 0)):
+        moved = sp.eye(3)
+        moved[i, j] += sp.Rational(1, 10**20)
+        assert abs(sp.N(energy_density(kind, moved, fibres, **VALUES[kind]), 30)) < 1e-10 * 1e-20
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MATERIALS if "D1" in VALUES[kind]])
 def test_what_is_called_D1_multiplies_the_whole_volumetric_part(kind):
     assert splits(kind)
     assert splits(MATERIALS[kind])
-    a, b, c, J, scale = sp.symbols("a b c J s", positive=True)
-    named = symbols(kind)
+    stretches, J, scale = (sp.Rational(13, 10), sp.Rational(4, 5), sp.Rational(11, 10)), sp.Rational(6, 5), 2
 
     def W(change, **values):
-        less_one = (change * a - 1, change * b - 1, change * c - 1)
-        return MATERIALS[kind](SYMPY, *measured(kind, SYMPY, less_one, change**3 * J - 1).values(), **(named | values))
+        less_one = tuple(change * stretch - 1 for stretch in stretches)
+        known = measured(kind, SYMPY, less_one, change**3 * J - 1)
+        return float(sp.N(MATERIALS[kind](SYMPY, *known.values(), **(VALUES[kind] | values)), 30))
 
+    # Of no deformation, as J is not the product of the stretches: a formula is seen better so.
     isochoric = W(1, D1=0)
-    assert sp.simplify(W(1) - isochoric - named["D1"] * (J - 1) ** 2) == 0
+    assert W(1) - isochoric == pytest.approx(VALUES[kind]["D1"] * float(J - 1) ** 2, rel=1e-10)
     # A change of volume scales stretches by s and J by s³: what is left must not feel it.
-    assert sp.simplify(sp.nsimplify(sp.powsimp(sp.expand_power_base(W(scale, D1=0) - isochoric)), rational=True)) == 0
+    assert W(scale, D1=0) == pytest.approx(isochoric, rel=1e-10)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MATERIALS if "D1" not in VALUES[kind]])
