@@ -533,7 +533,9 @@ class Discretisation:
         last_digits = np.where(np.arange(self.size) % 2 == 0, 1.0, -1.0) * np.finfo(float).eps
         change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
         change[self.fixed] = 0
-        return min(2 * self.norm(change), 1e-4 * scale)
+        left = 2 * self.norm(change)
+        # A body that is moved as if it were rigid has no forces but those of rounding.
+        return min(left, 1e-4 * scale) if self._external > 0 else left
 
     def _rounding_without_loads(self) -> float:
         if self._rounding is None:
