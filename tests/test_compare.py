@@ -330,6 +330,7 @@ def results(tmp_path):
         "method": "compare",
         "stopped": dataset.attrs["stopped"],
         "evaluations": recorder.solves,
+        "status": "complete",
         "failed": 0,
         "failures": [],
         "wall_seconds": 1.0,
