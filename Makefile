@@ -11,8 +11,9 @@ WHEEL_PYTHON = $(shell for python in python3.12 python3.13 python3.14 $$(ls -d $
     do $$python -c 'import venv, ensurepip' 2>/dev/null && echo $$python && break; done)
 WHEEL_VENV := .venv-wheel
 WHEEL_READY := $(WHEEL_VENV)/ready
-WHEEL_TESTS := tests/test_references.py tests/test_compilation.py tests/test_own_mesh.py tests/test_chaos.py tests/test_config.py \
-    tests/test_inputs.py tests/test_low_rank.py tests/test_monte_carlo.py tests/test_posterior.py tests/test_sobol.py
+WHEEL_TESTS := tests/forward/test_references.py tests/forward/fem/test_compilation.py tests/forward/bodies/test_mesh_file.py \
+    tests/uq/methods/test_chaos.py tests/uq/methods/test_monte_carlo.py tests/uq/methods/test_sobol.py tests/uq/inputs/test_inputs.py \
+    tests/inverse/fields/test_low_rank.py tests/inverse/low_dimensional/test_posterior.py tests/workflows/config/test_config.py
 DEMO := beam
 # Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.
 WORKERS := --numprocesses auto --dist loadfile

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from workflows.config import Study, load
+from workflows.config.study import Study, load
 
 CONFIG = Path(__file__).parent.parent / "configs" / "beam.toml"
 

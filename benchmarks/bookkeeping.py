@@ -7,10 +7,10 @@ import time
 import numpy as np
 
 from forward.model import FunctionModel
-from uq.distributions import Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from uq.monte_carlo import SensitivityMonteCarlo
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.methods.monte_carlo import SensitivityMonteCarlo
 
 SAMPLES = 100_000
 

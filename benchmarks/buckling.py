@@ -18,17 +18,17 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
-from forward.finite_element import HyperelasticModel
+from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, SolveError, Stability
-from forward.reference import ReferenceFactor
-from forward.stability import NOT_SCREENED, Screened
-from uq.distributions import Distribution, Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from uq.linearisation import linearise
-from uq.sampling import random_points
-from workflows.config import load
+from forward.solvers.reference import ReferenceFactor
+from forward.solvers.stability import NOT_SCREENED, Screened
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Distribution, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import random_points
+from uq.surrogates.linearisation import linearise
+from workflows.config.study import load
 
 SAMPLES = 125  # of each problem: 1 000 in all
 LARGE = [24, 4, 6]  # cells of a beam with about 10⁴ unknowns

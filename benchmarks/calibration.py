@@ -17,11 +17,11 @@ from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
 from forward.specimen import Specimen, SpecimenModel
-from inverse.calibration import Kind, calibrate
-from inverse.posterior import Posterior
-from uq.distributions import Distribution, LogNormal, LogUniform, Uniform
-from uq.evaluate import Prediction, SerialEvaluate
-from uq.inputs import Inputs
+from inverse.criticism.calibration import Kind, calibrate
+from inverse.low_dimensional.posterior import Posterior
+from uq.evaluation.evaluate import Prediction, SerialEvaluate
+from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
+from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
     import xarray as xr

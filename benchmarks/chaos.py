@@ -15,16 +15,16 @@ from scipy.linalg import cho_solve
 
 from benchmarks.beams import CONFIG
 from forward.model import WORK, FloatArray, ForwardModel, FunctionModel
-from uq.basis import gauss, hyperbolic, orthonormal
-from uq.chaos import Chaos
-from uq.distributions import Beta, Uniform
-from uq.evaluate import Evaluations, Merger, Request, SerialEvaluate
-from uq.expansion import load
-from uq.field_regression import Projections
-from uq.indices import coefficient_moments
-from uq.inputs import Inputs
-from uq.sampling import random_points
-from workflows.config import load as load_study
+from uq.estimators.indices import coefficient_moments
+from uq.evaluation.evaluate import Evaluations, Merger, Request, SerialEvaluate
+from uq.inputs.distributions import Beta, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import random_points
+from uq.methods.chaos import Chaos
+from uq.surrogates.basis import gauss, hyperbolic, orthonormal
+from uq.surrogates.expansion import load
+from uq.surrogates.field_regression import Projections
+from workflows.config.study import load as load_study
 
 SEEDS = 4  # designs of each size, over which errors are averaged
 NODES = 10_000
@@ -256,7 +256,7 @@ def _fields() -> None:
 
 
 def _own_fields(inputs: Inputs, order: int, points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sum the right-hand sides as blocks of one sample come in, and solve: the path of `uq.field_regression`."""
+    """Sum the right-hand sides as blocks of one sample come in, and solve: the path of `field_regression`."""
     basis = orthonormal(inputs, hyperbolic(len(inputs.names), order, 1.0))
     merger = Merger(Projections(basis, fields[0], False, None, None))
     for point, state in zip(points, fields, strict=True):

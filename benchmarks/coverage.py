@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
-from uq import chaos
-from uq.chaos import Chaos
-from uq.derivative_based import DerivativeBased
-from uq.distributions import LogNormal, Normal, Uniform
-from uq.evaluate import Evaluations, Request
-from uq.inputs import Inputs
-from uq.moments import half_width
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.multilevel_chaos import MultilevelChaos
-from uq.quasi_monte_carlo import QuasiMonteCarlo
-from uq.sampling import sobol_points
-from uq.sobol import Sobol
+from uq.estimators.moments import half_width
+from uq.evaluation.evaluate import Evaluations, Request
+from uq.inputs.distributions import LogNormal, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.methods import chaos
+from uq.methods.chaos import Chaos
+from uq.methods.derivative_based import DerivativeBased
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.multilevel_chaos import MultilevelChaos
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.methods.sobol import Sobol
 
 REPEATS = 100
 REFERENCE = 16  # 2^16 points of each of 16 scrambles give what is true

@@ -8,12 +8,12 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.beams import field_beam
-from forward.fields import ROBIN, Matern, Smoothness, correlation
-from forward.geometry import Box
-from uq.chaos import Chaos
-from uq.evaluate import SerialEvaluate
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.quasi_monte_carlo import QuasiMonteCarlo
+from forward.bodies.geometry import Box
+from forward.bodies.random_fields import ROBIN, Matern, Smoothness, correlation
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.methods.chaos import Chaos
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
 LENGTH = 0.4  # of the field on the unit cube
 OUTPUT = "uy"

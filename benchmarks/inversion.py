@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 from mpi4py import MPI
 
-from forward.fields import RandomField
+from forward.bodies.random_fields import RandomField
 from forward.model import FloatArray
 from forward.specimen import Specimen, SpecimenModel
-from inverse.field_posterior import FieldPosterior
-from inverse.low_rank import LowRankPosterior
-from inverse.newton_cg import find_mode
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
 
 CELLS = (7, 12, 16, 24)  # along each edge: 512 to 15 625 vertices
 PAIRS = 100

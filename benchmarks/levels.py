@@ -6,9 +6,9 @@ from mpi4py import MPI
 
 from benchmarks.beams import beam
 from forward.model import WORK
-from uq.evaluate import Recorder, SerialEvaluate
-from uq.linearisation import linearise
-from uq.multilevel_chaos import MultilevelChaos
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.methods.multilevel_chaos import MultilevelChaos
+from uq.surrogates.linearisation import linearise
 
 OUTPUT = "uy_max"
 CASES = (

@@ -13,9 +13,9 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.beams import beam
-from forward.cost import times
-from uq.linearisation import Linearisation
-from uq.sampling import random_points
+from forward.fem.cost import times
+from uq.inputs.sampling import random_points
+from uq.surrogates.linearisation import Linearisation
 
 T = TypeVar("T")
 DRAWS = 3

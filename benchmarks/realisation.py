@@ -9,13 +9,13 @@ from mpi4py import MPI
 
 from benchmarks.beams import beam
 from benchmarks.throughput import resident
-from uq.basis import orthonormal
-from uq.evaluate import Evaluate, Request, SerialEvaluate
-from uq.field_regression import Projections, StateExpansion
-from uq.inputs import Inputs
-from uq.linearisation import Linearisation, linearise
-from uq.regression import Data, fit_best, whole
-from uq.sampling import random_points, sobol_points
+from uq.evaluation.evaluate import Evaluate, Request, SerialEvaluate
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import random_points, sobol_points
+from uq.surrogates.basis import orthonormal
+from uq.surrogates.field_regression import Projections, StateExpansion
+from uq.surrogates.linearisation import Linearisation, linearise
+from uq.surrogates.regression import Data, fit_best, whole
 
 DRAWS = 50
 ORDER, SOLVES = 3, 16  # of the chaos prediction, which is fitted to values and gradients

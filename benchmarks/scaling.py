@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from forward.model import FloatArray, ForwardModel, Solution
-    from uq.evaluate import Evaluations
+    from uq.evaluation.evaluate import Evaluations
 
 ROOT = CONFIG.parent.parent
 PICTURE = ROOT / "docs" / "scaling.png"
@@ -38,8 +38,8 @@ import sys, time
 import numpy as np
 from mpi4py import MPI
 from forward.model import FunctionModel
-from uq.ensemble import Ensemble, _counter
-from uq.evaluate import Request
+from uq.evaluation.ensemble import Ensemble, _counter
+from uq.evaluation.evaluate import Request
 
 mode, world = sys.argv[1], MPI.COMM_WORLD
 if mode == "counter":
@@ -96,11 +96,11 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
     """Measure the constants on the published beam, and times of its solves with the inputs as published and wide."""
     from mpi4py import MPI
 
-    from uq.checkpoint import Checkpoint
-    from uq.evaluate import Merger, Request, SerialEvaluate
-    from uq.linearisation import linearise
-    from uq.sampling import random_points
-    from workflows.config import Study, load
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.evaluate import Merger, Request, SerialEvaluate
+    from uq.inputs.sampling import random_points
+    from uq.surrogates.linearisation import linearise
+    from workflows.config.study import Study, load
 
     times = []
     for study in (beam((12, 2, 4)), load(CONFIG.with_name("beam-wide.toml"))):

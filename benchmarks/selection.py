@@ -14,14 +14,14 @@ from itertools import pairwise
 import numpy as np
 
 from benchmarks.beams import CONFIG
-from forward.homogeneous import HomogeneousModel, MaterialTest
+from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
-from inverse.comparison import Candidate, Data
-from inverse.selection import Noise, Select
-from uq.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from workflows.verdict import conflicts, ranking
+from inverse.criticism.comparison import Candidate, Data
+from inverse.methods.selection import Noise, Select
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from workflows.report.verdict import conflicts, ranking
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 TESTS = [MaterialTest(mode=mode, at=STRETCHES) for mode in ("uniaxial", "equibiaxial", "pure-shear")]

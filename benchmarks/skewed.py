@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from forward.model import FloatArray, FunctionModel
-from uq.chaos import Chaos
-from uq.distributions import LogNormal, Normal, Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from uq.moments import half_width
-from uq.monte_carlo import SensitivityMonteCarlo
-from uq.quasi_monte_carlo import QuasiMonteCarlo
-from uq.sampling import sobol_points
+from uq.estimators.moments import half_width
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.methods.chaos import Chaos
+from uq.methods.monte_carlo import SensitivityMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
 SEEDS = range(8)
 KNOWN = 2**20  # points of each of eight scrambles that the moments are known from

@@ -27,11 +27,11 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
-from forward.finite_element import FiniteElementSolution, HyperelasticModel
-from forward.geometry import AXES
+from forward.bodies.geometry import AXES
+from forward.fem.model import FiniteElementSolution, HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, SolveError
-from workflows.config import load
+from workflows.config.study import load
 
 ROOT = Path(__file__).parent.parent
 TABLE, PICTURE = ROOT / "results" / "stability.csv", ROOT / "docs" / "stability.png"

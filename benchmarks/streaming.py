@@ -17,11 +17,11 @@ import numpy as np
 from mpi4py import MPI
 from benchmarks.beams import field_beam
 from benchmarks.throughput import resident
-from uq.ensemble import Ensemble
-from uq.evaluate import Request
-from uq.linearisation import linearise
-from uq.monte_carlo import _JointMoments
-from uq.sampling import random_points
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.evaluate import Request
+from uq.surrogates.linearisation import linearise
+from uq.methods.monte_carlo import _JointMoments
+from uq.inputs.sampling import random_points
 
 world = MPI.COMM_WORLD
 realisations, cells = int(sys.argv[1]), tuple(map(int, sys.argv[2].split(",")))

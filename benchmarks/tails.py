@@ -12,15 +12,15 @@ import numpy as np
 
 from benchmarks import coverage
 from benchmarks.coverage import CASES, Case, measure
-from uq import chaos
-from uq.chaos import Chaos
-from uq.derivative_based import DerivativeBased
-from uq.distributions import LogNormal
-from uq.inputs import Inputs
-from uq.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.quadrature import panels
-from uq.quasi_monte_carlo import QuasiMonteCarlo
-from uq.sobol import Sobol
+from uq.inputs.distributions import LogNormal
+from uq.inputs.quadrature import panels
+from uq.inputs.random_parameters import Inputs
+from uq.methods import chaos
+from uq.methods.chaos import Chaos
+from uq.methods.derivative_based import DerivativeBased
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.methods.sobol import Sobol
 
 REPEATS = 40
 

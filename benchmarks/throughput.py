@@ -15,10 +15,10 @@ SCRIPT = """
 import sys, time
 from mpi4py import MPI
 from benchmarks.beams import beam
-from uq.ensemble import Ensemble
-from uq.evaluate import Request
-from uq.linearisation import linearise
-from uq.sampling import random_points
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.evaluate import Request
+from uq.surrogates.linearisation import linearise
+from uq.inputs.sampling import random_points
 
 study = beam((12, 2, 4))
 inputs = study.inputs
@@ -73,9 +73,9 @@ def memory_over(realisations: int) -> list[float]:
     import numpy as np
     from mpi4py import MPI
 
-    from uq.evaluate import SerialEvaluate
-    from uq.linearisation import linearise
-    from workflows.config import load
+    from uq.evaluation.evaluate import SerialEvaluate
+    from uq.surrogates.linearisation import linearise
+    from workflows.config.study import load
 
     study = load(CONFIG.with_name("tiny.toml"), ["model.body.cells=[2, 1, 1]"])
     model = study.model.build(MPI.COMM_SELF, study.inputs.names)

@@ -7,8 +7,8 @@ import time
 from mpi4py import MPI
 
 from benchmarks.beams import beam
-from uq.evaluate import Evaluations, Request, SerialEvaluate
-from uq.monte_carlo import SensitivityMonteCarlo
+from uq.evaluation.evaluate import Evaluations, Request, SerialEvaluate
+from uq.methods.monte_carlo import SensitivityMonteCarlo
 
 SAMPLES = 256
 

@@ -60,7 +60,7 @@ def pages() -> Iterator[tuple[str, str]]:
     for package, title in PACKAGES.items():
         lines += [f"## {title}: `{package}`", ""]
         for path in modules(package):
-            name = f"{package}.{path.stem}"
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
             doc = ast.get_docstring(parsed(path)) or ""
             lines.append(f"- [`{name}`]({name}.md): {prose(doc.partition(chr(10))[0])}")
             yield f"reference/{name}.md", module_page(path, name)
@@ -116,8 +116,8 @@ def help_of(*command: str) -> str:
 
 
 def modules(package: str) -> list[Path]:
-    """Return the modules of a package."""
-    return [path for path in sorted((ROOT / package).glob("*.py")) if not path.stem.startswith("_")]
+    """Return the modules of a package and of the packages in it."""
+    return [path for path in sorted((ROOT / package).rglob("*.py")) if not path.stem.startswith("_")]
 
 
 def parsed(path: Path) -> ast.Module:
@@ -192,7 +192,7 @@ def fields(node: ast.ClassDef) -> list[str]:
 
 def settings() -> str:
     """Return the reference of all blocks of a study file, from its JSON Schema."""
-    from workflows.config import schema
+    from workflows.config.study import schema
 
     whole = schema()
     blocks = whole["$defs"]
@@ -290,7 +290,7 @@ def quoted(markdown: str) -> str:
 
 
 def docstring(place: str) -> str:
-    """Return a docstring as Markdown: ``uq.moments`` of a module, ``uq.moments:combine`` of a name in it."""
+    """Return a docstring as Markdown: ``uq.estimators.moments`` of a module, with ``:combine`` of a name in it."""
     module, _, name = place.partition(":")
     tree: Any = parsed(ROOT / f"{module.replace('.', '/')}.py")
     if name:

@@ -13,17 +13,17 @@ from annotated_types import Ge, Gt, Le
 from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.admissible import Materials
-from forward.fields import RandomField
-from forward.geometry import AXES, Body, Vector, holds, moved_points
-from forward.inclusions import Inclusion
-from forward.loads import LOAD_SIZES, Displacement, Gravity, Load, Pressure
-from forward.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.materials import MATERIALS, constants, measures, splits
+from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
+from forward.bodies.inclusions import Inclusion
+from forward.bodies.random_fields import RandomField
+from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
+from forward.materials.admissible import Materials
+from forward.materials.energies import MATERIALS, constants, measures, splits
 from forward.model import Finding
-from forward.newton import SolverSettings
-from forward.outputs import Output, PointDisplacement, Reaction
+from forward.observables.outputs import Output, PointDisplacement, Reaction
 from forward.settings import Settings, nearest
+from forward.solvers.newton import SolverSettings
+from forward.terms.loads import LOAD_SIZES, Displacement, Gravity, Load, Pressure
 
 
 class _Fibrous(Settings):
@@ -41,7 +41,7 @@ class _Fibrous(Settings):
 
 
 if TYPE_CHECKING:
-    from forward.finite_element import HyperelasticModel
+    from forward.fem.model import HyperelasticModel
 
     Material = Settings
 else:
@@ -317,7 +317,7 @@ class Hyperelastic(Settings):
             Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
             random fields that it does not hold are zero.
         """
-        from forward.finite_element import HyperelasticModel
+        from forward.fem.model import HyperelasticModel
 
         return HyperelasticModel(self, comm, parameters)
 

@@ -17,24 +17,24 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.admissible import Materials
-from forward.fields import RandomField
-from forward.geometry import AXES, Body, Vector, holds, tolerance
+from forward.bodies.geometry import AXES, Body, Vector, holds, tolerance
+from forward.bodies.inclusions import Inclusion
+from forward.bodies.random_fields import RandomField
+from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.hyperelastic import Hyperelastic, Material, Scalar, materials
-from forward.inclusions import Inclusion
-from forward.loads import Displacement, Load
-from forward.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.materials import splits
+from forward.materials.admissible import Materials
+from forward.materials.energies import splits
 from forward.model import Finding, FloatArray, Reference, SolveError, Stability, Work
-from forward.newton import SolverSettings
-from forward.outputs import Output
+from forward.observables.outputs import Output
 from forward.settings import Settings, nearest
+from forward.solvers.newton import SolverSettings
+from forward.terms.loads import Displacement, Load
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-    from forward.finite_element import FiniteElementSolution, HyperelasticModel
-    from forward.layout import Layout
+    from forward.fem.layout import Layout
+    from forward.fem.model import FiniteElementSolution, HyperelasticModel
 
 
 SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
@@ -324,8 +324,8 @@ class SpecimenModel:
     @cached_property
     def vertices(self) -> Layout:
         """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
-        from forward import fenicsx
-        from forward.layout import Layout
+        from forward.fem import fenicsx
+        from forward.fem.layout import Layout
 
         body = self.models[0].body
         return Layout(fenicsx.scalar_space(body.space.mesh, 1), body.comm)
@@ -448,7 +448,7 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
     """Where (n, 3) displacements are observed; collective."""
     if item.on is None:
         return np.array(item.at)
-    from forward import fenicsx
+    from forward.fem import fenicsx
 
     body, layout = model.body, model.layout
     mine = layout.nodes()[fenicsx.boundary_nodes(body.space, body.facets[item.on])]
@@ -467,7 +467,7 @@ def _interpolation(
     """
     from scipy.sparse import csr_matrix
 
-    from forward import fenicsx
+    from forward.fem import fenicsx
 
     body, layout, spec = model.body, model.layout, model.body.spec.body
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)

@@ -22,10 +22,10 @@ import os
 import tempfile
 from pathlib import Path
 
-from workflows import bodies, plots
-from workflows.config import load
-from workflows.results import read_dataset
-from workflows.study import run
+from workflows.config.study import load
+from workflows.report import bodies, plots
+from workflows.results.directory import read_dataset
+from workflows.run.run import run
 
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
 directory = Path(os.environ.get("TISSUQ_RESULTS") or tempfile.mkdtemp())

@@ -24,11 +24,11 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from uq.compare import gains
-from workflows import plots
-from workflows.config import parse
-from workflows.results import read_dataset
-from workflows.study import run
+from uq.methods.compare import gains
+from workflows.config.study import parse
+from workflows.report import plots
+from workflows.results.directory import read_dataset
+from workflows.run.run import run
 
 METHOD = """
 kind = "compare"

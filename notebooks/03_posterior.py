@@ -29,10 +29,10 @@ from pathlib import Path
 import numpy as np
 
 from uq.findings import findings
-from workflows import inversion_report, plots
-from workflows.config import load
-from workflows.results import read_dataset
-from workflows.study import run
+from workflows.config.study import load
+from workflows.report import inversion_report, plots
+from workflows.results.directory import read_dataset
+from workflows.run.run import run
 
 CONFIGS = next(path for path in (Path("configs"), Path("../configs")) if path.exists())
 directory = Path(os.environ.get("TISSUQ_INVERSION") or tempfile.mkdtemp())

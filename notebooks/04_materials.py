@@ -23,11 +23,11 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from workflows import plots, selection_report
-from workflows.config import parse
-from workflows.results import read_dataset
-from workflows.study import run
-from workflows.verdict import findings
+from workflows.config.study import parse
+from workflows.report import plots, selection_report
+from workflows.report.verdict import findings
+from workflows.results.directory import read_dataset
+from workflows.run.run import run
 
 STUDY = """
 [data]

@@ -49,11 +49,11 @@ check_derivatives(model, mean, 0.1 * mean).require()
 # ## Any method takes it
 
 # %%
-from uq.chaos import Chaos
-from uq.distributions import LogNormal, Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from uq.quasi_monte_carlo import QuasiMonteCarlo
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.methods.chaos import Chaos
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
 inputs = Inputs(
     {
@@ -84,10 +84,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from workflows import plots
-from workflows.config import load
-from workflows.results import read_dataset
-from workflows.study import run
+from workflows.config.study import load
+from workflows.report import plots
+from workflows.results.directory import read_dataset
+from workflows.run.run import run
 
 STUDY = """
 [model]

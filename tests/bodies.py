@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import sympy as sp
 from sympy.codegen.cfunctions import expm1, log1p
 
-from forward import kinematics
 from forward.hyperelastic import Hyperelastic
-from forward.materials import MATERIALS as LAWS
-from forward.materials import measures
+from forward.materials import kinematics
+from forward.materials.energies import MATERIALS as LAWS
+from forward.materials.energies import measures
 
 MATERIALS = {
     "mooney-rivlin": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 2e4, "D1": 2e5},

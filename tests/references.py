@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from forward.specimen import Specimen
 from tests.bodies import OUTPUTS, loaded_body
-from workflows.config import load
+from workflows.config.study import load
 
 ROOT = Path(__file__).parent.parent
 KEPT = Path(__file__).with_suffix(".json")

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from forward.homogeneous import HomogeneousModel
-from inverse.posterior import Posterior
-from uq.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
-from uq.evaluate import SerialEvaluate
-from uq.inputs import Inputs
-from workflows.config import load
-from workflows.selection import Selection
+from forward.materials.material_point import HomogeneousModel
+from inverse.low_dimensional.posterior import Posterior
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from workflows.config.study import load
+from workflows.studies.selection import Selection
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 FACTOR = LogUniform(lower=0.2, upper=20.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from workflows.config import AnyStudy
+    from workflows.config.study import AnyStudy
 
 # One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StopError as error:
         return _end(f"failed: {error}", FAILED)
     from forward.model import ModelError, SolveError
-    from workflows.config import StudyError
+    from workflows.config.study import StudyError
 
     try:
         code = int(options.command(options))
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BaseException as error:
         world = _world()
         if world is not None:
-            from uq.ensemble import end_job
+            from uq.evaluation.ensemble import end_job
 
             end_job(world, error)
         reason = reason_to_stop(error)
@@ -121,21 +121,21 @@ def _parser() -> argparse.ArgumentParser:
 
 def _load(options: argparse.Namespace) -> AnyStudy:
     """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
-    from forward.external import PythonModel
+    from forward.external.models import PythonModel
     from forward.machine import reserve_for_linear_algebra
-    from workflows.config import Study, load
+    from workflows.config.study import Study, load
 
     reserve_for_linear_algebra()
     study = load(options.study, options.set)
     if isinstance(study, Study) and isinstance(study.model, PythonModel):
-        from forward.own_modules import make_visible
+        from forward.external.own_modules import make_visible
 
         make_visible(study.model.modules, [options.study.resolve().parent, Path.cwd()])
     return study
 
 
 def _check(options: argparse.Namespace) -> int:
-    from workflows.plan import plan
+    from workflows.run.plan import plan
 
     study = _load(options)
     sys.stdout.write("\n".join([f"{options.study}: a valid study", *plan(study)]) + "\n")
@@ -145,8 +145,8 @@ def _check(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     study = _load(options)
     from forward.machine import SHARED_BY_RANKS, require_files
-    from workflows.signals import heed
-    from workflows.study import run
+    from workflows.run.run import run
+    from workflows.run.signals import heed
 
     if "mpi4py.MPI" not in sys.modules:  # or else it has its file
         require_files(SHARED_BY_RANKS, "MPI")
@@ -155,8 +155,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from workflows.config import StudyError
-    from workflows.report import compare, write_report
+    from workflows.config.study import StudyError
+    from workflows.report.page import compare, write_report
 
     if options.out is not None and len(options.directories) == 1:
         message = f"--out {options.out}: is the file of a comparison, expected several directories"
@@ -176,7 +176,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from workflows.config import Study, StudyError
+    from workflows.config.study import Study, StudyError
     from workflows.serve import serve
 
     study = _load(options)
@@ -197,7 +197,7 @@ def _init(options: argparse.Namespace) -> int:
 def _schema(options: argparse.Namespace) -> int:
     import json
 
-    from workflows.config import schema
+    from workflows.config.study import schema
 
     sys.stdout.write(json.dumps(schema(), indent=2, ensure_ascii=False) + "\n")
     return DONE

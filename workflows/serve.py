@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from forward.external import PROTOCOL
+from forward.external.models import PROTOCOL
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, ModelError, Reference, Solution, SolveError
 from forward.settings import nearest, shown
-from uq.evaluate import SerialEvaluate
-from uq.linearisation import linearise
-from workflows.config import Study, StudyError
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.surrogates.linearisation import linearise
+from workflows.config.study import Study, StudyError
 from workflows.http import RefusalError, Server
 
 if TYPE_CHECKING:

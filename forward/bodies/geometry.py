@@ -1,0 +1,402 @@
+"""Bodies with named boundaries, as specifications; the mesh itself is made in `fenicsx`."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import BeforeValidator, Field, model_validator
+
+from forward.bodies.mesh_file import OwnMesh
+from forward.model import Finding, FloatArray
+from forward.settings import Settings
+
+Axis = Literal["x", "y", "z"]
+Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
+AXES: tuple[Axis, ...] = ("x", "y", "z")
+Length = Annotated[float, Gt(0)]
+Count = Annotated[int, Gt(0)]
+Vector = tuple[float, float, float]
+ROUNDING = 1e-6  # of that distance: a move that is none
+NEARBY = 1e-3  # of the diagonal of a body: distance from it that is an inaccuracy of places
+
+
+class _SixSided(Settings):
+    """The image of a box that has a structured mesh: x-min, x-max, y-min … are the images of the faces of that box.
+
+    Parameters
+    ----------
+    cells
+        Number of cells along each edge (a cell is six tetrahedra where `cell` is "tetrahedron").
+    cell
+        Shape of the cells.
+    degree
+        Polynomial degree of the displacement.
+    quadrature_degree
+        Degree that the integrals are exact for; by default the lowest that keeps the order of convergence. Less than 2
+        (quadratic tetrahedra, linear hexahedra) or 4 (quadratic hexahedra) leaves deformations without energy.
+    grading
+        By face: how many times thinner the cells there are than at the opposite face or, where that has a grading too,
+        than in the middle between both. Edges of cells grow geometrically: ``{ z-min = 8 }`` for a body that is
+        clamped there, since stresses change fast beside the rim of a clamp.
+    """
+
+    kind: str
+    cells: tuple[Count, Count, Count]
+    cell: Literal["hexahedron", "tetrahedron"] = "hexahedron"
+    degree: Literal[1, 2] = 2
+    quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
+    grading: dict[Face, Annotated[float, Field(ge=1, le=1e4)]] = Field(default={})
+
+    @property
+    @abstractmethod
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the box that is meshed."""
+
+    @property
+    @abstractmethod
+    def vertices(self) -> tuple[Vector, ...]:
+        """The images (m) of the corners of that box: x goes first, then y, then z."""
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """The shape in words."""
+
+    @abstractmethod
+    def shaped(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the box that is meshed into the body (m), without the grading."""
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the box with equal cells into the body (m); nested meshes stay nested."""
+        if not self.grading:
+            return self.shaped(points)
+        axes = zip(points.T, self.meshed, AXES, strict=True)
+        moved = [
+            length * _graded(x / length, *(self.grading.get(f"{axis}-{end}", 1.0) for end in ("min", "max")))  # type: ignore[call-overload]
+            for x, length, axis in axes
+        ]
+        return self.shaped(np.column_stack(moved))
+
+    def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
+        """Return the same body with so many times the cells along each edge, thinner ones at some faces and beside.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(math.ceil(times * n) for n in self.cells)
+        graded = {}
+        for face in self.boundaries:
+            rims = any(face[0] != other[0] for other in towards)
+            more = grading if face in towards else beside if rims else 1.0
+            graded[face] = more * self.grading.get(face, 1.0)  # type: ignore[call-overload]
+        return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
+
+    @abstractmethod
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
+
+    @abstractmethod
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+
+    @property
+    def boundaries(self) -> tuple[str, ...]:
+        """Names of the boundaries."""
+        return tuple(f"{axis}-{end}" for axis in AXES for end in ("min", "max"))
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """No region has a name."""
+        return ()
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells."""
+        a, b, c = self.cells
+        return a * b * c * (6 if self.cell == "tetrahedron" else 1)
+
+    @property
+    def cells_in_words(self) -> str:
+        """How many cells there are along each edge."""
+        return " × ".join(f"{n}" for n in self.cells)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Nothing is odd about it."""
+        return ()
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes of the displacement."""
+        a, b, c = (self.degree * n + 1 for n in self.cells)
+        return a * b * c
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices of the mesh."""
+        a, b, c = self.cells
+        return (a + 1) * (b + 1) * (c + 1)
+
+    @property
+    def quadrature(self) -> int:
+        """The degree of quadrature in force."""
+        default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
+        return self.quadrature_degree or default[self.cell, self.degree]
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest coordinate (m) along each axis."""
+        return tuple((min(along), max(along)) for along in zip(*self.vertices, strict=True))
+
+    @property
+    def longest_edge(self) -> float:
+        """Length (m) of the longest edge of a cell (the diagonals of tetrahedra apart)."""
+        corners = np.reshape(self.vertices, (2, 2, 2, 3))  # by z, y and x
+        edges = []
+        for a, n in enumerate(self.cells):
+            ends = (self.grading.get(f"{AXES[a]}-{end}", 1.0) for end in ("min", "max"))  # type: ignore[call-overload]
+            share = np.diff(_graded(np.linspace(0, 1, n + 1), *ends)).max()
+            edges.append(np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() * share)
+        return float(max(edges))
+
+    def refined(self, level: int) -> Self:
+        """Return the same body with every cell divided by 2^level along each edge: its mesh is nested.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(n * 2**level for n in self.cells)
+        return self.model_validate(self.model_dump() | {"cells": cells})
+
+    def corners_of(self, boundary: str) -> list[Vector]:
+        """The four corners (m) of a boundary."""
+        axis, end = boundary.split("-")
+        bit = 1 << "xyz".index(axis)
+        return [corner for k, corner in enumerate(self.vertices) if bool(k & bit) == (end == "max")]
+
+    @model_validator(mode="after")
+    def _check_mesh(self) -> _SixSided:
+        if self.nodes > 20_000_000:
+            message = f"cells = {list(self.cells)} gives {3 * self.nodes:,} unknowns, expected at most 60 million"
+            raise ValueError(message)
+        lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
+        needed = lowest[self.cell, self.degree]
+        if self.quadrature < needed:
+            message = (
+                f"quadrature_degree = {self.quadrature} leaves deformations of {self.cell} cells of degree "
+                f"{self.degree} without energy, expected at least {needed}"
+            )
+            raise ValueError(message)
+        return self
+
+
+class Box(_SixSided):
+    """A box [0, size]; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
+
+    Parameters
+    ----------
+    size
+        Edge lengths in m.
+    cells, cell, degree, quadrature_degree, grading
+        The mesh, as of every body with six sides.
+    """
+
+    kind: Literal["box"] = "box"
+    size: tuple[Length, Length, Length]
+
+    @property
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the box that is meshed."""
+        return self.size
+
+    @property
+    def vertices(self) -> tuple[Vector, ...]:
+        """The corners (m): x goes first, then y, then z."""
+        a, b, c = self.size
+        return tuple((x, y, z) for z in (0.0, c) for y in (0.0, b) for x in (0.0, a))
+
+    @property
+    def description(self) -> str:
+        """The shape in words."""
+        return f"box of {' × '.join(f'{x:g}' for x in self.size)} m"
+
+    def shaped(self, points: FloatArray) -> FloatArray:
+        """Leave points (n, 3) where they are."""
+        return points
+
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
+        return all(-1e-12 * length <= x <= length * (1 + 1e-12) for x, length in zip(point, self.size, strict=True))
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        return np.asarray(np.clip(points, 0.0, self.size))
+
+
+def _graded(s: FloatArray, first: float, last: float) -> FloatArray:
+    """Map [0, 1] to itself with a slope that grows geometrically, `first` times from 0 and `last` times from 1.
+
+    With one of them it does so from end to end; with both, from either end to the middle.
+    """
+    if first == 1 or last == 1:
+        if first == last:
+            return s
+        return _grown(s, first) if last == 1 else 1 - _grown(1 - s, last)
+    halves = [(1 - 1 / ratio) / np.log(ratio) for ratio in (first, last)]  # lengths where the slope in the middle is 1
+    middle = halves[0] / sum(halves)
+    low, high = np.minimum(2 * s, 1), np.minimum(2 * (1 - s), 1)
+    return np.asarray(np.where(s <= 0.5, middle * _grown(low, first), 1 - (1 - middle) * _grown(high, last)))
+
+
+def _grown(s: FloatArray, ratio: float) -> FloatArray:
+    return np.asarray((ratio**s - 1) / (ratio - 1))
+
+
+class Block(_SixSided):
+    """A block with eight given corners: the trilinear image of a cube.
+
+    Its boundaries x-min, x-max, y-min, y-max, z-min and z-max are the images of the faces of the cube, whatever their
+    direction in space. Linear tetrahedra cut faces that are not plane.
+
+    Parameters
+    ----------
+    corners
+        The images (m) of the corners of the cube, in the order (0,0,0), (1,0,0), (0,1,0), (1,1,0), (0,0,1), (1,0,1),
+        (0,1,1), (1,1,1): x goes first, then y, then z.
+    cells, cell, degree, quadrature_degree
+        The mesh, as of every body with six sides.
+    """
+
+    kind: Literal["block"] = "block"
+    corners: tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector, Vector]
+
+    @property
+    def meshed(self) -> tuple[Length, Length, Length]:
+        """Edge lengths of the cube."""
+        return 1.0, 1.0, 1.0
+
+    @property
+    def vertices(self) -> tuple[Vector, ...]:
+        """The corners (m): x goes first, then y, then z."""
+        return self.corners
+
+    @property
+    def description(self) -> str:
+        """The shape in words."""
+        return f"block with the corners {', '.join('(' + ', '.join(f'{x:g}' for x in c) + ')' for c in self.corners)} m"
+
+    def shaped(self, points: FloatArray) -> FloatArray:
+        """Map points (n, 3) of the cube into the body (m)."""
+        return self._trilinear(*(np.stack([1 - x, x], axis=-1) for x in points.T))
+
+    def contains(self, point: Vector) -> bool:
+        """Whether a point (m) lies in the undeformed body."""
+        steps = np.linspace(0, 1, 5)
+        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        gaps = np.asarray(point) - self.shaped(guesses)
+        # Newton's method from the nearest guess, kept near the cube: the map is not invertible everywhere outside.
+        x = guesses[[np.linalg.norm(gaps, axis=1).argmin()]]
+        for _ in range(30):
+            step = np.linalg.lstsq(self._slopes(x)[0], np.asarray(point) - self.shaped(x)[0], rcond=None)[0]
+            x = np.clip(x + step, -0.1, 1.1)
+        gap = np.abs(np.asarray(point) - self.shaped(x)[0]).max()
+        extent = max(high - low for low, high in self.bounds)
+        return bool(gap <= 1e-9 * extent and (np.abs(x - 0.5) <= 0.5 + 1e-9).all())
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
+        from scipy.optimize import lsq_linear
+
+        steps = np.linspace(0, 1, 5)
+        guesses = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        images = self.shaped(guesses)
+        found = np.empty_like(points)
+        for i, point in enumerate(points):
+            # Gauss and Newton's method in the cube, the steps of which end at its faces.
+            x = guesses[[np.linalg.norm(images - point, axis=1).argmin()]]
+            for _ in range(20):
+                gap = point - self.shaped(x)[0]
+                step = lsq_linear(self._slopes(x)[0], gap, (np.minimum(-x[0], -1e-300), np.maximum(1 - x[0], 1e-300))).x
+                x = np.clip(x + step, 0, 1)
+                if np.abs(step).max() < 1e-12:
+                    break
+            found[i] = self.shaped(x)[0]
+        return found
+
+    def _trilinear(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
+        """Sum the corners with weights (n, 2) of the two ends along each axis."""
+        corners = np.reshape(self.corners, (2, 2, 2, 3))
+        return np.asarray(np.einsum("ni,nj,nk,kjia->na", x, y, z, corners))
+
+    def _slopes(self, points: FloatArray) -> FloatArray:
+        """Derivative (n, 3, 3) of the map: the last axis is that of the cube."""
+        ends = [np.stack([1 - x, x], axis=-1) for x in points.T]
+        slope = np.broadcast_to([-1.0, 1.0], (len(points), 2))
+        columns = [self._trilinear(*(slope if a == axis else ends[a] for a in range(3))) for axis in range(3)]
+        return np.stack(columns, axis=-1)
+
+    @model_validator(mode="after")
+    def _check_corners(self) -> Block:
+        steps = (0.0, 0.5, 1.0)
+        slopes = self._slopes(np.array([(x, y, z) for z in steps for y in steps for x in steps]))
+        # Volume relative to that of a right-angled cell with the same edges.
+        edges = np.linalg.norm(slopes, axis=1).prod(axis=1)
+        if not (np.linalg.det(slopes) > 1e-9 * edges).all():
+            message = (
+                "the corners enclose no volume or turn the block inside out, expected the images of (0,0,0), (1,0,0), "
+                "(0,1,0), (1,1,0), (0,0,1), (1,0,1), (0,1,1), (1,1,1) of a cube, in this order"
+            )
+            raise ValueError(message)
+        return self
+
+
+def _box_by_default(value: Any) -> Any:
+    return {"kind": "box"} | value if isinstance(value, dict) else value
+
+
+Body = Annotated[Box | Block | OwnMesh, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+
+
+def tolerance(body: Body) -> float:
+    """How far (m) a point may lie outside a body and still be meant to lie on it: a thousandth of its diagonal."""
+    return NEARBY * float(np.linalg.norm([high - low for low, high in body.bounds]))
+
+
+def outside(body: Body, point: Vector) -> float:
+    """How far (m) a point lies outside the undeformed body; of a mesh from a file, outside the box around it."""
+    if body.contains(point):
+        return 0.0
+    at = np.array([point])
+    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, OwnMesh) else body.nearest(at)
+    return float(np.linalg.norm(place - at))
+
+
+def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...]:
+    """Say how far points (m), by name, that lie outside a body are moved to it."""
+    distances = {name: outside(body, point) for name, point in points.items()}
+    far = {name: distance for name, distance in distances.items() if distance > ROUNDING * tolerance(body)}
+    if not far:
+        return ()
+    name = max(far, key=far.__getitem__)
+    moved = (
+        f"{len(far)} points lie outside the body and are" if len(far) > 1 else "1 point lies outside the body and is"
+    )
+    text = f"{moved} moved to its surface, by up to {far[name]:.2g} m ('{name}')."
+    return (Finding("note", text),)
+
+
+def holds(body: Body, point: Vector) -> bool:
+    """Whether a point (m) lies in the undeformed body, or no farther outside than `tolerance`.
+
+    Of a mesh from a file the box around it is looked at; where the mesh is made, the point must be near a cell.
+    """
+    return outside(body, point) <= tolerance(body)

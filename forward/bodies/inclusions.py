@@ -1,0 +1,189 @@
+"""Regions that are stiffer or softer than the body around them, as specifications with their smooth indicators.
+
+An indicator takes the operators `ops` (``tanh``, ``sqrt``, ``sin``, ``cos``), a place X and the numbers of its block,
+as the energies in `materials` take their constants; it is 1 well inside, 0 well outside, and differentiable in all of
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import BeforeValidator, Field
+
+from forward.bodies.geometry import Length
+from forward.model import FloatArray
+from forward.settings import Named
+
+TINY = 1e-12  # of the squared radius: keeps distances from the centre, and angles, differentiable where they are zero
+BLEND = 0.1  # squared distance from the centre, over that of the surface, up to which an ellipsoid counts as a ball
+
+
+class Sphere(Named):
+    """A ball in which the energy density is multiplied by `contrast`.
+
+    The factor on the energy is contrast^s with s = ½(1 − tanh((|X−c| − radius)/width)): softer and stiffer
+    inclusions are treated alike, and the factors of inclusions that overlap multiply. A transition that is narrower
+    than a cell is seen by few quadrature points, and derivatives with respect to place and size become rough: let
+    `width` be about the length of a cell.
+
+    Parameters
+    ----------
+    x, y, z
+        Centre c in the undeformed body (m).
+    radius
+        Where the indicator s is ½ (m).
+    contrast
+        Stiffness inside divided by that outside (1).
+    width
+        Half-width of the transition (m): s falls from 0.88 to 0.12 between radius − width and radius + width.
+    """
+
+    kind: Literal["sphere"] = "sphere"
+    x: float
+    y: float
+    z: float
+    radius: Length
+    contrast: Annotated[float, Gt(0)]
+    width: Length
+
+
+class Ellipsoid(Named):
+    """An ellipsoid in which the energy density is multiplied by `contrast`, as in a `Sphere`.
+
+    s = ½(1 − tanh(distance/width)) with a smooth function of the place that is zero on the surface, has there nearly
+    the slope of the distance, and is the distance where all radii are equal. Orders of the radii and turns by half a
+    circle give the same ellipsoid: let priors leave one of these.
+
+    Parameters
+    ----------
+    x, y, z
+        Centre in the undeformed body (m).
+    a, b, c
+        Radii (m) along the axes of the ellipsoid, which are those of the body where nothing is turned.
+    turn_x, turn_y, turn_z
+        Rotation vector (rad): the ellipsoid is turned about this direction, by an angle that is its length.
+    contrast, width
+        As of a sphere.
+    """
+
+    kind: Literal["ellipsoid"] = "ellipsoid"
+    x: float
+    y: float
+    z: float
+    a: Length
+    b: Length
+    c: Length
+    turn_x: float = 0.0
+    turn_y: float = 0.0
+    turn_z: float = 0.0
+    contrast: Annotated[float, Gt(0)]
+    width: Length
+
+
+def _sphere(ops: Any, X: Any, *, x: Any, y: Any, z: Any, radius: Any, width: Any) -> Any:
+    # The tiny sphere around the centre keeps the distance differentiable there.
+    distance = ops.sqrt((X[0] - x) ** 2 + (X[1] - y) ** 2 + (X[2] - z) ** 2 + TINY * radius**2)
+    return (1 - ops.tanh((distance - radius) / width)) / 2
+
+
+def _ellipsoid(
+    ops: Any,
+    X: Any,
+    *,
+    x: Any,
+    y: Any,
+    z: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    turn_x: Any,
+    turn_y: Any,
+    turn_z: Any,
+    width: Any,
+) -> Any:
+    along = _turned(ops, (X[0] - x, X[1] - y, X[2] - z), (-turn_x, -turn_y, -turn_z))
+    square = sum((X_i / r) ** 2 for X_i, r in zip(along, (a, b, c), strict=True)) + TINY
+    # With q² = square and slope = q|∇q|, (q − 1) q/slope is the distance to first order (G. Taubin, IEEE Trans. Pattern
+    # Anal. 13 (1991) 1115–1138). At the centre q/slope depends on the direction: there it is blended with the mean.
+    slope = sum((X_i / r**2) ** 2 for X_i, r in zip(along, (a, b, c), strict=True))
+    distance = (ops.sqrt(square) - 1) * ops.sqrt((square + BLEND) / (slope + (BLEND + TINY) * 3 / (a**2 + b**2 + c**2)))
+    return (1 - ops.tanh(distance / width)) / 2
+
+
+def _turned(ops: Any, v: Any, t: Any) -> tuple[Any, Any, Any]:
+    """Turn v by the rotation vector t: cos θ v + sin θ/θ t × v + (1 − cos θ)/θ² (t·v) t (O. Rodrigues, 1840)."""
+    angle = ops.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2 + TINY**2)
+    cross = (t[1] * v[2] - t[2] * v[1], t[2] * v[0] - t[0] * v[2], t[0] * v[1] - t[1] * v[0])
+    share = ops.sin(angle) / angle
+    # 1 − cos θ = 2 sin²(θ/2), which keeps its digits where θ is small.
+    part = 2 * (ops.sin(angle / 2) / angle) ** 2 * (t[0] * v[0] + t[1] * v[1] + t[2] * v[2])
+    x, y, z = (ops.cos(angle) * v_i + share * w + part * t_i for v_i, w, t_i in zip(v, cross, t, strict=True))
+    return x, y, z
+
+
+def _sphere_by_default(value: Any) -> Any:
+    return {"kind": "sphere"} | value if isinstance(value, dict) else value
+
+
+Inclusion = Annotated[Sphere | Ellipsoid, Field(discriminator="kind"), BeforeValidator(_sphere_by_default)]
+INDICATORS: dict[str, Callable[..., Any]] = {"sphere": _sphere, "ellipsoid": _ellipsoid}
+RADII = {"sphere": ("radius", "radius", "radius"), "ellipsoid": ("a", "b", "c")}
+_OPS = SimpleNamespace(ln=np.log, exp=np.exp, sqrt=np.sqrt, tanh=np.tanh, sin=np.sin, cos=np.cos)
+
+
+def stiffness_factor(ops: Any, X: Any, kind: str, *, contrast: Any, **shape: Any) -> Any:
+    """contrast^s at X, with s the indicator of a kind of inclusion; `shape` holds the numbers of its block."""
+    return ops.exp(INDICATORS[kind](ops, X, **shape) * ops.ln(contrast))
+
+
+# --- what follows from the numbers -----------------------------------------------------------------------------------
+
+
+def derived(
+    inclusions: Sequence[Sphere | Ellipsoid],
+    parameters: Sequence[str],
+    points: FloatArray,
+    places: FloatArray | None = None,
+) -> dict[str, FloatArray]:
+    """Return what follows from the numbers of inclusions at many parameter vectors, by path.
+
+    Parameters
+    ----------
+    inclusions
+        Those of a body.
+    parameters
+        Paths of the parameters; numbers of the inclusions that are not among them keep their values.
+    points
+        Parameters (n, d).
+    places
+        Places (k, 3) (m) at which the factor on the stiffness is wanted.
+
+    Returns
+    -------
+    dict
+        "inclusions.NAME.volume" (m³) of where the indicator is above ½: 4/3 π abc (n,); "stiffness.i" (1), the
+        product of the factors of all inclusions at place i (n,).
+    """
+    found: dict[str, FloatArray] = {}
+    factor: Any = 1.0
+    for inclusion in inclusions:
+        path = f"inclusions.{inclusion.label}"
+        numbers = {
+            name: points[:, [parameters.index(f"{path}.{name}")]] if f"{path}.{name}" in parameters else value
+            for name, value in inclusion.model_dump(exclude={"kind", "name"}).items()
+        }
+        volume = (
+            4 / 3 * np.pi * np.prod([np.broadcast_to(numbers[r], (len(points), 1)) for r in RADII[inclusion.kind]], 0)
+        )
+        found[f"{path}.volume"] = np.asarray(volume[:, 0])
+        if places is not None:
+            factor = factor * stiffness_factor(_OPS, places.T, inclusion.kind, **numbers)
+    if places is not None:
+        columns = np.broadcast_to(factor, (len(points), len(places))).T
+        found |= {f"stiffness.{i}": np.array(column) for i, column in enumerate(columns)}
+    return found

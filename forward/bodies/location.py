@@ -1,0 +1,142 @@
+"""Which cell of a mesh a point lies in, and where in it.
+
+Every point has a cell: that in which it lies or, where it lies in none, the one that it is nearest to, with the place
+there. So rounding, of coordinates that were written with few digits or of nodes that were computed, loses no point; how
+far a point was from the mesh is told, and the caller says how far is too far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.mesh_file import nearest_of
+from forward.model import FloatArray
+
+ROUNDING = 1e-12  # of the extent of the mesh: distance that is none
+STEPS = 30  # of Newton's method in a hexahedron
+NEAREST = 8  # cells that are looked at for a point in none
+AT_ONCE = 2048  # points
+FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])  # of a tetrahedron
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where points lie.
+
+    Attributes
+    ----------
+    cells
+        Number (n,) of the cell.
+    reference
+        Coordinates (n, 3) in the reference cell, never outside.
+    distances
+        How far (n,) the place there is from the point (m); zero for rounding, infinite where there are no cells.
+    """
+
+    cells: NDArray[np.int64]
+    reference: FloatArray
+    distances: FloatArray
+
+
+def locate(corners: FloatArray, points: FloatArray) -> Located:
+    """Find the cells that points lie in, or else are nearest to.
+
+    Parameters
+    ----------
+    corners
+        (n_cells, 4 or 8, 3) of tetrahedra or hexahedra, x first, then y, then z.
+    points
+        (n, 3).
+    """
+    n = len(points)
+    if not len(corners) or not n:
+        return Located(np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.full(n, np.inf))
+    lows, highs = corners.min(axis=1), corners.max(axis=1)
+    tiny = ROUNDING * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    parts = [_some(corners, (lows, highs), part, tiny) for part in np.array_split(points, -(-n // AT_ONCE))]
+    return Located(*(np.concatenate([getattr(part, name) for part in parts]) for name in Located.__annotations__))
+
+
+def _some(corners: FloatArray, boxes: tuple[FloatArray, FloatArray], points: FloatArray, tiny: float) -> Located:
+    point, cell = _candidates(*boxes, points)
+    of_cells = corners[cell]
+    reference = (_in_tetrahedra if corners.shape[1] == 4 else _in_hexahedra)(of_cells, points[point])
+    gap = np.einsum("nk,nka->na", shapes(reference, corners.shape[1]), of_cells) - points[point]
+    distance = np.linalg.norm(gap, axis=1)
+    distance[distance < tiny] = 0.0
+    order = np.lexsort((cell, distance, point))
+    best = order[np.searchsorted(point[order], np.arange(len(points)))]
+    return Located(cell[best], reference[best], distance[best])
+
+
+def _candidates(lows: FloatArray, highs: FloatArray, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs of a point and a cell that may hold it, or may be the nearest, sorted by point."""
+    from scipy.spatial import cKDTree
+
+    centres, slack = (lows + highs) / 2, 0.05 * (highs - lows)
+    reach = float(np.linalg.norm(highs - lows, axis=1).max()) * 0.55
+    near = cKDTree(centres).query_ball_point(points, reach)
+    point = np.repeat(np.arange(len(points)), [len(cells) for cells in near])
+    cell = np.concatenate([np.asarray(cells, dtype=np.int64) for cells in near])
+    inside = ((lows - slack)[cell] <= points[point]).all(axis=1) & (points[point] <= (highs + slack)[cell]).all(axis=1)
+    point, cell = point[inside], cell[inside]
+    lost = np.setdiff1d(np.arange(len(points)), point)
+    pairs = [(point, cell)]
+    for i in lost:
+        far = np.linalg.norm(np.maximum(np.maximum(lows - points[i], points[i] - highs), 0), axis=1)
+        found = np.argsort(far, kind="stable")[:NEAREST]
+        pairs.append((np.full(len(found), i), found))
+    point, cell = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    order = np.argsort(point, kind="stable")
+    return point[order], cell[order]
+
+
+def shapes(reference: FloatArray, corners: int) -> FloatArray:
+    """Values (n, 4 or 8) of the linear shape functions of the corners at reference coordinates (n, 3)."""
+    if corners == 4:
+        return np.column_stack([1 - reference.sum(axis=1), reference])
+    ends = np.stack([1 - reference, reference], axis=1)  # (n, 2, 3)
+    return np.asarray(np.einsum("ni,nj,nk->nkji", ends[..., 0], ends[..., 1], ends[..., 2]).reshape(-1, 8))
+
+
+def _slopes(reference: FloatArray) -> FloatArray:
+    """Their derivatives (n, 8, 3) in hexahedra."""
+    ends = np.stack([1 - reference, reference], axis=1)
+    along = np.broadcast_to(np.array([-1.0, 1.0]), (len(reference), 2))
+    parts = []
+    for axis in range(3):
+        a, b, c = (along if k == axis else ends[..., k] for k in range(3))
+        parts.append(np.einsum("ni,nj,nk->nkji", a, b, c).reshape(-1, 8))
+    return np.stack(parts, axis=2)
+
+
+def _in_tetrahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
+    def shares(places: FloatArray, corners: FloatArray) -> FloatArray:
+        edges = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 2)
+        x = np.linalg.solve(edges, (places - corners[:, 0])[..., None])[..., 0]
+        return np.column_stack([1 - x.sum(axis=1), x])
+
+    found = shares(points, corners)
+    out = np.flatnonzero((found < 0).any(axis=1))
+    if len(out):
+        faces = np.array([nearest_of(corners[out][:, face], points[out]) for face in FACES])
+        best = ((faces - points[out]) ** 2).sum(axis=2).argmin(axis=0)
+        found[out] = np.maximum(shares(faces[best, np.arange(len(out))], corners[out]), 0.0)
+    return np.asarray((found / found.sum(axis=1, keepdims=True))[:, 1:])
+
+
+def _in_hexahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Newton's method in the reference cell, the steps of which end at its faces."""
+    x = np.full((len(points), 3), 0.5)
+    for _ in range(STEPS):
+        gap = points - np.einsum("nk,nka->na", shapes(x, 8), corners)
+        slopes = np.einsum("nkd,nka->nad", _slopes(x), corners)
+        new = np.clip(x + np.linalg.solve(slopes, gap[..., None])[..., 0], 0.0, 1.0)
+        moved = float(np.abs(new - x).max(initial=0.0))
+        x = new
+        if moved < 1e-14:
+            break
+    return x

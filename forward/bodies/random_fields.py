@@ -1,0 +1,386 @@
+"""Log-normal random fields over a body: their specification, and the Gaussian Matérn field that they are made of.
+
+The Gaussian field m solves (κ² − Δ)^{α/2} m = white noise on the vertices of the mesh, which makes it a Matérn field of
+smoothness ν = α − 3/2 in unbounded space: F. Lindgren, H. Rue, J. Lindström, J. R. Stat. Soc. B 73 (2011) 423–498. On a
+body its variance depends on the place (near faces, and in thin bodies above all), so that it is divided by its point
+standard deviation, which is computed. What remains of the boundary is in the correlation.
+
+Vertices stand in the canonical order (`forward.fem.layout`). Nothing here depends on the number of ranks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, assert_never
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import Field, model_validator
+
+from forward.bodies.geometry import Body, Count, Length
+from forward.model import FloatArray
+from forward.settings import Settings
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+PositiveFloat = Annotated[float, Gt(0)]
+Smoothness = Literal[2, 4]
+ROBIN = 1 / 1.42  # coefficient over κ: Y. Daon, G. Stadler, Inverse Probl. Imaging 12 (2018) 1083–1102
+BATCH = 128  # right-hand sides that are solved together
+EQUAL = 1e-6  # relative distance of eigenvalues below which rounding decides on their eigenvectors
+
+
+class RandomField(Settings):
+    """A log-normal random factor over the body, on its stiffness or on its density.
+
+    The factor is exp(ln mean − v/2 + m) with a Gaussian Matérn field m of variance v at the vertices, and the
+    exponential of what is linear between them: at the vertices its expected value is `mean` (also with few modes,
+    where v is that of the modes). Its coefficients are d independent standard normal parameters, ``fields.NAME.0`` and
+    so on, which every study of this model has without naming them.
+
+    Parameters
+    ----------
+    of
+        What is multiplied: the energy density, or the density of the body under gravity.
+    name
+        In paths of parameters; by default what it is a factor of.
+    length
+        Correlation length (m): where the correlation has fallen to about 0.14.
+    std
+        Point standard deviation of the factor.
+    mean
+        Expected value of the factor.
+    smoothness
+        α of the operator: 2 (correlation exp(−2r/length), continuous realisations) or 4 (smooth ones, ν = 5/2).
+    basis
+        "modes": the leading Karhunen–Loève modes. "noise": the white noise at every vertex, nothing is cut off.
+        "nodes": the values of m at the vertices are the parameters themselves, for inversion; they are correlated, and
+        no study has them.
+    modes
+        Number of modes; of "modes" only.
+    """
+
+    of: Literal["stiffness", "density"]
+    name: str = Field(default="", pattern=r"^[^.\s]*$")
+    length: Length
+    std: PositiveFloat
+    mean: PositiveFloat = 1.0
+    smoothness: Smoothness = 2
+    basis: Literal["modes", "noise", "nodes"] = "modes"
+    modes: Count | None = None
+
+    @property
+    def label(self) -> str:
+        """The name in parameter paths."""
+        return self.name or self.of
+
+    @property
+    def log_std(self) -> float:
+        """Point standard deviation of the logarithm."""
+        return float(np.sqrt(np.log1p((self.std / self.mean) ** 2)))
+
+    def paths(self, body: Body) -> tuple[str, ...]:
+        """Paths of the coefficients on a body."""
+        count = self.modes if self.basis == "modes" else body.vertex_count
+        return tuple(f"fields.{self.label}.{i}" for i in range(count or 0))
+
+    @model_validator(mode="after")
+    def _check_modes(self) -> RandomField:
+        if (self.basis == "modes") != (self.modes is not None):
+            wanted = "a number of modes" if self.basis == "modes" else "no modes"
+            message = f"basis = '{self.basis}', expected {wanted}"
+            raise ValueError(message)
+        return self
+
+    def prior(self, body: Body) -> NodalPrior:
+        """Return the distribution of the values at the vertices of a body: what `basis` "nodes" has as parameters."""
+        return NodalPrior(Matern.on(body, self.length, self.smoothness), self.log_std)
+
+    def on(self, body: Body) -> Expansion:
+        """Expand the field on the vertices of a body, in this process: one factorisation, and a solve per vertex."""
+        offset = np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2)
+        match self.basis:
+            case "nodes":
+                return Nodal(offset)
+            case "noise":
+                return Noise(offset, Matern.on(body, self.length, self.smoothness), self.log_std)
+            case "modes":
+                matern = Matern.on(body, self.length, self.smoothness)
+                modes = self.log_std * matern.modes(self.modes or 0)
+                kept = (matern.mass @ modes**2).sum() / (self.log_std**2 * matern.mass.sum())
+                return Modes(np.log(self.mean) - (modes**2).sum(axis=1) / 2, modes, float(kept))
+            case _:
+                assert_never(self.basis)
+
+
+class Expansion(Protocol):
+    """The logarithm of a factor at the N vertices, as an affine function of k coefficients."""
+
+    @property
+    def offset(self) -> FloatArray:
+        """Its values (N,) where all coefficients are zero."""
+
+    @property
+    def kept(self) -> float:
+        """Fraction of the variance of the field, averaged over the body, that the coefficients make."""
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Return the linear part (N,) at coefficients (k,)."""
+
+    def pull(self, slopes: FloatArray) -> FloatArray:
+        """Return derivatives (k,) by the coefficients from those (N,) by the values at the vertices."""
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Scaled Karhunen–Loève modes (N, k)."""
+
+    offset: FloatArray
+    modes: FloatArray
+    kept: float
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Return the sum (N,) of the modes."""
+        return np.asarray(self.modes @ coefficients)
+
+    def pull(self, slopes: FloatArray) -> FloatArray:
+        """Return the products (k,) with the modes."""
+        return np.asarray(slopes @ self.modes)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The square root of the covariance: coefficients are independent and standard normal."""
+
+    offset: FloatArray
+    matern: Matern
+    std: float
+    kept: float = 1.0
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Return the field (N,) of a white noise."""
+        return self.std * self.matern.root(coefficients)
+
+    def pull(self, slopes: FloatArray) -> FloatArray:
+        """Return derivatives (N,) by the noise."""
+        return self.std * self.matern.root_transposed(slopes)
+
+
+@dataclass(frozen=True)
+class Nodal:
+    """The values at the vertices themselves."""
+
+    offset: FloatArray
+    kept: float = 1.0
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Return the coefficients."""
+        return coefficients
+
+    def pull(self, slopes: FloatArray) -> FloatArray:
+        """Return the slopes."""
+        return slopes
+
+
+@dataclass(frozen=True)
+class NodalPrior:
+    """The normal distribution N(0, std² C) of values at the N vertices, with C a Matérn covariance.
+
+    Rows are vectors. The root is that of `Matern`, so that no covariance is ever formed.
+    """
+
+    matern: Matern
+    std: float
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance (N,) at the vertices."""
+        return np.full(len(self.matern.mass), self.std**2)
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Return the field (N,) of a standard normal noise (N,), or (k, N) for k of them."""
+        return self.std * self.matern.root(noise.T).T
+
+    def root_transposed(self, g: FloatArray) -> FloatArray:
+        """Apply the transpose of `root` to (N,) or (k, N)."""
+        return self.std * self.matern.root_transposed(g.T).T
+
+
+class Matern:
+    """A Gaussian field on the vertices of a mesh, of variance one at every vertex.
+
+    With A = κ²M + K + βB, the covariance of the solution of the SPDE is A⁻¹MA⁻¹ for α = 2, and A⁻¹MA⁻¹MA⁻¹MA⁻¹ for
+    α = 4; B acts on the boundary, where ∂m/∂n + βm = 0. (A lumped M would leave the checkerboards of trilinear
+    elements, which K hardly sees, with far too much variance.)
+
+    Parameters
+    ----------
+    mass, laplacian, surface
+        M, K and B (N, N), of trilinear elements.
+    length
+        Correlation length √(8ν)/κ (m).
+    smoothness
+        α.
+    robin
+        β/κ; zero is the Neumann condition.
+
+    Attributes
+    ----------
+    mass
+        Volume (m³) of each vertex (N,): the sums of the rows of M.
+    """
+
+    def __init__(
+        self,
+        mass: csr_matrix,
+        laplacian: csr_matrix,
+        surface: csr_matrix,
+        length: float,
+        smoothness: Smoothness = 2,
+        robin: float = ROBIN,
+    ) -> None:
+        self._smoothness = smoothness
+        self._kappa = inverse_length(length, smoothness)
+        self._matrix = mass
+        self.mass = np.asarray(mass.sum(axis=1)).ravel()
+        self._operator = (self._kappa**2 * mass + laplacian + robin * self._kappa * surface).tocsr()
+        self._factor = _factorise(self._operator)
+
+    @classmethod
+    def on(cls, body: Body, length: float, smoothness: Smoothness = 2, robin: float = ROBIN) -> Matern:
+        """Return the field on the mesh of a body, made in this process alone."""
+        from forward.fem.layout import vertex_matrices
+
+        return cls(*vertex_matrices(body), length, smoothness, robin)
+
+    @cached_property
+    def _mass_factor(self) -> Any:
+        return _factorise(self._matrix)
+
+    @cached_property
+    def _noise(self) -> csr_matrix:
+        """G (N, N) with GGᵀ = M: it makes white noise of independent numbers."""
+        from scipy.sparse import diags
+
+        # M = PᵀLUP with U = DLᵀ, since pivots stay on the diagonal.
+        factor = self._mass_factor
+        return (factor.L @ diags(np.sqrt(factor.U.diagonal()))).tocsr()[factor.perm_r]
+
+    def _smooth(self, x: FloatArray) -> FloatArray:
+        """Apply the symmetric operator A⁻¹, or A⁻¹MA⁻¹ for α = 4."""
+        x = self._factor.solve(x)
+        return np.asarray(self._factor.solve(self._matrix @ x) if self._smoothness == 4 else x)
+
+    @cached_property
+    def _raw_std(self) -> FloatArray:
+        """Point standard deviation (N,) of the solution of the SPDE, by a solve for each vertex."""
+        n = len(self.mass)
+        variance = np.empty(n)
+        for first in range(0, n, BATCH):
+            last = min(first + BATCH, n)
+            units = np.zeros((n, last - first))
+            units[np.arange(first, last), np.arange(last - first)] = 1
+            x = self._smooth(units)
+            variance[first:last] = (x * (self._matrix @ x)).sum(axis=0)
+        return np.asarray(np.sqrt(variance))
+
+    @property
+    def inflation(self) -> FloatArray:
+        """Variance (N,) of the SPDE before it is set to one, over that in unbounded space."""
+        return self._raw_std**2 / unbounded_variance(self._kappa, self._smoothness)
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Return the field (N,) of a standard normal noise (N,), or (N, k) for k of them."""
+        return np.asarray((self._smooth(self._noise @ noise).T / self._raw_std).T)
+
+    def root_transposed(self, g: FloatArray) -> FloatArray:
+        """Apply the transpose of `root` to (N,) or (N, k)."""
+        return np.asarray(self._noise.T @ self._smooth((g.T / self._raw_std).T))
+
+    def covariance(self, g: FloatArray) -> FloatArray:
+        """Multiply the covariance (N, N) with (N,) or (N, k)."""
+        return np.asarray((self._smooth(self._matrix @ self._smooth((g.T / self._raw_std).T)).T / self._raw_std).T)
+
+    def precision(self, x: FloatArray) -> FloatArray:
+        """Multiply the inverse of the covariance with (N,) or (N, k)."""
+        y = self._operator @ (x.T * self._raw_std).T
+        for _ in range(self._smoothness - 1):
+            y = self._operator @ self._mass_factor.solve(y)
+        return np.asarray((y.T * self._raw_std).T)
+
+    def modes(self, count: int) -> FloatArray:
+        """Return the leading Karhunen–Loève modes (N, count), each times the square root of its eigenvalue.
+
+        Eigenfunctions are orthogonal over the body (with the lumped mass); their signs, and the choice among those of
+        one eigenvalue, are conventions that rounding does not touch. The sum of the eigenvalues is the volume.
+        """
+        n, root = len(self.mass), np.sqrt(self.mass)
+        more = min(count + 8, n)  # eigenvalues that a cut would separate from their equals
+        if more > n // 2:
+            values, vectors = np.linalg.eigh(self._symmetric(np.eye(n)))
+        else:
+            from scipy.sparse.linalg import LinearOperator, eigsh
+
+            multiply: Any = LinearOperator((n, n), matvec=self._symmetric, dtype=float)
+            values, vectors = eigsh(multiply, more, which="LA", v0=np.random.default_rng(0).standard_normal(n))
+        order = np.argsort(-values)[:more]
+        values, vectors = np.maximum(values[order], 0), vectors[:, order]
+        functions = _settled(values, (vectors.T / root).T, self.mass)
+        return np.asarray(functions[:, :count] * np.sqrt(values[:count]))
+
+    def _symmetric(self, x: FloatArray) -> FloatArray:
+        """Multiply with L^{1/2} C L^{1/2}."""
+        root = np.sqrt(self.mass)
+        return np.asarray((root * self.covariance((root * x.T).T).T).T)
+
+
+def _settled(values: FloatArray, functions: FloatArray, mass: FloatArray) -> FloatArray:
+    """Settle signs of eigenfunctions (N, k), and turn those of equal eigenvalues so that a fixed weight is diagonal."""
+    n = len(mass)
+    weight = mass * np.cos(np.arange(n) ** 2 / n)  # resembles no symmetry of a body
+    settled = np.empty_like(functions)
+    first = 0
+    for last in range(1, len(values) + 1):
+        if last < len(values) and values[last - 1] - values[last] <= EQUAL * values[0]:
+            continue
+        group = functions[:, first:last]
+        if last - first > 1:
+            _, turn = np.linalg.eigh(group.T @ (weight[:, None] * group))
+            group = group @ turn
+        settled[:, first:last] = group
+        first = last
+    large = np.abs(settled) >= 0.5 * np.abs(settled).max(axis=0)
+    signs = np.sign(settled[large.argmax(axis=0), np.arange(len(values))])
+    return np.asarray(settled * signs)
+
+
+def _factorise(matrix: csr_matrix) -> Any:
+    """Factorise a symmetric positive definite matrix, with its pivots on the diagonal."""
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _nu(smoothness: Smoothness) -> float:
+    return smoothness - 1.5
+
+
+def inverse_length(length: float, smoothness: Smoothness) -> float:
+    """κ = √(8ν)/length (1/m)."""
+    return float(np.sqrt(8 * _nu(smoothness)) / length)
+
+
+def unbounded_variance(kappa: float, smoothness: Smoothness) -> float:
+    """Variance Γ(ν) / (Γ(α) (4π)^{3/2} κ^{2ν}) of the solution in unbounded space (Lindgren, Rue, Lindström 2011)."""
+    from math import gamma, pi
+
+    nu = _nu(smoothness)
+    return float(gamma(nu) / (gamma(smoothness) * (4 * pi) ** 1.5 * kappa ** (2 * nu)))
+
+
+def correlation(distance: FloatArray, length: float, smoothness: Smoothness) -> FloatArray:
+    """Matérn correlation (κr)^ν K_ν(κr) / (2^{ν−1} Γ(ν)) at distances (m), in closed form for ν = 1/2 and 5/2."""
+    x = inverse_length(length, smoothness) * np.asarray(distance)
+    return np.asarray(np.exp(-x) * (1 if smoothness == 2 else 1 + x + x**2 / 3))

@@ -1,0 +1,418 @@
+"""Models that are not of this program, as specifications: a Python function, or a server of the UM-Bridge protocol.
+
+UM-Bridge: L. Seelinger et al., J. Open Source Softw. 8 (2023) 4748; protocol 1.0.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal, NoReturn
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from forward.external.own_modules import Sources, sources
+from forward.external.patience import TimeLimitError, time_limit
+from forward.hyperelastic import Scalar
+from forward.machine import StopError, out_of_memory, reason_to_stop
+from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
+from forward.settings import Settings, nearest
+
+SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
+PROTOCOL = 1.0
+MISUSED = ("InvalidInput", "UnsupportedFeature", "ModelNotFound")  # errors of a server that no other parameters mend
+
+
+class Value(Settings):
+    """An output of an external model.
+
+    Parameters
+    ----------
+    name
+        What it is called in results.
+    unit
+        Its unit, to be shown.
+    """
+
+    name: str = Field(min_length=1)
+    unit: str = "1"
+
+
+def _named(given: Any) -> Any:
+    return {"name": given} if isinstance(given, str) else given
+
+
+Output = Annotated[Value, BeforeValidator(_named, json_schema_input_type=Value | str)]
+
+
+class _Number(Settings):
+    """The block of a parameter of an external model: any finite number."""
+
+    value: float
+
+
+class _External(Settings):
+    """A map from d numbers to m outputs, without a mesh.
+
+    Parameters
+    ----------
+    parameters
+        Values of all d parameters by name, in the order that the model takes them; the random parameters of a study
+        take their place.
+    outputs
+        The m outputs in their order: names, or blocks with `name` and `unit`.
+    solve_seconds
+        Longest time (s, by the clock) for one evaluation, after which it has failed; none by default.
+    """
+
+    kind: str
+    solve_seconds: Annotated[float, Field(gt=0)] | None = None
+    parameters: dict[Annotated[str, Field(pattern=r"^\S+$")], float] = Field(min_length=1)
+    outputs: tuple[Output, ...] = Field(min_length=1)
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Every number that can be made a parameter, by its name."""
+        return {name: Scalar(value, _Number, "value") for name, value in self.parameters.items()}
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """No random fields."""
+        return ()
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """The model in words."""
+
+    @abstractmethod
+    def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
+        """Return the map from all parameters (d,) to outputs (m,), and its Jacobian (m, d) if there is one.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be found.
+        """
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> FunctionModel:
+        """Find the model and make it a function of some of its parameters; the others keep their values."""
+        function, jacobian = self.functions()
+        names, nominal = list(self.parameters), np.array(list(self.parameters.values()))
+        places = [names.index(name) for name in parameters]
+        m = len(self.outputs)
+
+        def whole(point: FloatArray) -> FloatArray:
+            vector = nominal.copy()
+            vector[places] = point
+            return vector
+
+        def slopes(point: FloatArray) -> FloatArray:
+            assert jacobian is not None
+            found = real(jacobian(whole(point)), "jacobian")
+            if found.size != m * len(names) or (found.shape != (m, len(names)) and 1 not in {m, len(names)}):
+                message = f"model.jacobian: returned shape {found.shape}, expected ({m}, {len(names)})"
+                raise ModelError(message)
+            return found.reshape(m, len(names))[:, places]
+
+        return FunctionModel(
+            lambda point: function(whole(point)),
+            parameters,
+            tuple(output.name for output in self.outputs),
+            None if jacobian is None else slopes,
+        )
+
+    @model_validator(mode="after")
+    def _check_names(self) -> _External:
+        for name, count in Counter(output.name for output in self.outputs).items():
+            if count > 1:
+                message = f"{count} outputs are called '{name}', expected different names"
+                raise ValueError(message)
+        return self
+
+
+_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of what they held
+Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
+
+
+class PythonModel(_External):
+    """A Python function of a vector of parameters (d,) that returns the outputs (m,).
+
+    Where it raises an exception, or returns what is not finite, there is no answer: the solve has failed. Modules are
+    found where Python finds them, beside the study, and in the working directory; one that is found at several of these
+    is refused. All modules that they import and that are not installed count as the model's source: results are not
+    continued once one has changed. Data that they read cannot be known; change a module with them.
+
+    Parameters
+    ----------
+    function
+        Dotted path, such as ``beam.tip``.
+    jacobian
+        Dotted path of the derivatives: (d,) → (m, d). Without it, methods that need derivatives refuse the model.
+    parameters, outputs
+        Names, as of every external model.
+    solve_seconds
+        Longest time (s) for one call; code that does not come back to Python is not interrupted.
+    """
+
+    kind: Literal["python"] = "python"
+    function: Dotted
+    jacobian: Dotted | None = None
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        return f"Python function {self.function}{f', derivatives {self.jacobian}' if self.jacobian else ''}"
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The modules of function and Jacobian."""
+        return tuple(path.rpartition(".")[0] for path in (self.function, self.jacobian) if path)
+
+    @property
+    def sources(self) -> Sources:
+        """All modules that the model is made of: what was solved before they changed is no part of its results."""
+        return sources(self.modules)
+
+    def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
+        """Import function and Jacobian."""
+        function = _guarded(self.function, "function", self.solve_seconds)
+        return function, _guarded(self.jacobian, "jacobian", self.solve_seconds) if self.jacobian else None
+
+
+def _imported(module: str) -> ModuleType:
+    """Import a module, again if it or what it imports is another file, or another text, than when it was imported."""
+    importlib.invalidate_caches()
+    now = sources([module]).files
+    for name, (file, _) in now.items():
+        known = getattr(sys.modules.get(name), "__file__", None) or file
+        if _texts.get(name, now[name]) != now[name] or (name not in _texts and Path(known).absolute() != Path(file)):
+            for changed in now.keys() & sys.modules.keys():
+                del sys.modules[changed]
+            break
+    _texts.update(now)
+    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes within a second
+    try:
+        return importlib.import_module(module)
+    finally:
+        sys.dont_write_bytecode = kept
+
+
+def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray], Any]:
+    """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves."""
+    module, _, name = path.rpartition(".")
+    try:
+        function = getattr(_imported(module), name)
+    except AttributeError:
+        known = tuple(word for word in dir(_imported(module)) if not word.startswith("_"))
+        message = f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}"
+        raise ModelError(message) from None
+    except (Exception, SystemExit) as error:
+        if out_of_memory(error):
+            raise
+        message = f"model.{key}: '{module}' cannot be imported: {_said(error)}"
+        raise ModelError(message) from None
+    if not callable(function):
+        message = f"model.{key}: '{path}' is {type(function).__name__}, expected a function"
+        raise ModelError(message)
+
+    def guarded(point: FloatArray) -> Any:
+        try:
+            with time_limit(seconds):
+                return function(point)
+        except SolveError:
+            raise
+        except TimeLimitError:
+            message = f"{path} took longer than solve_seconds = {seconds:g}"
+            raise SolveError(message) from None
+        except SystemExit as error:
+            message = f"{path} ended the process: {_said(error)}"
+            raise StopError(message) from None
+        except Exception as error:
+            if reason_to_stop(error) is not None:
+                raise
+            message = f"{path} raised {_said(error)}"
+            raise SolveError(message) from error
+
+    return guarded
+
+
+def _said(error: BaseException) -> str:
+    """Name and first line of an exception."""
+    lines = str(error).splitlines()
+    return f"{type(error).__name__}{f': {lines[0]}' if lines else ''}"
+
+
+class UmBridgeModel(_External):
+    """A model behind a server of the UM-Bridge protocol.
+
+    Vectors of the server that are several follow one another in `parameters` and `outputs`. Derivatives come from
+    ApplyJacobian or Gradient, whichever the server has (of both, what takes fewer calls). A solve that the server
+    reports as failed is a failed solve; a server that is gone ends the study, which continues with the same command.
+
+    Parameters
+    ----------
+    url
+        Where the server is, such as ``http://localhost:4242``.
+    name
+        Which of its models; may be left out where it has one only.
+    config
+        Options of the model, as the server documents them.
+    parameters, outputs
+        Names, as of every external model.
+    """
+
+    kind: Literal["um-bridge"] = "um-bridge"
+    url: Annotated[str, Field(pattern=r"^https?://\S+$")]
+    name: str | None = None
+    config: dict[str, Any] = Field(default={})
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        options = ", ".join(f"{key} = {value}" for key, value in self.config.items())
+        return f"UM-Bridge model{f' {self.name}' if self.name else ''} at {self.url}{f', {options}' if options else ''}"
+
+    def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
+        """Ask the server what it has."""
+        client = Client(self.url, self.name, self.config, self.solve_seconds)
+        for what, sizes, given in (
+            ("parameters", client.inputs, len(self.parameters)),
+            ("outputs", client.outputs, len(self.outputs)),
+        ):
+            if sum(sizes) != given:
+                message = f"model.{what}: {given} are named, but {self.url} has {sum(sizes)} (in vectors of {sizes})"
+                raise ModelError(message)
+        return client.evaluate, client.jacobian if client.differentiable else None
+
+
+class Client:
+    """A model of an UM-Bridge server.
+
+    Parameters
+    ----------
+    url
+        Of the server.
+    name
+        Of the model; the only one where it is not given.
+    config
+        Options.
+    seconds
+        Longest time for the answer to one question; None to wait for ever.
+
+    Attributes
+    ----------
+    inputs, outputs
+        Lengths of the vectors of parameters and of outputs.
+    differentiable
+        Whether the server gives derivatives.
+
+    Raises
+    ------
+    ModelError
+        If the server does not answer, or has no such model.
+    """
+
+    def __init__(self, url: str, name: str | None, config: dict[str, Any], seconds: float | None = None) -> None:
+        self._url = url.rstrip("/")
+        self._seconds = seconds
+        info = self._ask("Info", None)
+        models = info.get("models", [])
+        if name is None and len(models) != 1:
+            message = f"model.name: missing, expected one of the models of {url}: {', '.join(models)}"
+            raise ModelError(message)
+        self._model = models[0] if name is None else name
+        if self._model not in models:
+            message = f"model.name: '{name}' is not a model of {url}; {nearest(str(name), tuple(models))}"
+            raise ModelError(message)
+        if info.get("protocolVersion") != PROTOCOL:
+            message = f"model.url: {url} speaks version {info.get('protocolVersion')} of UM-Bridge, expected {PROTOCOL}"
+            raise ModelError(message)
+        self._config = config
+        self.inputs: list[int] = self._ask("InputSizes", {"config": config})["inputSizes"]
+        self.outputs: list[int] = self._ask("OutputSizes", {"config": config})["outputSizes"]
+        support = self._ask("ModelInfo", {})["support"]
+        self._forward, self._reverse = (bool(support.get(word)) for word in ("ApplyJacobian", "Gradient"))
+        if not support.get("Evaluate"):
+            message = f"model.url: the model '{self._model}' of {url} cannot be evaluated"
+            raise ModelError(message)
+        self.differentiable = self._forward or self._reverse
+
+    def evaluate(self, point: FloatArray) -> FloatArray:
+        """Return the outputs (m,) at parameters (d,)."""
+        vectors = self._solve("Evaluate", point, {})
+        return np.concatenate([np.asarray(vector, dtype=float) for vector in vectors])
+
+    def jacobian(self, point: FloatArray) -> FloatArray:
+        """Return the derivatives (m, d), by one call for each parameter or for each output."""
+        blocks = [
+            [self._block(point, o, i, m, d) for i, d in enumerate(self.inputs)] for o, m in enumerate(self.outputs)
+        ]
+        return np.block(blocks)
+
+    def _block(self, point: FloatArray, o: int, i: int, m: int, d: int) -> FloatArray:
+        """Derivatives (m, d) of one vector of outputs by one vector of parameters."""
+        which = {"outWrt": o, "inWrt": i}
+        if self._forward and (d <= m or not self._reverse):
+            columns = [self._solve("ApplyJacobian", point, which | {"vec": unit.tolist()}) for unit in np.eye(d)]
+            return np.array(columns, dtype=float).reshape(d, m).T
+        rows = [self._solve("Gradient", point, which | {"sens": unit.tolist()}) for unit in np.eye(m)]
+        return np.array(rows, dtype=float).reshape(m, d)
+
+    def _solve(self, what: str, point: FloatArray, more: dict[str, Any]) -> Any:
+        ends = np.cumsum(self.inputs)[:-1]
+        vectors = [part.tolist() for part in np.split(point, ends)]
+        return self._ask(what, {"input": vectors, "config": self._config} | more, self._seconds)["output"]
+
+    def _ask(self, what: str, question: dict[str, Any] | None, timeout: float | None = SECONDS_TO_ANSWER) -> Any:
+        """Send a question and return the answer."""
+        from urllib.error import HTTPError, URLError
+        from urllib.request import Request, urlopen
+
+        data = None if question is None else json.dumps({"name": self._model} | question).encode()
+        request = Request(f"{self._url}/{what}", data, {"Content-Type": "application/json"})
+        try:
+            with urlopen(request, timeout=timeout) as answer:
+                return json.loads(answer.read())
+        except HTTPError as error:
+            self._refuse(what, error.code, error.read())
+        except TimeoutError:
+            self._refuse_slowness(what, timeout)
+        except URLError as error:
+            if isinstance(error.reason, TimeoutError):
+                self._refuse_slowness(what, timeout)
+            message = f"model.url: {self._url} does not answer ({error.reason}), expected an UM-Bridge server"
+            raise ModelError(message) from None
+        except json.JSONDecodeError:
+            message = f"model.url: {self._url} is no UM-Bridge server: its answer to {what} is not JSON"
+            raise ModelError(message) from None
+        except OSError as error:
+            message = f"model.url: {self._url} broke off ({_said(error)})"
+            raise ModelError(message) from None
+
+    def _refuse_slowness(self, what: str, timeout: float | None) -> NoReturn:
+        if what in {"Evaluate", "Gradient", "ApplyJacobian"}:
+            message = f"{self._url} took longer than solve_seconds = {timeout:g}"
+            raise SolveError(message)
+        message = f"model.url: {self._url} does not answer within {timeout:g} s, expected an UM-Bridge server"
+        raise ModelError(message)
+
+    def _refuse(self, what: str, code: int, body: bytes) -> None:
+        """Say what a server's error means: a failed solve, or a model that cannot be used."""
+        try:
+            said = json.loads(body)["error"]
+            kind, message = str(said["type"]), str(said["message"])
+        except (ValueError, KeyError, TypeError):
+            kind, message = "", f"status {code}"
+        if code == 404 or kind in MISUSED:
+            message = f"model.url: {self._url} refuses {what}: {message}"
+            raise ModelError(message)
+        message = f"{self._url}: {message}"
+        raise SolveError(message)

@@ -1,0 +1,274 @@
+"""The modules of a user's Python model: their files, found without running them, and whether these have changed.
+
+What a module imports is read from its text, also where it imports inside a function; what it loads by a name that it
+computes is known once it is loaded. Files of data that it reads cannot be known.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.metadata
+import json
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from typing import Any
+
+from forward.model import ModelError
+
+_TISSUQ = ("forward", "uq", "inverse", "workflows")
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a model's answers follow from, besides its parameters.
+
+    Attributes
+    ----------
+    files
+        (path, SHA-256) of the modules that are neither of Python's standard library nor installed, by module.
+    versions
+        Versions of the installed distributions that these modules import, or that the model is of.
+    """
+
+    files: dict[str, tuple[str, str]]
+    versions: dict[str, str]
+
+    @property
+    def digest(self) -> str:
+        """One hash of all, wherever the files are."""
+        contents = [sorted((name, text) for name, (_, text) in self.files.items()), sorted(self.versions.items())]
+        return hashlib.sha256(repr(contents).encode()).hexdigest()
+
+    def with_files(self, more: Mapping[str, tuple[str, str]]) -> Sources:
+        """Add files of modules that were loaded otherwise."""
+        return Sources({**more, **self.files}, self.versions)
+
+    def document(self) -> dict[str, Any]:
+        """Return tables for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Sources:
+        """Return what `document` has returned."""
+        files = {str(name): (str(path), str(text)) for name, (path, text) in document["files"].items()}
+        return cls(files, {str(name): str(version) for name, version in document["versions"].items()})
+
+    def change(self, now: Sources) -> str | None:
+        """Say what is no longer as it was here, or nothing if all is."""
+        for module, (path, text) in self.files.items():
+            file, found = now.files.get(module) or (path, hashed(Path(path)))
+            if found != text:
+                return f"{file} {'has changed' if found else 'is gone'}"
+        for module in now.files.keys() - self.files.keys():
+            return f"{now.files[module][0]} is new"
+        for name in sorted(self.versions.keys() | now.versions.keys()):
+            before, after = (of.versions.get(name, "absent") for of in (self, now))
+            if before != after:
+                return f"{name} was {before}, and is {after}"
+        return None
+
+
+def sources(modules: Iterable[str]) -> Sources:
+    """Return what modules, by their dotted names, are made of; nothing of it is run."""
+    files: dict[str, tuple[str, str]] = {}
+    versions: dict[str, str] = {}
+    for name, spec, _ in _walk(modules):
+        file = _file(spec)
+        if file is None:
+            continue
+        if _is_own(file):
+            files[name] = (str(file), hashed(file))
+        elif _is_installed(file):
+            distribution = _distribution(name.partition(".")[0])
+            if distribution is None:
+                files[name] = (str(file), hashed(file))
+            else:
+                versions[distribution] = importlib.metadata.version(distribution)
+    return Sources(files, versions)
+
+
+def other_code(change: str) -> str:
+    """Say that results in a directory are of code that has changed."""
+    return f"holds results of other code: {change}; choose another --out"
+
+
+def hashed(file: Path) -> str:
+    """Return the SHA-256 of a file; empty where it cannot be read."""
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+class Loaded:
+    """The user's modules that were loaded since this was made, with the hashes that they had when they were seen."""
+
+    def __init__(self) -> None:
+        self._before = frozenset(sys.modules)
+        self._files: dict[str, tuple[str, str]] = {}
+
+    def __call__(self) -> dict[str, tuple[str, str]]:
+        """Return (path, SHA-256) by module."""
+        for name in sys.modules.keys() - self._before - self._files.keys():
+            file = getattr(sys.modules[name], "__file__", None)
+            if isinstance(file, str) and file.endswith(".py") and name != "__main__":
+                path = Path(file).absolute()
+                if _is_own(path):
+                    self._files[name] = (str(path), hashed(path))
+        return self._files
+
+    def note(self) -> str:
+        """Say what they are, to be kept with what follows from them; empty if there are none."""
+        files = self()
+        return json.dumps(files, sort_keys=True) if files else ""
+
+    def objection(self, note: str) -> str | None:
+        """Say which of the files of a note is no longer as it was, if one is not."""
+        change = Sources.of({"files": json.loads(note or "{}"), "versions": {}}).change(Sources({}, {}))
+        return None if change is None else other_code(change)
+
+
+def make_visible(modules: Iterable[str], folders: Iterable[Path]) -> None:
+    """Have modules found in some folders too, after all other places.
+
+    Raises
+    ------
+    ModelError
+        If one of them, or one that is imported by a module in these folders, is also a module that is found elsewhere:
+        which one is meant cannot be known.
+    """
+    names = [str(folder) for folder in folders]
+    elsewhere = [entry for entry in sys.path if str(Path(entry or ".").resolve()) not in names]
+    sys.path += [name for name in dict.fromkeys(names) if name not in sys.path]
+    importers = {(module.partition(".")[0], ""): "" for module in modules}
+    for name, spec, imported in _walk(list(modules)):
+        file = _file(spec)
+        if file is not None and any(file.is_relative_to(folder) for folder in names):
+            importers |= {(other.partition(".")[0], name): str(file) for other in imported}
+    for (top, _), importer in importers.items():
+        beside = _file(PathFinder.find_spec(top, names))
+        other = None if beside is None else _elsewhere(top, elsewhere, beside)
+        if other is not None:
+            what = f"{importer} imports '{top}', which" if importer else f"'{top}'"
+            message = (
+                f"model.function: {what} is both {beside} and {other}, expected a name of its own: rename the first"
+            )
+            raise ModelError(message)
+
+
+def find(module: str) -> ModuleSpec | None:
+    """Find a module by its dotted name as it would be found now, without importing the packages that it is in."""
+    top, *rest = module.split(".")
+    spec, name = _found(top), top
+    for step in rest:
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        name = f"{name}.{step}"
+        spec = PathFinder.find_spec(name, list(spec.submodule_search_locations))
+    return spec
+
+
+def _found(top: str) -> ModuleSpec | None:
+    """Find a module or package that is in no other one."""
+    for finder in sys.meta_path:
+        try:
+            spec = finder.find_spec(top, None)
+        except (ImportError, ValueError, AttributeError):
+            continue
+        if spec is not None:
+            return spec
+    return None
+
+
+def _elsewhere(top: str, path: list[str], beside: Path) -> str | None:
+    """Say what else a module is that stands beside a study, if it is: on a path, or of this program."""
+    if top in sys.builtin_module_names or top in sys.stdlib_module_names:
+        return "a module of Python's standard library"
+    if top in _TISSUQ:
+        return "a package of this program"
+    file = _file(PathFinder.find_spec(top, path))
+    return None if file in {None, beside} else f"another module, {file}"
+
+
+def _walk(modules: Iterable[str]) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
+    """Go through modules and what they import, as far as it is the user's own: name, where it is, what it imports."""
+    waiting, seen = list(modules), set[str]()
+    while waiting:
+        parts = waiting.pop().split(".")
+        for name in (".".join(parts[: i + 1]) for i in range(len(parts))):
+            if name in seen:
+                continue
+            seen.add(name)
+            spec = find(name)
+            if spec is None:
+                break
+            file = _file(spec)
+            imported = _imports(name, spec, file) if file is not None and _is_own(file) else set()
+            waiting += sorted(imported - seen)
+            yield name, spec, imported
+
+
+def _imports(name: str, spec: ModuleSpec, file: Path) -> set[str]:
+    """Read from the text of a module what it may import; whoever imports it says what is wrong with it."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+        return set()
+    package = name if spec.submodule_search_locations is not None else name.rpartition(".")[0]
+    found = set[str]()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import():
+                found |= {alias.name for alias in node.names}
+            case ast.ImportFrom():
+                around = package.split(".")
+                base = [] if node.level == 0 else around[: len(around) - node.level + 1]
+                base += node.module.split(".") if node.module else []
+                found |= {".".join([*base, alias.name]) for alias in node.names if alias.name != "*"}
+                found.add(".".join(base))
+            case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called), args=[ast.Constant(value=str(word))]):
+                if called in {"import_module", "__import__"}:
+                    found.add(word)
+            case _:
+                pass
+    return {word for word in found if word and all(part.isidentifier() for part in word.split("."))}
+
+
+def _file(spec: ModuleSpec | None) -> Path | None:
+    return Path(spec.origin).absolute() if spec is not None and spec.has_location and spec.origin else None
+
+
+@cache
+def _library() -> tuple[Path, ...]:
+    return tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
+
+
+def _is_installed(file: Path) -> bool:
+    return not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
+
+
+def _is_tissuq(file: Path) -> bool:
+    root = Path(__file__).resolve().parents[2]
+    return any(file.is_relative_to(root / package) for package in _TISSUQ)
+
+
+def _is_own(file: Path) -> bool:
+    """Whether it is neither installed, nor of the standard library, nor of this program."""
+    library = any(file.resolve().is_relative_to(folder) for folder in _library())
+    return not (library or _is_installed(file) or _is_tissuq(file))
+
+
+@cache
+def _distribution(top: str) -> str | None:
+    """Return the name of the distribution that a module or package is of."""
+    try:
+        importlib.metadata.version(top)
+    except importlib.metadata.PackageNotFoundError:
+        return next(iter(importlib.metadata.packages_distributions().get(top, [])), None)
+    return top

@@ -1,0 +1,1 @@
+"""Finite elements: equations, their solution and derivatives, and what both cost."""

@@ -1,0 +1,119 @@
+"""The canonical order of nodes: sorted by place, so that fields look the same on any number of ranks.
+
+A state (U,) in canonical order holds the displacements of the nodes, interleaved by component, and then, in the mixed
+form, the pressures of the vertices.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.geometry import Body
+from forward.fem import fenicsx
+from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+class Layout:
+    """Where this rank's nodes and unknowns stand in the canonical order (by x, then y, then z).
+
+    Parameters
+    ----------
+    space
+        The space of displacements.
+    comm
+        Communicator of the ranks that share the mesh.
+    pressure
+        The space of pressures, if they are unknowns.
+
+    Attributes
+    ----------
+    positions
+        Canonical positions (n_owned,) of the nodes that this rank owns.
+    coordinates
+        Coordinates (N, 3) of all nodes in canonical order, in m, on every rank.
+    """
+
+    def __init__(self, space: Any, comm: Any, pressure: Any | None = None) -> None:
+        self._space = space
+        self._comm = comm
+        self.coordinates, self._canonical, self.positions = sorted_by_place(space, comm)
+        self.size = self.coordinates.size
+        self._unknowns = (3 * self.positions[:, None] + np.arange(3)).ravel()
+        if pressure is not None:
+            vertices, _, positions = sorted_by_place(pressure, comm)
+            self._unknowns = np.concatenate([self._unknowns, self.size + positions])
+            self.size += len(vertices)
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
+        if self._comm.size == 1:
+            whole = np.empty_like(rows)
+            whole[:, self._unknowns] = rows
+            return whole
+        parts = self._comm.gather((self._unknowns, rows))
+        if parts is None:
+            return None
+        whole = np.empty((len(rows), self.size))
+        for unknowns, part in parts:
+            whole[:, unknowns] = part
+        return whole
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U) in canonical order."""
+        return np.ascontiguousarray(rows[:, self._unknowns])
+
+    def nodes(self) -> NDArray[np.int64]:
+        """Return the canonical positions of this rank's nodes, ghosts included."""
+        return np.asarray(self._canonical[fenicsx.global_node_numbers(self._space)])
+
+    def cells(self) -> tuple[NDArray[np.int64], int]:
+        """Return all cells (n_cells, k) as canonical nodes in VTK's order, and VTK's number of the type; collective."""
+        cells, kind = self._cells()
+        everywhere = np.concatenate(self._comm.allgather(cells))
+        return everywhere[np.lexsort(everywhere.T[::-1])], kind
+
+    def by_cell(self, values: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return numbers of this rank's cells for all cells (n_cells,), in the order of `cells`; collective."""
+        own, _ = self._cells()
+        cells, found = (np.concatenate(self._comm.allgather(part)) for part in (own, values[: len(own)]))
+        return np.asarray(found[np.lexsort(cells.T[::-1])], dtype=np.int64)
+
+    def _cells(self) -> tuple[NDArray[np.int64], int]:
+        """This rank's cells."""
+        local, kind = fenicsx.vtk_cells(self._space)
+        return self.nodes()[local], kind
+
+
+def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the sorted places (N, 3) of all nodes of a space, and canonical numbers: by global number, and of ours."""
+    parts = comm.allgather(fenicsx.node_coordinates(space))
+    everywhere = np.concatenate(parts)
+    # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
+    # simple fractions of the largest extent, off the ends of the intervals.
+    step = 1e-9 * np.ptp(everywhere, axis=0).max()
+    keys = np.floor(everywhere / step + 1 / np.pi).astype(np.int64)
+    order = np.lexsort(keys.T[::-1])
+    canonical = np.empty(len(order), dtype=np.int64)
+    canonical[order] = np.arange(len(order))
+    before = sum(len(part) for part in parts[: comm.rank])
+    return everywhere[order], canonical, canonical[before : before + len(parts[comm.rank])]
+
+
+def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
+    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, vertices in canonical order.
+
+    They are of trilinear hexahedra, whatever the cells of the body: of tetrahedra with these vertices, correlations
+    would depend on how the hexahedra are cut.
+    Each process that calls makes a mesh of its own: the numbers do not depend on how others share theirs.
+    """
+    space, matrices = fenicsx.trilinear_elements(body)
+    _, canonical, _ = sorted_by_place(space, space.mesh.comm)
+    order = np.argsort(canonical)
+    mass, laplacian, surface = (matrix[order][:, order] for matrix in matrices)
+    return mass, laplacian, surface

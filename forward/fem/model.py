@@ -1,0 +1,357 @@
+"""Finite-element model of a hyperelastic body: equilibria, tangents and adjoints.
+
+With the equations F(u, ω) = 0 of `forward.fem.equations`, K = ∂F/∂u: tangent K du = −∂F/∂ω dω; adjoint Kᵀλ = ∂ψ/∂u,
+dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem import fenicsx
+from forward.fem.equations import Discretisation
+from forward.fem.functionals import functional
+from forward.hyperelastic import Hyperelastic
+from forward.model import FloatArray, InadmissibleError, Reference, SolveError, Stability, Work
+from forward.solvers.anderson import Inverse, block_galerkin
+from forward.solvers.newton import Found, Residual, solve
+from forward.solvers.reference import ReferenceFactor, turn
+from forward.solvers.stability import NOT_SCREENED, Screened, draw
+
+FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
+ITERATIONS = 20  # of these derivatives, before a factor is made after all
+
+
+class HyperelasticModel:
+    """A hyperelastic body as a `ForwardModel`: one mesh, one set of forms and one solver for every realisation.
+
+    Parameters
+    ----------
+    spec
+        The body.
+    comm
+        Communicator of the ranks that share it.
+    parameters
+        Paths of the numbers that vary, in the order of the parameter vectors.
+
+    Raises
+    ------
+    ValueError
+        For a path that is not a number of the model, or an output at a point outside the body.
+    """
+
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+        self._scalars = spec.scalars
+        coefficients = set(spec.coefficients)
+        for path in parameters:
+            if path not in self._scalars and path not in coefficients:
+                known = [*self._scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
+                message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
+                raise ValueError(message)
+        self.spec = spec
+        self.parameters = parameters
+        self._materials = spec.materials(parameters)
+        self.outputs = tuple(output.name for output in spec.outputs)
+        self.body = Discretisation(spec, comm, parameters)
+        self.layout = self.body.layout
+        self.displacements = self.layout.coordinates.size
+        self.differentiable = True
+        self._functionals = [functional(output, self.body) for output in spec.outputs]
+        self._visited: object = None  # the solution whose state is set
+        self._factorised: object = None  # the solution that owns the factor at hand
+
+    @cached_property
+    def reference(self) -> ReferenceFactor:
+        """The factor of the last reference that was given."""
+        return ReferenceFactor(self.body)
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> FiniteElementSolution:
+        """Find the equilibrium at `parameters` (d,); collective.
+
+        Parameters
+        ----------
+        start
+            Prediction of the state (U_local,).
+        reference
+            A solution elsewhere, whose factor corrects the prediction. It is factorised when it is first given; the
+            factor is kept until another is.
+        iterations
+            Stop after so many corrections with that factor (Newton steps without a reference, or with
+            ``solver = "newton"``). Derivatives are then those of the equations linearised at the state reached.
+
+        Raises
+        ------
+        SolveError
+            With the load fraction where the solver stopped, the reason, and the history of its iterations.
+        """
+        body = self.body
+        self._visited = self._factorised = None
+        for path, value in zip(self.parameters, parameters, strict=True):
+            scalar = self._scalars.get(path)
+            if scalar is not None:
+                objection = scalar.objection(float(value))
+            else:
+                objection = None if np.isfinite(value) else "input should be a finite number"
+            if objection is not None:
+                message = f"{path} = {value:.6g} is not admissible: {objection}"
+                raise InadmissibleError(message)
+        objection = self._materials.objection(dict(zip(self.parameters, map(float, parameters), strict=True)))
+        if objection is not None:
+            raise InadmissibleError(objection)
+        if self.spec.solver.kind == "newton" or start is None:
+            reference = None
+        screen = False
+        if reference is not None:
+            self.reference.prepare(reference)
+            screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
+        body.work = Work()
+        body.set_parameters(parameters)
+        way = None if reference is None else _Way(self, reference, parameters, screen=screen)
+        with body.time_limit(self.spec.solver.solve_seconds):
+            found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
+        # Where Newton had to take over, the reference is too far away for the derivatives too.
+        solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
+        if found.stability >= Stability.COUNTED and body.symmetric:
+            self._factorised = solution
+        return solution
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
+        return self.layout.gather(rows)
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U) in canonical order."""
+        return self.layout.scatter(rows)
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, nodes) of each random field at parameters (n, d), nodes in canonical order.
+
+        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
+        the vertices.
+        """
+        self._visited = None
+        self.body.forget_parameters()
+        space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
+        found = {field.field.label: field.factors(points, space) for field in self.body.fields}
+        return {label: factors for label, factors in found.items() if factors is not None}
+
+    def region_of_cells(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of the layout's cells; nothing without regions.
+
+        Collective.
+        """
+        if not isinstance(self.spec.body, OwnMesh):
+            return None
+        return self.layout.by_cell(fenicsx.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+        return {field.field.label: field.kept for field in self.body.fields}
+
+    def visit(self, solution: FiniteElementSolution) -> Discretisation:
+        """Set parameters and state to those of a solution, if they are not."""
+        if self._visited is not solution:
+            self.body.set_parameters(solution.parameters)
+            self.body.at_load(1.0)
+            self.body.set_state(solution.state)
+            self._visited = solution
+        self.body.work = solution.work
+        return self.body
+
+    def linearise(self, solution: FiniteElementSolution) -> Discretisation:
+        """Factorise the stiffness at a solution, if the factor at hand is another's."""
+        body = self.visit(solution)
+        if self._factorised is not solution:
+            self._factorised = None  # a factorisation that fails leaves no factor
+            body.factorise(solution.state)
+            self._factorised = solution
+            if solution.stability == Stability.SCREENED and body.symmetric:
+                negative = body.negative_pivots()
+                if negative > 0:
+                    message = (
+                        f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
+                        "derivative has shown: the body buckles, or its mesh is too coarse"
+                    )
+                    raise SolveError(message, work=solution.work, stability=Stability.MISSED)
+                solution.stability = Stability.COUNTED
+        return body
+
+    def has_factor(self, solution: FiniteElementSolution) -> bool:
+        """Whether the factor at hand is that of a solution."""
+        return self._factorised is solution
+
+    def take_reference(self, reference: Reference) -> ReferenceFactor:
+        """Return the factor of a reference; this may change parameters and state."""
+        self._visited = None
+        self.reference.prepare(reference)
+        return self.reference
+
+
+class _Way:
+    """The straight line in parameters from a reference.
+
+    Attributes
+    ----------
+    reference
+        Where it begins.
+    state
+        Of the reference.
+    rotation
+        Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
+    draw
+        A number in [0, 1) that depends on the parameters asked for.
+    """
+
+    def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray, *, screen: bool) -> None:
+        self._screen = screen
+        self.draw = draw(parameters)
+        self._body, self._factor = model.body, model.reference
+        self._from, self._to = reference.parameters, parameters
+        self.reference = reference
+        self.state = reference.state
+        self.rotation: FloatArray | None = None
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        self.rotation = self._factor.rotation(u)
+        return self._factor.inverse(self.rotation)
+
+    def screen(self, u: FloatArray, residual: Residual) -> Screened:
+        if not self._screen or self.rotation is None:
+            return NOT_SCREENED
+        return self._factor.screen(u, residual.vector, self.rotation)
+
+    def at(self, fraction: float) -> None:
+        self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
+        self._body.at_load(1.0)
+
+
+class FiniteElementSolution:
+    """An equilibrium with its linearisation.
+
+    k derivatives cost one factorisation and k back-substitutions. Few derivatives of a solution that was found with a
+    reference are instead solved for with the factor of the reference, to the solver's `derivative_tolerance`.
+    """
+
+    def __init__(
+        self,
+        model: HyperelasticModel,
+        parameters: FloatArray,
+        found: Found,
+        work: Work,
+        way: _Way | None,
+    ) -> None:
+        self._model = model
+        self.parameters = np.array(parameters, dtype=float)
+        self.state = np.array(found.state)
+        self.residual, self.converged = found.residual, found.converged
+        self.stability = found.stability
+        self.work = work
+        for array in (self.parameters, self.state):
+            array.flags.writeable = False
+        self._reference = None if way is None else way.reference
+        self._rotation = None if way is None else way.rotation
+        model.visit(self)
+        self.outputs = np.array([f.value() for f in model._functionals])
+        self.outputs.flags.writeable = False
+
+    @cached_property
+    def _right_sides(self) -> FloatArray:
+        return self._model.visit(self).right_sides()
+
+    @cached_property
+    def _gradients(self) -> FloatArray:
+        """∂ψ/∂u (m, U_local)."""
+        self._model.visit(self)
+        return np.array([f.gradient() for f in self._model._functionals])
+
+    @cached_property
+    def _partials(self) -> FloatArray:
+        """∂ψ/∂ω (m, d)."""
+        self._model.visit(self)
+        return np.array([f.partial() for f in self._model._functionals])
+
+    def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
+        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
+        model = self._model
+        near = self._reference is not None and not model.has_factor(self)
+        if near and self._reference is not None and self._rotation is not None and len(right) <= FEW:
+            found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
+            if found is not None:
+                return found
+        return model.linearise(self).back_substitute(right, transpose=transpose)
+
+    def _solve_near(
+        self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
+    ) -> FloatArray | None:
+        """Solve with the factor of the reference, turned as for its prediction; nothing if that is too far away."""
+        model = self._model
+        factor = model.take_reference(reference)
+        fixed = model.body.fixed
+        first = None
+        if directions is not None and directions.shape[1] <= FEW:
+            # Turned along, the tangents at the reference are what a first back-substitution would give.
+            first = turn(directions @ factor.slopes(), R)
+            first[:, fixed] = 0
+        body = model.visit(self)
+        free = np.array(right)
+        free[:, fixed] = 0
+        found = block_galerkin(
+            lambda x: body.free_stiffness_times(x, transpose=transpose),
+            factor.inverse(R, transpose=transpose),
+            free,
+            body.total,
+            body.norms,
+            model.spec.solver.derivative_tolerance,
+            ITERATIONS,
+            first,
+        )
+        if found is not None:
+            found[:, fixed] = right[:, fixed]
+        return found
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
+        directions = np.atleast_2d(direction)
+        body = self._model.body
+        right = directions[:, body.scalars] @ self._right_sides
+        if body.fields:
+            right += self._model.visit(self).field_right_sides(directions)
+        du = self._solve(right, directions=directions)
+        return du.reshape(*np.shape(direction)[:-1], -1)
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
+        du = self.state_tangent(direction)
+        return self._model.body.total(du @ self._gradients.T) + direction @ self._partials.T
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
+        return self.state_adjoint(weights @ self._gradients) + weights @ self._partials
+
+    def state_adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the state weighted by `weights` (U_local,), or (k, d) for k of them; collective.
+
+        The transpose of `state_tangent`, summed over the ranks.
+        """
+        loads = np.atleast_2d(weights)
+        multipliers = self._solve(loads, transpose=True)
+        body = self._model.body
+        gradients = np.zeros((len(loads), len(self.parameters)))
+        gradients[:, body.scalars] = body.total(multipliers @ self._right_sides.T)
+        if body.fields:
+            body = self._model.visit(self)
+            multipliers[:, body.fixed] = 0
+            gradients -= np.array([body.field_products(multiplier) for multiplier in multipliers])
+        return gradients.reshape(*np.shape(weights)[:-1], -1)

@@ -1,0 +1,136 @@
+"""Random fields on the mesh of a group of ranks: functions of forms that follow the parameters, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import ufl
+
+from forward.bodies.geometry import Body
+from forward.bodies.random_fields import Expansion, Modes, RandomField
+from forward.fem import fenicsx
+from forward.fem.layout import sorted_by_place
+from forward.model import FloatArray
+
+
+class VertexField:
+    """The factor of a random field on a mesh.
+
+    Modes are split over the ranks of the group; a white noise is mapped by the first of them.
+
+    Parameters
+    ----------
+    field, body
+        What is expanded.
+    msh, comm
+        This rank's part of the mesh, and the ranks that share it.
+    parameters
+        Names of all parameters, of which the field picks its own.
+
+    Attributes
+    ----------
+    positions
+        Where (k,) its coefficients stand among the parameters.
+    log
+        Logarithm of the factor, as a variable of forms.
+    direction
+        Change of the logarithm, as a function of forms.
+    test
+        Test function on the vertices.
+    kept
+        Fraction of the variance that the coefficients make.
+    """
+
+    def __init__(self, field: RandomField, body: Body, msh: Any, comm: Any, parameters: tuple[str, ...]) -> None:
+        self.field = field
+        self._comm = comm
+        self._space = fenicsx.scalar_space(msh, 1)
+        _, _, self._vertices = sorted_by_place(self._space, comm)
+        numbers = {path: i for i, path in enumerate(field.paths(body))}
+        self._count = len(numbers)
+        self.positions = np.array([i for i, path in enumerate(parameters) if path in numbers], dtype=np.int64)
+        self._numbers = np.array([numbers[parameters[i]] for i in self.positions], dtype=np.int64)
+        self._expansion: Expansion | None = (
+            field.on(body) if comm.rank == 0 else None
+        )  # on the other ranks of modes too
+        offset, self.kept, modes = comm.bcast(
+            None
+            if self._expansion is None
+            else (
+                self._expansion.offset,
+                self._expansion.kept,
+                self._expansion.modes if isinstance(self._expansion, Modes) else None,
+            )
+        )
+        self._offset = offset[self._vertices]
+        self._modes = None if modes is None else np.ascontiguousarray(modes[self._vertices])
+        if self._modes is not None:
+            self._expansion = None  # every rank keeps its part only
+        self._function = fenicsx.function(self._space)
+        self.log = ufl.variable(self._function)
+        self.direction = fenicsx.function(self._space)
+        self.test = ufl.TestFunction(self._space)
+        self.set(np.zeros(len(parameters)))
+
+    @property
+    def factor(self) -> Any:
+        """The factor, as a UFL expression."""
+        return ufl.exp(self.log)
+
+    def inside(self, integrand: Any) -> bool:
+        """Whether an integrand depends on the field, and the field on parameters."""
+        return len(self.positions) > 0 and self._function in ufl.algorithms.extract_coefficients(integrand)
+
+    def set(self, parameters: FloatArray) -> None:
+        """Set the field to parameters (d,); collective."""
+        _give(self._function, self._offset + self._values(parameters))
+
+    def set_direction(self, direction: FloatArray) -> None:
+        """Set the change of the field to that along a direction (d,) of the parameters; collective."""
+        _give(self.direction, self._values(direction))
+
+    def pull(self, slopes: FloatArray) -> FloatArray:
+        """Return derivatives (k,) by this field's parameters from this rank's part of those by the vertices."""
+        if self._modes is not None:
+            return fenicsx.total(self._comm, slopes @ self._modes)[self._numbers]
+        parts = self._comm.gather((self._vertices, slopes))
+        pulled = None
+        if parts is not None and self._expansion is not None:
+            whole = np.empty(self._count)
+            for vertices, part in parts:
+                whole[vertices] = part
+            pulled = self._expansion.pull(whole)[self._numbers]
+        return np.asarray(self._comm.bcast(pulled))
+
+    def factors(self, points: FloatArray, space: Any) -> FloatArray | None:
+        """Return the factors (n, nodes) at parameters (n, d) at the nodes of a space in canonical order; collective.
+
+        On the first rank only.
+        """
+        _, _, positions = sorted_by_place(space, self._comm)
+        rows = []
+        for point in points:
+            self.set(point)
+            rows.append(np.exp(fenicsx.interpolate(self._function, space)))
+        parts = self._comm.gather((positions, np.array(rows)))
+        if parts is None:
+            return None
+        whole = np.empty((len(points), sum(len(nodes) for nodes, _ in parts)))
+        for nodes, part in parts:
+            whole[:, nodes] = part
+        return whole
+
+    def _values(self, parameters: FloatArray) -> FloatArray:
+        """Linear part of the logarithm at this rank's vertices."""
+        coefficients = np.zeros(self._count)
+        coefficients[self._numbers] = parameters[self.positions]
+        if self._modes is not None:
+            return np.asarray(self._modes @ coefficients)
+        whole = None if self._expansion is None else self._expansion.values(coefficients)
+        return np.asarray(self._comm.bcast(whole)[self._vertices])
+
+
+def _give(function: Any, values: FloatArray) -> None:
+    function.x.array[: len(values)] = values
+    function.x.scatter_forward()

@@ -1,0 +1,1 @@
+"""Strain energies, measures of deformation, and what a material is at a point."""

@@ -1,0 +1,153 @@
+"""Which constants make a material: those with which it is stable at rest.
+
+The undeformed body resists every small strain where its shear modulus μ and its bulk modulus κ are positive (G. A.
+Holzapfel, Nonlinear Solid Mechanics (2000), section 6.1). That is asked of the constants together, not of each: C2 of a
+Mooney–Rivlin material may be negative as long as C1 + C2 is not, and so may be a term of an Ogden material, or C20 of a
+Yeoh material. Besides, constants have the ranges in which their energy is one at all (`forward.materials.energies`: the
+chains of a Gent material have some length). What happens at large strains is found there, by the solve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+from annotated_types import Ge, Gt
+from numpy.typing import NDArray
+
+from forward.materials.energies import MATERIALS, constants
+from forward.model import FloatArray
+
+Values = Mapping[str, Any]  # of constants by name: numbers, or arrays (n,)
+
+
+class _AtRest(NamedTuple):
+    """A modulus of the undeformed body, in words and as a function of the constants."""
+
+    words: str
+    of: Callable[[Values], Any]
+
+
+_SHEAR: dict[str, _AtRest] = {
+    "mooney-rivlin": _AtRest("2 (C1 + C2)", lambda v: 2 * (v["C1"] + v["C2"])),
+    "neo-hookean": _AtRest("2 C1", lambda v: 2 * v["C1"]),
+    "neo-hookean-coupled": _AtRest("mu", lambda v: v["mu"]),
+    "yeoh": _AtRest("2 C10", lambda v: 2 * v["C10"]),
+    "gent": _AtRest("mu", lambda v: v["mu"]),
+    "demiray": _AtRest("a", lambda v: v["a"]),
+    "saint-venant-kirchhoff": _AtRest("mu", lambda v: v["mu"]),
+    "blatz-ko": _AtRest("mu", lambda v: v["mu"]),
+    "ogden": _AtRest(
+        "(mu1 alpha1 + mu2 alpha2 + mu3 alpha3)/2",
+        lambda v: (v["mu1"] * v["alpha1"] + v["mu2"] * v["alpha2"] + v["mu3"] * v["alpha3"]) / 2,
+    ),
+    "holzapfel-gasser-ogden": _AtRest("c", lambda v: v["c"]),
+}
+_LAME = _AtRest("lmbda + 2/3 mu", lambda v: v["lmbda"] + 2 / 3 * v["mu"])
+_BULK: dict[str, _AtRest] = {
+    "neo-hookean-coupled": _LAME,
+    "saint-venant-kirchhoff": _LAME,
+    "blatz-ko": _AtRest("5/3 mu", lambda v: 5 / 3 * v["mu"]),
+}
+_VOLUME = _AtRest("2 D1", lambda v: 2 * v["D1"])  # of energies that split
+
+
+def moduli(energy: str, values: Values) -> tuple[Any, Any]:
+    """Return the shear and the bulk modulus (Pa) at rest of a kind of material; κ is infinite where D1 is left out."""
+    bulk = _BULK.get(energy, _VOLUME)
+    incompressible = bulk is _VOLUME and "D1" not in values
+    return _SHEAR[energy].of(values), np.inf if incompressible else bulk.of(values)
+
+
+def objection(energy: str, values: Mapping[str, float]) -> str | None:
+    """Say why these constants are of no material, or None if they are."""
+    for limit in _limits(energy):
+        if limit.name in values and not limit.holds(values[limit.name]):
+            return f"{limit.name} = {values[limit.name]:.6g}, expected {limit.words}"
+    bulk = _BULK.get(energy, _VOLUME)
+    for symbol, modulus, formula in zip("μκ", moduli(energy, values), (_SHEAR[energy], bulk), strict=True):
+        if not modulus > 0:
+            return f"not stable at rest: {symbol} = {formula.words} = {modulus:.6g} Pa, expected more than 0"
+    return None
+
+
+def admissible(energy: str, values: Values) -> NDArray[np.bool_]:
+    """Return which constants, numbers or arrays (n,), are of a material (n,)."""
+    shear, bulk = moduli(energy, values)
+    good = (np.asarray(shear) > 0) & (np.asarray(bulk) > 0)
+    for limit in _limits(energy):
+        if limit.name in values:
+            good = good & limit.holds(values[limit.name])
+    return np.asarray(good)
+
+
+class _Limit(NamedTuple):
+    """The range in which a constant makes an energy."""
+
+    name: str
+    least: float
+    reached: bool  # whether the constant may be that
+
+    def holds(self, value: Any) -> Any:
+        return np.asarray(value) >= self.least if self.reached else np.asarray(value) > self.least
+
+    @property
+    def words(self) -> str:
+        return f"{'at least' if self.reached else 'more than'} {self.least:g}"
+
+
+@cache
+def _limits(energy: str) -> tuple[_Limit, ...]:
+    hints = constants(MATERIALS[energy])
+    return tuple(
+        _Limit(name, float(str(limit.gt if isinstance(limit, Gt) else limit.ge)), isinstance(limit, Ge))
+        for name, hint in hints.items()
+        for limit in get_args(hint)
+        if isinstance(limit, Gt | Ge)
+    )
+
+
+@dataclass(frozen=True)
+class Materials:
+    """The materials of a model as functions of its parameters.
+
+    Parameters
+    ----------
+    energy
+        Kind of all of them.
+    constants
+        By the place of each material in the model: values of its constants, or the names of the parameters that they
+        are.
+    """
+
+    energy: str
+    constants: Mapping[str, Mapping[str, float | str]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that are constants."""
+        found = (value for of in self.constants.values() for value in of.values() if isinstance(value, str))
+        return tuple(dict.fromkeys(found))
+
+    def objection(self, values: Mapping[str, float]) -> str | None:
+        """Say where and why parameters are of no material, or None if they are."""
+        return next((f"{place}: {said}" for place, said in self.objections(values)), None)
+
+    def objections(self, values: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+        """Say of each place whose parameters are of no material why."""
+        for place, own in self._at(values):
+            said = objection(self.energy, own)
+            if said is not None:
+                yield place, said
+
+    def admissible(self, values: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
+        """Return which parameters, arrays (n,) by name, are of materials (n,)."""
+        found = [admissible(self.energy, own) for _, own in self._at(values)]
+        return np.asarray(np.all(np.broadcast_arrays(*found), axis=0))  # a place may have no parameters of its own
+
+    def _at(self, values: Values) -> Iterator[tuple[str, dict[str, Any]]]:
+        for place, own in self.constants.items():
+            yield place, {name: values[value] if isinstance(value, str) else value for name, value in own.items()}

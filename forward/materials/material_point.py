@@ -1,0 +1,490 @@
+"""Material-point tests: the stress of a homogeneously deformed specimen, from the energies of the finite elements.
+
+A test prescribes one stretch (or shear) x, and perhaps another one z across; free faces leave the lateral stretch y.
+With the energy W(x, z, y) of the specimen per volume, the nominal stresses that do work on x and on z are
+
+    P1 = (1/k) dW(x, z, y(x, z))/dx,   P2 = dW(x, z, y(x, z))/dz,
+
+with k = 2 where two equal stretches are prescribed. An incompressible specimen has y from J = 1; a compressible one has
+∂W/∂y = 0, and then dW/dx = ∂W/∂x. Cauchy stresses are P1 x/J and P2 z/J. Fibres lie such that no shear is needed for
+that. SymPy reads the energy and differentiates it, so that stresses and their derivatives with respect to the constants
+are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics
+(2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import Field, model_validator
+
+from forward.materials.admissible import objection
+from forward.materials.energies import MATERIALS, constants, measures
+from forward.materials.kinematics import dilation_of, of_stretches
+from forward.model import FloatArray, FunctionModel, FunctionSolution, InadmissibleError, Reference, SolveError
+from forward.settings import Settings
+
+Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
+Component = Literal["P1", "P2", "P1-P2"]
+HELD: tuple[Mode, ...] = ("biaxial", "pure-shear")  # modes in which something acts across
+Positive = Annotated[float, Gt(0)]
+ITERATIONS = 60  # of Newton's method for the lateral stretch
+ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
+
+
+class MaterialTest(Settings):
+    """One homogeneous test of a material: what is prescribed, and which stress is read.
+
+    Parameters
+    ----------
+    mode
+        "uniaxial" (tension or compression), "equibiaxial", "biaxial" (two stretches), "pure-shear" (planar tension: one
+        width is held) or "simple-shear".
+    at
+        Stretches λ > 0, or amounts of shear γ.
+    across
+        Second stretch at each of them (biaxial only).
+    stress
+        "nominal" (force over undeformed area) or "cauchy".
+    component
+        Which stress is read: "P1", along `at`; in "biaxial" and "pure-shear" also "P2", across, and their difference
+        "P1-P2", which of Cauchy stresses does not depend on the pressure.
+    name
+        Name of the test in the names of the outputs; by default its mode, with the component where that is not P1.
+    """
+
+    mode: Mode
+    at: tuple[float, ...] = Field(min_length=1)
+    across: tuple[Positive, ...] | None = None
+    stress: Literal["nominal", "cauchy"] = "nominal"
+    component: Component = "P1"
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name in outputs."""
+        return self.name or named(self.mode, self.component)
+
+    @model_validator(mode="after")
+    def _check(self) -> MaterialTest:
+        if self.mode != "simple-shear" and min(self.at) <= 0:
+            message = f"at: stretch {min(self.at):g}, expected positive ones (1 is undeformed)"
+            raise ValueError(message)
+        if (self.across is not None) != (self.mode == "biaxial"):
+            message = "across: is for mode = 'biaxial', and only for it"
+            raise ValueError(message)
+        if self.component != "P1" and self.mode not in HELD:
+            message = f"component: {self.component} of a test '{self.mode}', expected P1: nothing acts across"
+            raise ValueError(message)
+        if self.across is not None and len(self.across) != len(self.at):
+            message = f"across: {len(self.across)} stretches, expected as many as in at: {len(self.at)}"
+            raise ValueError(message)
+        return self
+
+
+def named(test: str, component: Component) -> str:
+    """Return the name of a test with that of the stress that is read, where it is not the first one."""
+    return test if component == "P1" else f"{test} {component}"
+
+
+class HomogeneousModel:
+    """A forward model: stresses (Pa) of material tests as outputs, the constants of a material as parameters.
+
+    Parameters
+    ----------
+    energy
+        Kind of the material, see `forward.materials.energies`.
+    values
+        Its constants; without the constant D1, an energy that has one is that of an incompressible material.
+    tests
+        What is measured.
+    parameters
+        Names of the constants that vary; the others keep their values.
+    fibres
+        Directions of one or two families of fibres, where the material has them: components along the stretch x, along
+        what is prescribed across (in simple shear, x moves along the first, more so along the second), and along y.
+
+    Raises
+    ------
+    ValueError
+        If constants are missing or unknown, or a test would shear the specimen.
+    """
+
+    differentiable = True
+    displacements = 0
+
+    def __init__(
+        self,
+        energy: str,
+        values: dict[str, float],
+        tests: Sequence[MaterialTest],
+        parameters: Sequence[str],
+        fibres: Sequence[tuple[float, float, float]] = (),
+    ) -> None:
+        units = tuple(tuple((np.array(fibre) / np.linalg.norm(fibre)).tolist()) for fibre in fibres)
+        objection = next(filter(None, (unfit(energy, test.mode, fibres) for test in tests)), None)
+        if objection is not None:
+            raise ValueError(objection)
+        known = constants(MATERIALS[energy])
+        given = dict.fromkeys([*values, *parameters])
+        unknown, missing = set(given) - set(known), set(known) - set(given) - {"D1"}
+        if unknown or missing:
+            message = f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}"
+            raise ValueError(message)
+        self.parameters = tuple(parameters)
+        self._names = tuple(name for name in known if name in given)
+        self._energy = energy
+        self._free = "D1" not in known or "D1" in given  # faces move as they like, and where to has to be found
+        self._values = np.array([values.get(name, np.nan) for name in self._names])
+        self._varied = [self._names.index(name) for name in parameters]
+        self._tests = tuple(tests)
+        self._readings = [
+            reading(energy, test.mode, self._names, units, test.component, test.stress == "cauchy") for test in tests
+        ]
+        many = {test.label for test in tests if len(test.at) > 1}
+        self.outputs = tuple(
+            f"{test.label}[{i}]" if test.label in many else test.label for test in tests for i in range(len(test.at))
+        )
+
+    def stresses(self, points: FloatArray) -> FloatArray:
+        """Return the stresses (n, m) at parameters (n, d), NaN where there is none (a Gent chain at its end)."""
+        return np.concatenate([values for values, _ in self._evaluate(points, derivatives=False)], axis=1)
+
+    def stresses_and_derivatives(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the stresses (n, m) and their derivatives (n, m, d) at parameters (n, d)."""
+        values, slopes = zip(*self._evaluate(points, derivatives=True), strict=True)
+        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+
+    def _evaluate(self, points: FloatArray, *, derivatives: bool) -> list[tuple[FloatArray, FloatArray]]:
+        points = np.asarray(points, dtype=float)
+        theta = np.tile(self._values[:, None, None], (1, len(points), 1))
+        theta[self._varied] = points.T[:, :, None]
+        found = []
+        for test, read in zip(self._tests, self._readings, strict=True):
+            x, across = np.array(test.at), np.array(test.across if test.across is not None else 1.0)
+            stress, slopes = read(x, across, theta, derivatives)
+            found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
+        return found
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> FunctionSolution:
+        """Return the stresses (m,) at `parameters` (d,).
+
+        Raises
+        ------
+        InadmissibleError
+            Where the constants are of no material, or an incompressible one has no energy in a test.
+        SolveError
+            Where a test of a compressible one has no stress.
+        """
+        return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
+
+    def _one(self, parameters: FloatArray) -> FloatArray:
+        here = dict(zip(self._names, self._values, strict=True))
+        said = objection(self._energy, here | dict(zip(self.parameters, map(float, parameters), strict=True)))
+        if said is not None:
+            raise InadmissibleError(said)
+        values = np.asarray(self.stresses(parameters[None, :])[0])
+        if np.isfinite(values).all():
+            return values
+        name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
+        if self._free:
+            message = f"no stress in the test {name}: the material has no energy, or no equilibrium, there"
+            raise SolveError(message)
+        message = f"no stress in the test {name}: the material has no energy there"
+        raise InadmissibleError(message)
+
+    def _jacobian(self, parameters: FloatArray) -> FloatArray:
+        return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])
+
+    def gather(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Return the (empty) rows as they are."""
+        return rows
+
+
+# --- closed forms --------------------------------------------------------------------------------------------------
+
+
+class _Kinematics(NamedTuple):
+    """Stretches of a mode with x prescribed, z prescribed across and y free; y where the volume does not change.
+
+    All stretches stand less one, so that small ones keep their digits; in simple shear, x is the amount of shear.
+    """
+
+    stretches: Callable[[Any, Any, Any, Any], tuple[Any, Any, Any]]  # of sympy, x, z, y
+    incompressible: Callable[[Any, Any, Any], Any] | None  # of sympy, x, z; nothing is free where there is none
+    share: int = 1  # prescribed stretches that are x
+    alike: tuple[tuple[int, int], ...] = ()  # directions in which the specimen is stretched alike, and so must be made
+
+
+_MODES: dict[str, _Kinematics] = {
+    "uniaxial": _Kinematics(
+        lambda ops, x, z, y: (x, y, y),
+        lambda ops, x, z: -x / (ops.sqrt(1 + x) * (1 + ops.sqrt(1 + x))),
+        alike=((1, 2),),
+    ),
+    "equibiaxial": _Kinematics(
+        lambda ops, x, z, y: (x, x, y), lambda ops, x, z: -x * (2 + x) / (1 + x) ** 2, share=2, alike=((0, 1),)
+    ),
+    "biaxial": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda ops, x, z: -(x + z + x * z) / ((1 + x) * (1 + z))),
+    "pure-shear": _Kinematics(lambda ops, x, z, y: (x, z, y), lambda ops, x, z: -(x + z + x * z) / ((1 + x) * (1 + z))),
+    # λ₁ − 1/λ₁ = γ; the volume does not change, and no face is free.
+    "simple-shear": _Kinematics(lambda ops, x, z, y: (_sheared(ops, x) + x / 2, _sheared(ops, x) - x / 2, 0), None),
+}
+
+
+def _sheared(ops: Any, gamma: Any) -> Any:
+    """√(1 + γ²/4) − 1."""
+    return gamma**2 / 4 / (1 + ops.sqrt(1 + gamma**2 / 4))
+
+
+Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray, FloatArray]]
+
+
+def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
+    """Say why fibres do not fit a material and a mode, or nothing if they do.
+
+    Where a face is free, the material must be alike on both sides of each plane of the mode (reflections leave the
+    families of fibres as they are, up to their sign), and in the directions that are stretched alike.
+    """
+    if ("i4" in measures(energy)) != bool(fibres):
+        return f"material '{energy}': {'expected fibres' if not fibres else 'has no fibres'}"
+    if mode == "simple-shear" or not fibres:
+        return None
+    families = np.array(fibres)
+    families = families / np.linalg.norm(families, axis=1)[:, None]
+    changes = [np.eye(3) - 2 * np.diag(axis) for axis in np.eye(3)]
+    for i, j in _MODES[mode].alike:
+        swap = np.eye(3)
+        swap[[i, j]] = swap[[j, i]]
+        changes.append(swap)
+    if all(np.isclose(np.abs(families @ change @ families.T).max(axis=0), 1).all() for change in changes):
+        return None
+    return f"fibres that a test '{mode}' would shear, or stretch unlike: expected them along axes, or a mirrored pair"
+
+
+@cache
+def reading(
+    energy: str,
+    mode: Mode,
+    names: tuple[str, ...],
+    fibres: tuple[tuple[float, float, float], ...] = (),
+    component: Component = "P1",
+    cauchy: bool = False,
+) -> Reading:
+    """Return (x (k,), z (k,), θ (c, n, 1), derivatives) → stresses (n, k) and dσ/dθ (c, n, k) of a mode.
+
+    Parameters
+    ----------
+    energy
+        Kind of the material.
+    names
+        The c constants θ; without D1 an energy that has it is read at J = 1.
+    fibres
+        Unit vectors along the families of fibres.
+    component, cauchy
+        Which stress, as of `MaterialTest`.
+    """
+    kinematics = _MODES[mode]
+    confined = kinematics.incompressible is None
+    incompressible = "D1" in constants(MATERIALS[energy]) and "D1" not in names
+    free = not incompressible and not confined
+    energies = _of_measures(energy, names, len(fibres))
+    ways = [_of_stretches(mode, name, incompressible=incompressible, fibres=fibres) for name in measures(energy)]
+    share = {"P1": (1, 0), "P2": (0, 1), "P1-P2": (1, -1)}[component]
+
+    def shares(x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[Any, Any, Any]:
+        """What the nominal stresses along x and z are multiplied by, and the relative slope of both along y."""
+        along, across = share[0] / kinematics.share, share[1]
+        if not cauchy or confined:
+            return along, across, 0.0
+        J = 1.0 if incompressible else 1 + dilation_of(kinematics.stretches(np, x, z, y))
+        both = 2 if mode == "uniaxial" else 1  # faces that are free
+        return along * (1 + x) / J, across * (1 + z) / J, 0.0 if incompressible else -both / (1 + y)
+
+    def balance(x: FloatArray, z: FloatArray, y: FloatArray, theta: FloatArray) -> tuple[Any, Any]:
+        """∂W/∂y and ∂²W/∂y²."""
+        m, _, _, by_y = _joined([way.first(x, z, y) for way in ways])
+        *_, by_yy = _joined([way.second(x, z, y) for way in ways])
+        _, by_m = energies.first(m, theta)
+        turned = [_sum(row, by_y) for row in energies.second(m, theta)]
+        return _sum(by_m, by_y), _sum(turned, by_y) + _sum(by_m, by_yy)
+
+    def read(
+        at: FloatArray, across: FloatArray, constants_: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        shape = np.broadcast_shapes(at.shape, constants_.shape[1:])
+        x, z = (at, across - 1) if confined else (at - 1, across - 1)
+        y = np.zeros(shape)
+        with np.errstate(all="ignore"):
+            if kinematics.incompressible is not None:
+                y = np.broadcast_to(kinematics.incompressible(np, x, z), shape)
+            if free:
+                y = _lateral(lambda y: balance(x, z, y, constants_), y)
+            m, by_x, by_z, by_y = _joined([way.first(x, z, y) for way in ways])
+            W, by_m = energies.first(m, constants_)
+            a, b, slope = shares(x, z, y)
+            stress = a * _sum(by_m, by_x) + b * _sum(by_m, by_z)
+            # Beyond where an energy ends, its derivatives may be numbers.
+            stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
+            if not derivatives:
+                return stress, np.zeros((0, *shape))
+            mixed = energies.mixed(m, constants_)
+            found = [a * _sum(row, by_x) + b * _sum(row, by_z) for row in mixed]
+            if free:
+                by_xy, by_zy, by_yy = _joined([way.second(x, z, y) for way in ways])
+                turned = [_sum(row, by_y) for row in energies.second(m, constants_)]
+                g_y = _sum(turned, by_y) + _sum(by_m, by_yy)
+                along, aside = _sum(turned, by_x) + _sum(by_m, by_xy), _sum(turned, by_z) + _sum(by_m, by_zy)
+                by_lateral = a * along + b * aside + slope * stress
+                found = [one - by_lateral * _sum(row, by_y) / g_y for one, row in zip(found, mixed, strict=True)]
+            by_constant = np.array([np.broadcast_to(one, shape) for one in found]).reshape(len(names), *shape)
+        return stress, np.where(np.isfinite(stress), by_constant, np.nan)
+
+    return read
+
+
+def _sum(left: Sequence[Any], right: Sequence[Any]) -> Any:
+    """Σ_i left_i right_i."""
+    return sum(a * b for a, b in zip(left, right, strict=True))
+
+
+class _Energies(NamedTuple):
+    """An energy W of measures m and constants θ: functions of (m, θ)."""
+
+    first: Callable[[Any, Any], tuple[Any, list[Any]]]  # W and ∂W/∂m
+    second: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂m∂m
+    mixed: Callable[[Any, Any], list[list[Any]]]  # ∂²W/∂θ∂m, for each θ
+
+
+@cache
+def _of_measures(energy: str, names: tuple[str, ...], families: int) -> _Energies:
+    import sympy
+
+    m: list[Any] = []
+    given: list[Any] = []
+    for name in measures(energy):
+        own = sympy.symbols([f"{name}_{k}" for k in range(families if name == "i4" else 1)])
+        m += own
+        given.append(tuple(own) if name == "i4" else own[0])
+    theta = sympy.symbols(names)
+    values = dict(zip(names, theta, strict=True))
+    if "D1" in constants(MATERIALS[energy]):
+        values.setdefault("D1", sympy.Integer(0))
+    W = MATERIALS[energy](_operators(), *given, **values)
+    slopes = [sympy.diff(W, one) for one in m]
+    first = _compiled([*m, *theta], [W, *slopes])
+    second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m])
+    mixed = _compiled([*m, *theta], [slope.diff(one) for one in theta for slope in slopes])
+    n = len(m)
+
+    def rows(found: Sequence[Any]) -> list[list[Any]]:
+        return [list(found[i : i + n]) for i in range(0, len(found), n)]
+
+    def value_and_slopes(m: Any, theta: Any) -> tuple[Any, list[Any]]:
+        value, *by_m = first(*m, *theta)
+        return value, by_m
+
+    return _Energies(
+        value_and_slopes, lambda m, theta: rows(second(*m, *theta)), lambda m, theta: rows(mixed(*m, *theta))
+    )
+
+
+class _Paths(NamedTuple):
+    """Measures m of a mode, as functions of its stretches (x, z, y) less one."""
+
+    first: Callable[[Any, Any, Any], list[list[Any]]]  # m, and its derivatives by x, z and y
+    second: Callable[[Any, Any, Any], list[list[Any]]]  # derivatives of that by y, by x, z and y
+
+
+def _joined(parts: Sequence[list[list[Any]]]) -> list[list[Any]]:
+    """Join the lists of several measures, each in its place."""
+    return [[one for found in same for one in found] for same in zip(*parts, strict=True)]
+
+
+@cache
+def _of_stretches(
+    mode: Mode, name: str, *, incompressible: bool, fibres: tuple[tuple[float, float, float], ...]
+) -> _Paths:
+    import sympy
+
+    kinematics, ops = _MODES[mode], _operators()
+    x, z, y = symbols = sympy.symbols("x z y")
+    across = y
+    if incompressible and kinematics.incompressible is not None:
+        across = kinematics.incompressible(sympy, x, z)
+    confined = kinematics.incompressible is None
+    e, f, g = stretches = kinematics.stretches(sympy, x, z, across)
+    dilation = sympy.Integer(0) if incompressible or confined else dilation_of(stretches)
+    longer = tuple(
+        2 * x * a * b + x**2 * b**2 if confined else e * (2 + e) * a**2 + f * (2 + f) * b**2 + g * (2 + g) * c**2
+        for a, b, c in fibres
+    )
+    known = of_stretches(ops, stretches, dilation, longer)
+    m = list(known[name]) if name == "i4" else [known[name]]
+    by_y = [sympy.diff(one, y) for one in m]
+    first = _compiled(symbols, [*m, *(sympy.diff(one, way) for way in (x, z) for one in m), *by_y])
+    second = _compiled(symbols, [one.diff(way) for way in (x, z, y) for one in by_y])
+    n = len(m)
+
+    def rows(found: Sequence[Any]) -> list[list[Any]]:
+        return [list(found[i : i + n]) for i in range(0, len(found), n)]
+
+    return _Paths(lambda *at: rows(first(*at)), lambda *at: rows(second(*at)))
+
+
+def _compiled(symbols: Sequence[Any], expressions: Sequence[Any]) -> Callable[..., Sequence[Any]]:
+    import sympy
+
+    function: Callable[..., Sequence[Any]] = sympy.lambdify(symbols, list(expressions), modules="numpy", cse=True)
+    return function
+
+
+def _operators() -> SimpleNamespace:
+    import sympy
+    from sympy.codegen.cfunctions import expm1, log1p
+
+    def positive(x: Any) -> Any:
+        return sympy.Piecewise((x, x > 0), (0, True))
+
+    def near(z: Any, limit: float, inside: Any, outside: Any) -> Any:
+        return sympy.Piecewise((inside, z**2 < limit**2), (outside, True))
+
+    return SimpleNamespace(
+        ln=sympy.log,
+        log1p=log1p,
+        exp=sympy.exp,
+        expm1=expm1,
+        sinh=sympy.sinh,
+        sqrt=sympy.sqrt,
+        positive=positive,
+        near=near,
+    )
+
+
+def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
+    """Solve ∂W/∂y = 0 by Newton's method in ln(1 + y), in steps of at most a factor of two; NaN where none settles."""
+    y = np.array(start)
+    for _ in range(ITERATIONS):
+        g, g_y = balance(y)
+        # At the minimum of W the slope of (1+y) g is (1+y)² g_y + (1+y) g; away from it |·| keeps the way downhill.
+        curvature = np.abs((1 + y) ** 2 * g_y + (1 + y) * g)
+        step = np.clip(-(1 + y) * g / curvature, -np.log(2), np.log(2))
+        y = y + (1 + y) * np.expm1(step)
+        if np.nanmax(np.abs(step), initial=0.0) < ROUNDED:
+            break
+    return np.where(np.abs(step) < 1e-8, y, np.nan)

@@ -1,0 +1,232 @@
+"""The factor of a reference state as an approximate inverse of the stiffness at other states.
+
+Between two states of a slender body most of what changes is the orientation of its parts. So the reference factor K̄ is
+turned along: K(u)⁻¹ ≈ R K̄⁻¹ Rᵀ, where R holds at each node the rotation from the reference state to u. On the published
+beam this halves the number of corrections (docs/decisions/0004-turned-reference.md). The rotations are those of the
+polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. Stat. Comput. 7 (1986) 1160–1174.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray, Reference, Work
+from forward.solvers.anderson import Inverse
+from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
+
+if TYPE_CHECKING:
+    from forward.fem.equations import Discretisation
+    from forward.fem.fenicsx import DirectSolver
+
+
+def rotations(F: FloatArray) -> FloatArray:
+    """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n); the identity where F turns space over."""
+    good = _determinant(F) > 0
+    identity = np.broadcast_to(np.eye(3)[:, :, None], F.shape)
+    X = np.where(good, F, identity)
+    for _ in range(30):
+        cofactors = _cofactors(X)
+        inverse = cofactors / (X[0] * cofactors[0]).sum(axis=0)  # transposed
+        scale = ((inverse**2).sum(axis=(0, 1)) / (X**2).sum(axis=(0, 1))) ** 0.25
+        before, X = X, (scale * X + inverse / scale) / 2
+        if np.abs(X - before).max(initial=0.0) < 1e-6:  # the error is the square of that
+            break
+    return X
+
+
+def _cofactors(F: FloatArray) -> FloatArray:
+    a, b, c = F
+    return np.array([_cross(b, c), _cross(c, a), _cross(a, b)])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _determinant(F: FloatArray) -> FloatArray:
+    return np.asarray((F[0] * _cross(F[1], F[2])).sum(axis=0))
+
+
+def turn(x: FloatArray, R: FloatArray) -> FloatArray:
+    """Return x (n,) or rows (k, n) with the vectors of the nodes turned by R (3, 3, n_owned); what follows is kept."""
+    n = 3 * R.shape[2]
+    y = np.array(x)
+    for i in range(3):  # nine products of long vectors: much faster than many small matrices
+        y[..., i:n:3] = R[i, 0] * x[..., 0:n:3] + R[i, 1] * x[..., 1:n:3] + R[i, 2] * x[..., 2:n:3]
+    return y
+
+
+def turned(inverse: Inverse, R: FloatArray, fixed: NDArray[np.int64]) -> Inverse:
+    """Return x → R K̄⁻¹ Rᵀ x on the free unknowns, and the identity on the prescribed ones.
+
+    Parameters
+    ----------
+    inverse
+        Applies K̄⁻¹.
+    R
+        Rotations (3, 3, n_owned) of the nodes, for the first 3 n_owned unknowns.
+    fixed
+        Positions of the prescribed unknowns.
+    """
+    back = R.swapaxes(0, 1)
+
+    def correct(x: FloatArray) -> FloatArray:
+        known = x[..., fixed]
+        y = turn(x, back)
+        y[..., fixed] = 0
+        y = turn(inverse(y), R)
+        y[..., fixed] = known
+        return y
+
+    return correct
+
+
+STEP = 1e-3  # of the differences of stiffnesses, in standard deviations
+DIRECTIONS = 6  # in which parameters are changed for the screen: one after the other or, if there are more, at random
+
+
+class ReferenceFactor:
+    """The factor of a reference state of a body, as an approximate inverse of the stiffness at other states."""
+
+    def __init__(self, body: Discretisation) -> None:
+        self._body = body
+        self._solver = body.new_solver()
+        self._rotations = np.empty((3, 3, 0))
+        self._reference: Reference | None = None
+        self._slopes: FloatArray | None = None
+        self._vectors: FloatArray | None = None
+        self._screening: DirectSolver | None = None  # where the stiffness is not symmetric
+
+    def prepare(self, reference: Reference) -> None:
+        """Factorise at a reference, if the factor at hand is another's; this changes parameters and state."""
+        if self._reference is not None and self._reference.same(reference):
+            return
+        self._reference = self._slopes = self._vectors = None
+        body = self._set(reference)
+        self._solver.factorise()
+        self._rotations = rotations(body.gradients())
+        self._reference = reference
+
+    def _set(self, reference: Reference) -> Discretisation:
+        body = self._body
+        body.set_parameters(reference.parameters)
+        body.at_load(1.0)
+        body.set_state(reference.state)
+        return body
+
+    def slopes(self) -> FloatArray:
+        """Derivatives (d, U_local) of the state at the reference; this may change parameters and state."""
+        if self._slopes is None:
+            assert self._reference is not None
+            body = self._set(self._reference)
+            kept, body.work = body.work, Work()  # the first solution is charged no more than the others
+            self._slopes = self._solver.solve(body.right_sides_of_all())
+            body.work = kept
+        return self._slopes
+
+    def prepare_screen(self) -> bool:
+        """Make the vectors that show instabilities, if they are not there; this may change parameters and state.
+
+        False where there are none: without spread of the parameters, or where the reference itself is not stable.
+        """
+        assert self._reference is not None
+        reference, body = self._reference, self._body
+        if reference.spread is None or not np.isfinite(reference.spread).all():
+            return False
+        if self._vectors is None and not body.symmetric:
+            self._set(reference)
+            self._screening = self._screening or body.new_symmetric_solver()
+            self._screening.factorise()
+        if self._definite().negative_pivots() != body.unknowns.pressures:
+            return False
+        if self._vectors is None:
+            kept, body.work = body.work, Work()  # charged to none, as the factor
+            random = np.random.default_rng(0)
+            forces = body.layout.scatter(random.standard_normal((BLOCK, body.layout.size)))
+            self._vectors = screening_vectors(
+                self._changes(reference, random),
+                self._definite().solve,
+                forces,
+                body.free_displacements,
+                body.total,
+            )
+            body.work = kept
+        return True
+
+    def _definite(self) -> DirectSolver:
+        """The factor of the symmetric part of the stiffness at the reference."""
+        if self._body.symmetric:
+            return self._solver
+        assert self._screening is not None
+        return self._screening
+
+    def _changes(self, reference: Reference, random: np.random.Generator) -> Iterator[Rows]:
+        """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents."""
+        assert reference.spread is not None
+        body, d = self._body, len(reference.parameters)
+        if d <= DIRECTIONS:
+            directions = np.diag(reference.spread)[reference.spread > 0]
+        else:
+            directions = random.standard_normal((DIRECTIONS, d)) * reference.spread
+        self._set(reference)
+        slopes = self._solver.solve(body.right_sides_along(directions))
+        for direction, slope in zip(directions, slopes, strict=True):
+            ends: list[tuple[float, Any, FloatArray]] = []
+            for step in (STEP, -STEP):
+                state = reference.state + step * slope
+                R = self.rotation(state)
+                body.set_parameters(reference.parameters + step * direction)
+                body.at_load(1.0)
+                body.set_state(state)
+                ends.append((step, body.assembled_stiffness(), R))
+
+            def multiply(rows: FloatArray, ends: list[tuple[float, Any, FloatArray]] = ends) -> FloatArray:
+                # As the screen sees it: turned along with the body, so that its rotations are no change.
+                total = np.zeros_like(rows)
+                for step, matrix, R in ends:
+                    along = turn(rows, R)
+                    along[:, body.fixed] = 0
+                    total += turn(body.products(matrix, along), R.swapaxes(0, 1)) / (2 * step)
+                total[:, body.fixed] = 0
+                return total
+
+            yield multiply
+            for _, matrix, _ in ends:
+                matrix.destroy()
+
+    def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
+        """Return what the screen says of a state u (U_local,), with its imbalance, turned by R from the reference."""
+        assert self._vectors is not None
+        body, free = self._body, self._body.free_displacements
+        vectors = turn(self._vectors, R)
+        vectors[:, body.fixed] = 0
+        return screen(
+            vectors,
+            lambda rows: body.stiffness_near(u, imbalance, rows),
+            self._inverse(self._definite(), R),
+            free,
+            body.total,
+        )
+
+    def rotation(self, u: FloatArray) -> FloatArray:
+        """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
+        body = self._body
+        body.set_state(u)
+        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations))
+
+    def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
+        """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
+        return self._inverse(self._solver, R, transpose=transpose)
+
+    def _inverse(self, solver: DirectSolver, R: FloatArray, *, transpose: bool = False) -> Inverse:
+        body = self._body
+
+        def inverse(right: FloatArray) -> FloatArray:
+            body.work.back_substitutions += 1 if right.ndim == 1 else len(right)
+            return solver.solve(right, transpose=transpose)
+
+        return turned(inverse, R, body.fixed)

@@ -1,0 +1,1 @@
+"""What makes a posterior doubtful, and what several models say together."""

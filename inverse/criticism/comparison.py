@@ -1,0 +1,368 @@
+"""What evidences, posteriors and residuals of several models say together.
+
+That one model is the most probable does not make it good. For that, the residuals r of each model are compared with
+those that it would have if it were true: their squares Σr² ~ χ², and their correlation between neighbours of a test, Σ
+r_i r_j/Σ r² over pairs of them (`inverse.data.neighbours`), whose distribution for independent errors is drawn once.
+Both are posterior predictive probabilities (A. Gelman, X.-L. Meng, H. Stern, Stat. Sinica 6 (1996) 733–807); the second
+one says something even where the size of the noise was inferred.
+
+Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i) (A. Vehtari, A. Gelman, J. Gabry, Stat.
+Comput. 27 (2017) 1413–1432), or whole tests t, by ln p(y_t | other tests) = ln Z − ln Z without t: data of one test
+follow one another, so that one of them left out alone is no surprise. Averaged predictions have the variance Σ P_k V_k
+within models and Σ P_k (μ_k − μ)² between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.criticism.weights import effective_number, normalised, tail_shape, trustworthy
+from inverse.data.neighbours import Neighbours, neighbours
+from inverse.low_dimensional.evidence import Evidence
+from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.posterior import Posterior
+from uq.inputs.random_parameters import Inputs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+DRAWS = 4000  # of independent errors, for the correlation of neighbours
+QUANTILES = (0.05, 0.95)
+Pair = tuple[str, str]  # candidate and group
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that may be the right one.
+
+    Attributes
+    ----------
+    inputs
+        Its parameters.
+    weight
+        π, its probability before the data, up to a common factor.
+    """
+
+    inputs: Inputs
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Data:
+    """What was measured of one specimen, and what else is to be predicted.
+
+    Attributes
+    ----------
+    values
+        y (m,), the first m outputs of the model.
+    sigma
+        Their standard deviations (m,), where they are known.
+    tests
+        Name of the test of each output (M,).
+    at
+        Where in the test (M,).
+    places
+        Where the data are, (m, k), in the space in which they stand beside each other; by default `at`.
+    kinds
+        Numbers (m,) of what can be compared; by default of the tests.
+    """
+
+    values: FloatArray
+    sigma: FloatArray | None
+    tests: tuple[str, ...]
+    at: FloatArray
+    places: FloatArray | None = None
+    kinds: NDArray[np.int64] | None = None
+
+    @property
+    def sorted(self) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.int64]]:
+        """Numbers (m,) of the data in an order that is not that of the rows, and their places and kinds in it."""
+        m = self.values.size
+        places = self.at[:m, None] if self.places is None else self.places
+        kinds = np.unique(self.tests[:m], return_inverse=True)[1] if self.kinds is None else self.kinds
+        order = np.lexsort((*places.T, kinds))
+        return order, places[order], kinds[order]
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """The posterior of a candidate: Laplace's Gaussian, and weighted points with the evidence."""
+
+    gaussian: Laplace
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
+class Criticism:
+    """What the data say about one model.
+
+    Attributes
+    ----------
+    scores
+        ln p(y_j | other data) (m,), with `tails`, the k̂ (m,) of the weights, and `trusted` (m,), what they are worth.
+    pointwise
+        ln p(y_j | x_i) (n, m) at the points.
+    misfit
+        Posterior predictive probability of residuals as large as these, or larger.
+    correlation
+        The same of neighbours that agree as much.
+    """
+
+    scores: FloatArray
+    tails: FloatArray
+    trusted: NDArray[np.bool_]
+    pointwise: FloatArray
+    misfit: float
+    correlation: float
+
+
+def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
+    """Compare the residuals of a model with what it says of them."""
+    from scipy.stats import chi2
+
+    w, density = found.weights, found.density
+    used = w > 0
+    w, outputs = w[used], density.outputs[used]
+    scale = np.tile(posterior.sigma, (len(w), 1))
+    if posterior.noise is not None:
+        scale = scale * posterior.physical(density.x[used])[:, -1:]
+    r = (outputs - posterior.data) / scale
+    pointwise = -(r**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2
+    log_ratio = np.log(w)[:, None] - pointwise
+    top = log_ratio.max(axis=0)
+    scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
+    left_out = [normalised(column) for column in log_ratio.T]
+    tails = [tail_shape(column) for column in left_out]
+    trusted = [
+        trustworthy(k, effective_number(column), found.weights.size) for k, column in zip(tails, left_out, strict=True)
+    ]
+    whole = np.full((found.weights.size, posterior.data.size), -np.inf)
+    whole[used] = pointwise
+    order, places, kinds = data.sorted
+    beside = neighbours(places, kinds)
+    m = posterior.data.size
+    misfit = float(w @ chi2.sf((r**2).sum(axis=1), m))
+    errors = np.random.default_rng(0).standard_normal((DRAWS, m))
+    drawn = np.sort(agreement(errors, beside))
+    larger = 1 - np.searchsorted(drawn, agreement(r[:, order], beside)) / DRAWS
+    return Criticism(scores, np.array(tails), np.array(trusted), whole, misfit, float(w @ larger))
+
+
+def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
+    """Return Σ r_i r_j/Σ r² (k,) over pairs i, j of neighbours, for residuals (k, n)."""
+    return np.asarray((r[:, neighbours[0]] * r[:, neighbours[1]]).sum(axis=1) / (r**2).sum(axis=1))
+
+
+# --- all together --------------------------------------------------------------------------------------------------
+
+
+def comparison(
+    candidates: Mapping[str, Candidate],
+    groups: Mapping[str, Data],
+    posteriors: Mapping[Pair, Posterior],
+    stated: Mapping[Pair, Assessment],
+    variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
+    checks: Mapping[Pair, tuple[float, float]],
+    left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
+) -> xr.Dataset:
+    """Put everything that is known of the candidates into a dataset.
+
+    Parameters
+    ----------
+    candidates, groups
+        By name.
+    posteriors, stated
+        What was found, by candidate and group.
+    variants
+        ln Z and error by the name of the variant, the study as it is first.
+    checks
+        ln Z and error by nested sampling, if it was asked for.
+    left_out
+        ln Z and error without each test, if they were asked for.
+    """
+    import xarray as xr
+
+    names = list(candidates)
+    found = {pair: assessment.evidence for pair, assessment in stated.items()}
+    critics = {pair: criticise(found[pair], posteriors[pair], groups[pair[1]]) for pair in stated}
+    weights = np.array([candidate.weight for candidate in candidates.values()])
+
+    def table(value: Mapping[Pair, Any]) -> Any:
+        return (("model", "group"), np.array([[value[name, group] for group in groups] for name in names]))
+
+    def totals(values: Mapping[Pair, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
+        parts = [[values[name, group] for group in groups if (name, group) in values] for name in names]
+        sums = np.array([sum(value for value, _ in part) for part in parts])
+        return sums, np.array([np.sqrt(sum(error**2 for _, error in part)) for part in parts])
+
+    sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)
+    chances = np.array([probabilities(total, weights) for total in sums])
+    P = chances[0]
+    scores = np.array([np.concatenate([critics[name, group].scores for group in groups]) for name in names])
+    behind = scores - scores[scores.sum(axis=1).argmax()]
+    count = scores.shape[1]
+    variables: dict[str, Any] = {
+        "log_evidence": ("model", sums[0]),
+        "log_evidence_error": ("model", errors[0]),
+        "probability": ("model", P),
+        "probability_error": ("model", _chance_errors(P, errors[0])),
+        "prior_probability": ("model", weights / weights.sum()),
+        "variant_log_evidence": (("variant", "model"), np.array(sums)),
+        "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
+        "variant_probability": (("variant", "model"), chances),
+        "group_log_evidence": table({pair: e.log_evidence for pair, e in found.items()}),
+        "group_log_evidence_error": table({pair: e.error for pair, e in found.items()}),
+        "laplace_log_evidence": table({pair: a.gaussian.log_evidence for pair, a in stated.items()}),
+        "converged": table({pair: a.gaussian.converged for pair, a in stated.items()}),
+        "route": table({pair: e.route for pair, e in found.items()}),
+        "why": table({pair: e.why for pair, e in found.items()}),
+        "effective": table({pair: e.effective for pair, e in found.items()}),
+        "tail": table({pair: e.tail for pair, e in found.items()}),
+        "trusted": table({pair: e.trusted for pair, e in found.items()}),
+        "misfit_probability": table({pair: c.misfit for pair, c in critics.items()}),
+        "correlation_probability": table({pair: c.correlation for pair, c in critics.items()}),
+        "score": ("model", scores.sum(axis=1)),
+        "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
+        "score_behind": ("model", behind.sum(axis=1)),
+        "score_behind_error": ("model", np.sqrt(count) * behind.std(axis=1)),
+        "score_tail": ("model", [max(critics[name, group].tails.max() for group in groups) for name in names]),
+        "score_trusted": ("model", [all(critics[name, group].trusted.all() for group in groups) for name in names]),
+    }
+    if checks:
+        variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
+        variables["nested_log_evidence_error"] = table({pair: error for pair, (_, error) in checks.items()})
+    if left_out:
+        whole = {pair: (e.log_evidence, e.error) for pair, e in found.items()}
+        ours, theirs = zip(
+            *((totals({pair: whole[pair] for pair in rest}), totals(rest)) for rest in left_out.values()), strict=True
+        )
+        dims = ("left_out", "model")
+        variables["held_out_score"] = (dims, np.array([a[0] - b[0] for a, b in zip(ours, theirs, strict=True)]))
+        variables["held_out_score_error"] = (
+            dims,
+            np.array([np.hypot(a[1], b[1]) for a, b in zip(ours, theirs, strict=True)]),
+        )
+    columns = [_predictions(names, group, data, posteriors, stated, P) for group, data in groups.items()]
+    for name, (dims, _) in columns[0].items():
+        variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
+    parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
+    variables["point_log_likelihood"] = _pointwise(names, groups, critics)
+    variables |= _constants(names, list(groups), parameters, posteriors, stated)
+    coordinates = {"model": names, "group": list(groups), "variant": list(variants), "parameter": parameters}
+    coordinates |= {"left_out": list(left_out)} if left_out else {}
+    return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
+
+
+def probabilities(log_evidence: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return P_k ∝ π_k Z_k, of sum 1."""
+    P = weights * np.exp(log_evidence - log_evidence.max())
+    return np.asarray(P / P.sum())
+
+
+def _chance_errors(P: FloatArray, errors: FloatArray) -> FloatArray:
+    """To first order: ∂P_k/∂ln Z_j = P_k (δ_kj − P_j)."""
+    slopes = P[:, None] * (np.eye(len(P)) - P)
+    return np.sqrt((slopes**2) @ errors**2)
+
+
+def _predictions(
+    names: list[str],
+    group: str,
+    data: Data,
+    posteriors: Mapping[Pair, Posterior],
+    stated: Mapping[Pair, Assessment],
+    P: FloatArray,
+) -> dict[str, tuple[Any, Any]]:
+    """Outputs of one group without noise, by each model and by all, beside the data."""
+    m, M = data.values.size, len(data.tests)
+    mean, std = np.empty((2, len(names), M))
+    bands = np.empty((len(QUANTILES), len(names), M))
+    for k, name in enumerate(names):
+        evidence = stated[name, group].evidence
+        used = evidence.weights > 0
+        w, outputs = evidence.weights[used], evidence.density.everything[used]
+        mean[k] = w @ outputs
+        std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
+        bands[:, k] = np.array([quantiles(column, w) for column in outputs.T]).T
+    average = P @ mean
+    missing = np.full(M - m, np.nan)
+    sigma = next(posteriors[name, group].sigma for name in names)
+    return {
+        "output_group": ("output", np.full(M, group)),
+        "output_test": ("output", np.array(data.tests)),
+        "output_at": ("output", data.at),
+        "measured": ("output", np.concatenate([data.values, missing])),
+        "sigma": ("output", np.concatenate([sigma, missing])),
+        "prediction_mean": (("model", "output"), mean),
+        "prediction_std": (("model", "output"), std),
+        "prediction_quantiles": (("quantile", "model", "output"), bands),
+        "average_mean": ("output", average),
+        "average_within": ("output", P @ std**2),
+        "average_between": ("output", P @ (mean - average) ** 2),
+    }
+
+
+def _constants(
+    names: list[str],
+    groups: list[str],
+    parameters: list[str],
+    posteriors: Mapping[Pair, Posterior],
+    stated: Mapping[Pair, Assessment],
+) -> dict[str, tuple[Any, Any]]:
+    """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
+    shape = (len(names), len(groups), len(parameters))
+    mode, mean, std = np.full((3, *shape), np.nan)
+    bands = np.full((len(QUANTILES), *shape), np.nan)
+    for k, name in enumerate(names):
+        for g, group in enumerate(groups):
+            posterior, assessment = posteriors[name, group], stated[name, group]
+            columns = [parameters.index(p) for p in posterior.names]
+            w = assessment.evidence.weights
+            points = posterior.physical(assessment.evidence.density.x)
+            mode[k, g, columns] = posterior.physical(assessment.gaussian.mode[None, :])[0]
+            mean[k, g, columns] = w @ points
+            std[k, g, columns] = np.sqrt(w @ (points - w @ points) ** 2)
+            bands[:, k, g, columns] = np.array([quantiles(column, w) for column in points.T]).T
+    count = max(assessment.evidence.weights.size for assessment in stated.values())
+    places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
+    for k, name in enumerate(names):
+        for g, group in enumerate(groups):
+            posterior, found = posteriors[name, group], stated[name, group].evidence
+            columns = [parameters.index(p) for p in posterior.names]
+            places[k, g, : found.weights.size, columns] = posterior.physical(found.density.x).T
+            shares[k, g, : found.weights.size] = found.weights
+    dims = ("model", "group", "parameter")
+    return {
+        "point": (("model", "group", "point", "parameter"), places),
+        "point_weight": (("model", "group", "point"), shares),
+        "constant_mode": (dims, mode),
+        "constant_mean": (dims, mean),
+        "constant_std": (dims, std),
+        "constant_quantiles": (("quantile", *dims), bands),
+    }
+
+
+def _pointwise(names: list[str], groups: Mapping[str, Data], critics: Mapping[Pair, Criticism]) -> tuple[Any, Any]:
+    """Ln of the density of every datum at every point of its group; NaN where nothing was measured."""
+    count = max(critic.pointwise.shape[0] for critic in critics.values())
+    parts = []
+    for group, data in groups.items():
+        part = np.full((len(names), count, len(data.tests)), np.nan)
+        for k, name in enumerate(names):
+            found = critics[name, group].pointwise
+            part[k, : found.shape[0], : found.shape[1]] = found
+        parts.append(part)
+    return ("model", "point", "output"), np.concatenate(parts, axis=2)
+
+
+def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:
+    """Return quantiles of values (n,) at points with weights (n,) of sum 1."""
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order]) - weights[order] / 2
+    return np.interp(levels, reached, values[order])

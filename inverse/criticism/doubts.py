@@ -1,0 +1,212 @@
+"""What makes a posterior doubtful: its distance from the prior, ends of ranges, noise, strange data, the mesh.
+
+Each function returns doubts: findings with a few words for the verdict. None of them solves anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from forward.model import FloatArray, Severity
+from uq.inputs.distributions import Distribution
+
+FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre that are a warning, an error
+UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance that are
+END, CROWDED = (
+    0.02,
+    5.0,
+)  # share of the prior at an end of a range, and how many times that share the posterior has there
+NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
+NOTHING_SEEN = 0.5  # size of the errors over that of the data from which on the model explains nothing
+STRANGE = 0.01  # probability that any datum of all is as far out as one that does not belong
+LISTED = 5
+BIASED, WRONG = (
+    0.5,
+    2.0,
+)  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
+GRID = np.linspace(-40.0, 40.0, 8001)
+
+
+class Doubt(NamedTuple):
+    """A finding, and what a verdict says of it."""
+
+    severity: Severity
+    text: str
+    short: str
+
+
+def scores(distribution: Distribution, values: FloatArray) -> FloatArray:
+    """Return how many prior deviations values (n,) are from the median, in the coordinate where the prior is normal."""
+    return np.interp(values, distribution.from_normal(GRID)[0], GRID)
+
+
+def far_from_prior(
+    priors: Mapping[str, Distribution], mode: FloatArray, mean: FloatArray, square: float, degrees: float
+) -> list[Doubt]:
+    """Doubt parameters whose mode or mean is far from the prior, each by name, and all of them together.
+
+    Parameters
+    ----------
+    priors
+        By name, in the order of the values.
+    mode, mean
+        Of the posterior (d,).
+    square, degrees
+        Squared distance of the mode from the centre in the directions that the data tell, over what is expected of it,
+        and their number: of χ² where the truth is drawn from the prior.
+    """
+    from scipy.special import chdtrc
+
+    found = []
+    for k, (name, prior) in enumerate(priors.items()):
+        if prior.support is not None:
+            continue  # an end of a range is named as such
+        distances = scores(prior, np.array([mode[k], mean[k]]))
+        distance = float(distances[np.abs(distances).argmax()])
+        if abs(distance) > FAR:
+            centre = float(prior.from_normal(np.zeros(1))[0][0])
+            value = float((mode, mean)[int(np.abs(distances).argmax())][k])
+            text = (
+                f"the posterior of {name} ({value:.4g}) lies {abs(distance):.1f} prior deviations from the prior "
+                f"({centre:.4g}): the prior, the data or the model is wrong"
+            )
+            short = f"{name} is {abs(distance):.1f} prior deviations from its prior"
+            found.append(Doubt("error" if abs(distance) > FARTHER else "warning", text, short))
+    chance = float(chdtrc(degrees, square)) if degrees >= 1 and np.isfinite(square) else 1.0
+    if chance < UNLIKELY and not found:
+        text = (
+            f"all unknowns together lie farther from the prior than it allows: a squared distance of {square:.3g} in "
+            f"{degrees:.0f} directions that the data tell (probability {chance:.1g})"
+        )
+        found.append(Doubt("error" if chance < IMPOSSIBLE else "warning", text, "the prior does not allow it"))
+    return found
+
+
+def at_an_end(priors: Mapping[str, Distribution], mode: FloatArray, draws: FloatArray) -> list[Doubt]:
+    """Doubt parameters at an end of a bounded range, by name: of the mode (d,) or of draws (n, d) of the posterior."""
+    from scipy.special import ndtr
+
+    found = []
+    for k, (name, prior) in enumerate(priors.items()):
+        if prior.support is None:
+            continue
+        shares = ndtr(scores(prior, np.append(draws[:, k], mode[k])))
+        for end, share in zip(("lower", "upper"), (shares, 1 - shares), strict=True):
+            if (share[:-1] < END).mean() > CROWDED * END or share[-1] < END / 4:
+                value = prior.support[end == "upper"]
+                text = (
+                    f"{name} is at the {end} end of its range ({value:.4g}): the data want it beyond, and its "
+                    "interval is cut off there; widen the range, or explain it"
+                )
+                found.append(Doubt("warning", text, f"{name} is at the {end} end of its range"))
+    return found
+
+
+def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatArray) -> list[Doubt]:
+    """Doubt an inferred size of the errors.
+
+    Parameters
+    ----------
+    factor
+        On the stated standard deviations.
+    expected
+        The median of its prior.
+    sigma, values
+        Stated standard deviations (n,), and data (n,).
+    """
+    size = float(np.sqrt((sigma**2).mean()) * factor / np.sqrt((values**2).mean())) if (values != 0).any() else np.inf
+    if size >= NOTHING_SEEN:
+        text = f"the inferred errors are {100 * size:.0f} % of the data ({factor:.3g} times the stated ones)"
+        return [Doubt("error", f"{text}: the model does not explain these data", "the model explains no data")]
+    if not any(1 / NOISE_FAR <= factor / known <= NOISE_FAR for known in (1.0, expected)):
+        text = f"the inferred errors are {factor:.3g} times the stated ones"
+        cause = "the model, or what is said of the errors, is wrong" if factor > 1 else "the stated ones are too large"
+        return [Doubt("warning", f"{text}: {cause}", text)]
+    return []
+
+
+def too_large_errors(square: float, degrees: float, probability: float) -> list[Doubt]:
+    """Doubt stated errors that residuals are far smaller than."""
+    factor = float(np.sqrt(square / degrees)) if degrees > 0 else 1.0
+    if factor < 1 / NOISE_FAR and probability > 1 - STRANGE:
+        text = f"residuals are {factor:.2g} times the stated errors: those are too large, and intervals too wide"
+        return [Doubt("warning", text, "the stated errors are too large")]
+    return []
+
+
+REMEDY = 'or allow for them: data.errors = { kind = "student-t" }'
+
+
+def strangers(
+    residual: FloatArray, resolution: FloatArray, labels: Sequence[str], *, heavy: bool, remedy: str = REMEDY
+) -> list[Doubt]:
+    """Doubt data that do not belong to the others.
+
+    Parameters
+    ----------
+    residual
+        Over the errors (n,).
+    resolution
+        Share (n,) of each datum in its own prediction.
+    labels
+        What each datum is.
+    heavy
+        Whether heavy tails of the errors were allowed for already: then it is a note.
+    remedy
+        What may be done beside looking at them.
+    """
+    from scipy.special import log_ndtr
+
+    if len(residual) < LISTED:
+        return []
+    z = residual / np.sqrt(np.maximum(1 - resolution, 1e-3))
+    usual = max(1.0, float(np.median(np.abs(z))) / 0.6745)
+    strange = np.log(2 * len(z)) + log_ndtr(-np.abs(z) / usual) < np.log(STRANGE)
+    which = np.flatnonzero(strange)
+    if not len(which):
+        return []
+    first = which[np.argsort(-np.abs(z[which]), kind="stable")][:LISTED]
+    listed = "; ".join(f"{labels[i]}: {z[i]:+.1f}" for i in first)
+    more = f"; and {len(which) - len(first)} more" if len(which) > len(first) else ""
+    data = "1 datum does" if len(which) == 1 else f"{len(which)} data do"
+    text = f"{data} not belong to the other {len(z) - len(which)}, by residuals in standard deviations: {listed}{more}"
+    if heavy:
+        return [Doubt("note", text, "")]
+    text += f". Look at them{', ' if remedy else ''}{remedy}"
+    return [Doubt("warning", text, f"{data} not belong to the others")]
+
+
+def mesh_too_coarse(
+    looked: bool, why: str, error: FloatArray, shifts: Mapping[str, float], nodes: FloatArray
+) -> list[Doubt]:
+    """Doubt the mesh, by what a finer one says.
+
+    Parameters
+    ----------
+    looked
+        Whether there was a solve on a finer mesh, or else `why` not.
+    error
+        What it adds to the data (n,), over the noise.
+    shifts
+        What that does to unknowns, by name, over their posterior deviations.
+    nodes
+        The same of a field at the vertices (N,), or nothing.
+    """
+    if not looked:
+        return [Doubt("warning", f"not checked for the mesh: {why}", "not checked for the mesh")]
+    size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
+    data = f"a finer mesh moves the data by {size:.2g} standard deviations of the noise (at most {most:.2g})"
+    moved = {name: shift for name, shift in shifts.items() if np.isfinite(shift)}
+    everywhere = float(np.sqrt((nodes**2).mean())) if len(nodes) else 0.0
+    worst = max([abs(shift) for shift in moved.values()] + [everywhere], default=0.0)
+    listed = [f"{name} {shift:+.2g}" for name, shift in sorted(moved.items(), key=lambda item: -abs(item[1]))]
+    listed += [f"values at the vertices {everywhere:.2g} (root mean square)"] if len(nodes) else []
+    text = f"{data} and the unknowns, in deviations of the posterior, by: {', '.join(listed)}"
+    if worst <= BIASED:
+        return [Doubt("note", text, "")]
+    severity: Severity = "error" if worst > WRONG else "warning"
+    advice = "The mesh is too coarse for the noise: take a finer one, or thinner cells at held faces (body.grading)"
+    return [Doubt(severity, f"{text}. {advice}", f"its mesh is too coarse: unknowns move by {worst:.2g} deviations")]

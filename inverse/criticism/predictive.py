@@ -1,0 +1,205 @@
+"""What a posterior says of other quantities and of data, and what residuals say of it.
+
+If model, prior and noise are right and the model is linear, the normalised residuals r at the mode are normal with the
+covariance I − S, S = A(I + AᵀA)⁻¹Aᵀ (`inverse.fields.low_rank`): |r|² is a sum of squares weighted by 1/(1+λ), of the
+mean n − tr S. Its distribution is taken to be that of g χ²(ν) with the same mean and variance (F. E. Satterthwaite,
+Biom. Bull. 2 (1946) 110–114). Residuals of neighbours must not agree more than such a normal vector's do: that says
+something also where the size of the noise was inferred.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.criticism.comparison import DRAWS, agreement, quantiles
+from inverse.data.neighbours import Neighbours
+from inverse.fields.field_posterior import Point
+from inverse.fields.low_rank import LowRankPosterior, Spectrum
+from inverse.low_dimensional.evidence import Evidence
+from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.posterior import Density, Posterior
+
+LEVELS = (0.025, 0.5, 0.975)
+Map = Callable[[FloatArray], FloatArray]
+
+
+# --- derived quantities ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What is known of k quantities.
+
+    Attributes
+    ----------
+    mean, std
+        (k,).
+    levels
+        Probabilities (q,).
+    quantiles
+        (q, k).
+    """
+
+    mean: FloatArray
+    std: FloatArray
+    levels: tuple[float, ...]
+    quantiles: FloatArray
+
+
+def summary(values: FloatArray, weights: FloatArray | None = None, levels: tuple[float, ...] = LEVELS) -> Summary:
+    """Summarise values (n, k) at points with weights (n,) of sum 1, by default equal ones.
+
+    Raises
+    ------
+    ValueError
+        If a value at a point that counts is not finite.
+    """
+    w = np.full(len(values), 1 / len(values)) if weights is None else weights
+    values, w = values[w > 0], w[w > 0]
+    if not np.isfinite(values).all():
+        message = f"{np.isnan(values).any(axis=1).sum()} of {len(values)} points have no value of a derived quantity"
+        raise ValueError(message)
+    mean = w @ values
+    std = np.sqrt(w @ (values - mean) ** 2)
+    return Summary(mean, std, levels, np.array([quantiles(column, w, levels) for column in values.T]).T)
+
+
+def derived_by_laplace(
+    posterior: Posterior, gaussian: Laplace, function: Map, *, draws: int = 4096, seed: int = 0
+) -> Summary:
+    """Summarise a function (n, c) → (n, k) of the physical parameters (and the noise) by Laplace's Gaussian."""
+    z = np.random.default_rng(seed).standard_normal((draws, len(gaussian.mode)))
+    return summary(function(posterior.physical(gaussian.mode + z @ gaussian.root.T)))
+
+
+def derived_by_weights(posterior: Posterior, found: Evidence, function: Map) -> Summary:
+    """Summarise a function (n, c) → (n, k) of the physical parameters (and the noise) by weighted points."""
+    return summary(function(posterior.physical(found.density.x)), found.weights)
+
+
+def derived_of_field(found: LowRankPosterior, function: Map, *, draws: int = 512, seed: int = 0) -> Summary:
+    """Summarise a function (n, N) → (n, k) of the values of a field, by samples; linear ones have `marginal`."""
+    noise = np.random.default_rng(seed).standard_normal((draws, len(found.mean)))
+    return summary(function(found.samples(noise)))
+
+
+# --- predictions -----------------------------------------------------------------------------------------------------
+
+
+def predictive_std(mode: Point, found: LowRankPosterior, which: NDArray[np.int64] | None = None) -> FloatArray:
+    """Return standard deviations (k,) of outputs, measured or not, without errors of measurement; an adjoint for each.
+
+    Parameters
+    ----------
+    mode
+        Where the posterior is linearised.
+    found
+        The Gaussian there.
+    which
+        Numbers (k,) of the outputs; by default those that were not measured.
+    """
+    numbers = np.flatnonzero(found.weights == 0) if which is None else which
+    unit = np.zeros((len(numbers), len(found.weights)))
+    unit[np.arange(len(numbers)), numbers] = 1
+    if not len(numbers):
+        return np.zeros(0)
+    pulled = found.prior.root_transposed(mode.solution.adjoint(unit))
+    return np.asarray(np.linalg.norm(found.spectrum.root(pulled), axis=1))
+
+
+# --- residuals -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """What residuals at the mode say of model, prior and noise.
+
+    Attributes
+    ----------
+    square
+        |r|².
+    degrees
+        Its expectation n − tr S: the effective degrees of freedom.
+    probability
+        Of a larger one. Small: the model does not explain the data; near 1: σ is too large.
+    agreement
+        Σ r_i r_j/Σ r² over neighbours; NaN where there are none.
+    agreement_probability
+        Of neighbours that agree as much or more.
+    """
+
+    square: float
+    degrees: float
+    probability: float
+    agreement: float
+    agreement_probability: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether neither probability is below 1 %."""
+        return self.probability >= 0.01 and not self.agreement_probability < 0.01
+
+
+def examine(
+    residual: FloatArray, spectrum: Spectrum, measured: FloatArray, neighbours: Neighbours | None = None
+) -> ResidualTest:
+    """Test residuals at a mode.
+
+    Parameters
+    ----------
+    residual
+        r (n,), zero where nothing was measured.
+    spectrum
+        Pairs of AᵀA; what is left out counts as λ = 0.
+    measured
+        Not zero (n,) where something was measured.
+    neighbours
+        Numbers of data that are expected to agree if the model is wrong, as of `inverse.data.neighbours`.
+    """
+    from scipy.special import chdtrc
+
+    seen = np.asarray(measured) != 0
+    n, values = int(seen.sum()), spectrum.values
+    weights = np.concatenate([1 / (1 + values[:n]), np.ones(max(n - len(values), 0))])
+    square, total = float(residual @ residual), float(weights.sum())
+    scale = float((weights**2).sum()) / total
+    probability = float(chdtrc(total / scale, square / scale))
+    if neighbours is None or not len(neighbours[0]):
+        return ResidualTest(square, total, probability, np.nan, np.nan)
+    drawn = np.random.default_rng(0).standard_normal((DRAWS, len(residual))) * seen
+    # (I − S)^{1/2}: the images are the eigenvectors of S times √λ.
+    share = np.divide((1 + values) ** -0.5 - 1, values, out=np.zeros_like(values), where=values > 0)
+    drawn = drawn + (drawn @ spectrum.images.T * share) @ spectrum.images
+    here = float(agreement(residual[None], neighbours)[0])
+    larger = (1 + int((agreement(drawn, neighbours) >= here).sum())) / (DRAWS + 1)
+    return ResidualTest(square, total, probability, here, larger)
+
+
+def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
+    """Return all pairs of AᵀA of few parameters at a point with derivatives; the noise is no parameter of these."""
+    d = len(posterior.inputs.names)
+    assert at.tangents is not None
+    which = slice(None) if posterior.which is None else list(posterior.which)
+    scale = _scale(posterior, at.x)
+    root = np.sqrt(posterior.errors.information((at.outputs[0] - posterior.data) / scale))
+    A = at.tangents[0][which] @ posterior.inputs.from_normals(at.x[:, :d])[1][0] * (root / scale)[:, None]
+    values, vectors = np.linalg.eigh(A.T @ A)
+    values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T
+    return Spectrum(values, vectors, vectors @ A.T, np.zeros(d), 0.0, d)
+
+
+def examine_few(posterior: Posterior, gaussian: Laplace, neighbours: Neighbours | None = None) -> ResidualTest:
+    """Test the residuals of few parameters at the mode: a solve with derivatives."""
+    at = posterior.at(gaussian.mode[None], derivatives=True)
+    residual = posterior.errors.normal_scores((at.outputs[0] - posterior.data) / _scale(posterior, at.x))
+    return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)
+
+
+def _scale(posterior: Posterior, x: FloatArray) -> FloatArray:
+    scale = posterior.sigma
+    return scale if posterior.noise is None else np.asarray(scale * posterior.physical(x)[0, -1])

@@ -1,0 +1,1 @@
+"""Measurements: files of them, their errors, their neighbours."""

@@ -1,0 +1,1 @@
+"""Posteriors of fields of thousands of values."""

@@ -1,0 +1,221 @@
+"""The posterior density of a field of N values given many measured outputs, in the noise that its prior is made of.
+
+With m = m_0 + Lξ and ξ ~ N(0, I) a priori, so that Γ_pr = LLᵀ, and data y = G(m) + e with independent e_i ~ N(0, σ_i²),
+
+    −ln p(ξ | y) = ½ r·r + ½ ξ·ξ + const,   r_i = (G_i(m) − y_i)/σ_i.
+
+The gradient ξ + Aᵀr and the Gauss–Newton product (I + AᵀA)ξ, A = Γ_n^{−1/2} G'(m) L, are those of the density of m with
+the prior covariance as preconditioner: H v = λ Γ_pr⁻¹ v has the solutions v = Lu with AᵀA u = λu (T. Bui-Thanh, O.
+Ghattas, J. Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). Neither the precision nor any matrix of N
+columns and N rows is needed.
+
+Vectors are rows: k of them are (k, N) in the field and (k, n) in the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
+from inverse.data.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
+
+BLOCK = 32  # vectors whose products are formed together
+
+
+class Prior(Protocol):
+    """A normal distribution N(0, LLᵀ) of N values, known by products with a root L of its covariance."""
+
+    @property
+    def variance(self) -> FloatArray:
+        """Diagonal (N,) of LLᵀ."""
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Return Lξ (N,) for ξ (N,), or (k, N)."""
+
+    def root_transposed(self, g: FloatArray) -> FloatArray:
+        """Return Lᵀg (N,) for g (N,), or (k, N)."""
+
+
+@dataclass
+class Counts:
+    """What was asked of the model: solutions, and products with derivatives, a Hessian product being one of each."""
+
+    solves: int = 0
+    tangents: int = 0
+    adjoints: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPosterior:
+    """Measured outputs of a model, and what is believed of its parameters before.
+
+    Parameters
+    ----------
+    model
+        All of its parameters are values of the field.
+    data
+        y (n,), in the units of the outputs; NaN where nothing was measured.
+    sigma
+        Standard deviations σ (n,) of the errors.
+    prior
+        Of the differences from `mean`.
+    mean
+        m_0 (N,); by default zero.
+    progress
+        Told of each solve, and whether it failed.
+    errors
+        Distribution of the errors over their scale σ.
+    """
+
+    model: ForwardModel
+    data: FloatArray
+    sigma: FloatArray
+    prior: Prior
+    mean: FloatArray | None = None
+    counts: Counts = field(default_factory=Counts)
+    progress: Callable[[int, int], None] = lambda done, failed: None
+    errors: NormalErrors | StudentErrors = NORMAL
+
+    def __post_init__(self) -> None:
+        n = len(self.model.outputs)
+        if self.data.shape != (n,) or self.sigma.shape != (n,):
+            message = f"{self.data.size} data and {self.sigma.size} standard deviations, expected {n} of each"
+            raise ValueError(message)
+        if not (self.sigma > 0).all():
+            message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
+            raise ValueError(message)
+        if not self.measured.any():
+            raise ValueError("no data that are numbers")
+
+    @property
+    def size(self) -> int:
+        """Number N of values."""
+        return len(self.model.parameters)
+
+    @cached_property
+    def measured(self) -> FloatArray:
+        """One for what was measured, zero for what was not (n,)."""
+        return np.isfinite(self.data).astype(float)
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """1/σ (n,) of what was measured."""
+        return self.measured / self.sigma
+
+    @property
+    def data_count(self) -> int:
+        """Number of data."""
+        return int(self.measured.sum())
+
+    def values(self, noise: FloatArray) -> FloatArray:
+        """Return the field m_0 + Lξ (N,), or (k, N)."""
+        return self.prior.root(noise) + (0.0 if self.mean is None else self.mean)
+
+    def at(self, noise: FloatArray, start: FloatArray | None = None, reference: Reference | None = None) -> Point:
+        """Solve at ξ (N,), from a prediction of the state and with the help of a reference.
+
+        Raises
+        ------
+        SolveError
+            Where the model has no answer.
+        """
+        self.counts.solves += 1
+        values = self.values(noise)
+        try:
+            solution = self.model.solve(values, start, reference)
+        except SolveError:
+            self.progress(1, 1)
+            raise
+        self.progress(1, 0)
+        return Point(self, np.array(noise), values, solution)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """The posterior at one ξ, with its linearisation there.
+
+    Attributes
+    ----------
+    posterior
+        Of which this is a point.
+    noise
+        ξ (N,).
+    values
+        m (N,).
+    solution
+        Of the model.
+    """
+
+    posterior: FieldPosterior
+    noise: FloatArray
+    values: FloatArray
+    solution: Solution
+
+    @cached_property
+    def gaps(self) -> FloatArray:
+        """What is predicted less what was measured, over σ (n,); zero where nothing was measured."""
+        posterior = self.posterior
+        gap = np.where(posterior.measured > 0, self.solution.outputs - posterior.data, 0.0)
+        return np.asarray(posterior.weights * gap)
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """√ (n,) of the weights of the data in Gauss–Newton's matrix: 1 of normal errors, see `inverse.data.errors`."""
+        return np.asarray(np.sqrt(self.posterior.errors.information(self.gaps)))
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """R (n,); of errors that are not normal, what has their gradient with the weights of Gauss–Newton."""
+        return np.asarray(self.posterior.errors.score(self.gaps) / self.root)
+
+    @cached_property
+    def misfit(self) -> float:
+        """½ r·r, or what takes its place: −ln p(y | ξ) but for Σ ln σ + (n/2) ln 2π."""
+        minus_log = self.posterior.errors.minus_log(self.gaps) - HALF_LOG
+        return float(self.posterior.measured @ minus_log)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Ln p(y | ξ)."""
+        weights = self.posterior.weights[self.posterior.weights > 0]
+        return -self.misfit + float(np.log(weights).sum()) - len(weights) * HALF_LOG
+
+    @property
+    def penalty(self) -> float:
+        """½ ξ·ξ."""
+        return float(self.noise @ self.noise) / 2
+
+    @property
+    def cost(self) -> float:
+        """−ln p(ξ | y) but for a constant."""
+        return self.misfit + self.penalty
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """ξ + Aᵀr (N,), by one adjoint of the model."""
+        return np.asarray(self.noise + self.pull(self.residual))
+
+    def image(self, noise: FloatArray) -> FloatArray:
+        """Return Aξ (n,), or (k, n) for k of them."""
+        posterior = self.posterior
+        posterior.counts.tangents += len(np.atleast_2d(noise))
+        return self.root * posterior.weights * self.solution.tangent(posterior.prior.root(noise))
+
+    def pull(self, data: FloatArray) -> FloatArray:
+        """Return Aᵀr (N,), or (k, N) for k of them."""
+        posterior = self.posterior
+        posterior.counts.adjoints += len(np.atleast_2d(data))
+        return posterior.prior.root_transposed(self.solution.adjoint(self.root * posterior.weights * data))
+
+    def product(self, noise: FloatArray) -> FloatArray:
+        """Return AᵀAξ (N,), or (k, N) for k of them."""
+        return self.pull(self.image(noise))
+
+    def predicted(self, step: FloatArray) -> FloatArray:
+        """Return the change (U_local,) of the state along a step (N,) of ξ."""
+        return self.solution.state_tangent(self.posterior.prior.root(step))

@@ -1,0 +1,298 @@
+"""The Gaussian at the mode of a posterior of a field, from the directions that the data constrain.
+
+With AᵀA u = λu at the mode ξ̂ (`inverse.fields.field_posterior`), and V = LU of the r pairs that are kept,
+
+    Γ_post = Γ_pr − V diag(λ/(1+λ)) Vᵀ = L (I + UΛUᵀ)⁻¹ Lᵀ,
+
+of which the error is at most λ/(1+λ) of the first pair that is left out, in units of the prior (T. Bui-Thanh, O.
+Ghattas, J. Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). In the data, S = A(I + AᵀA)⁻¹Aᵀ says what a
+prediction of a datum owes to that datum; it is also the posterior covariance of Γ_n^{−1/2} G(m).
+
+The pairs come from the Krylov space of a block of random vectors (C. Musco, C. Musco, NIPS 28 (2015)): a product for
+each of its vectors, whereas passing twice over random vectors takes two, and is less accurate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from forward.model import FloatArray
+from inverse.fields.field_posterior import BLOCK, Point, Prior
+
+CUTOFF = 0.1  # λ of pairs that are left out: they change a variance by at most λ/(1+λ)
+ACCURACY = 1e-2  # ‖AᵀAu − λu‖/λ of pairs that are kept: λ is known to about its square
+VANISHING = 1e-13  # of the largest λ: rounding
+
+Map = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The leading eigenpairs of AᵀA.
+
+    Attributes
+    ----------
+    values
+        λ (r,), falling.
+    vectors
+        u (r, N), orthonormal rows.
+    images
+        Au (r, n), orthogonal rows of length √λ.
+    residuals
+        ‖AᵀAu − λu‖ (r,).
+    neglected
+        Estimate of the first λ that was left out; zero where there is none.
+    products
+        Products with AᵀA that were formed.
+    """
+
+    values: FloatArray
+    vectors: FloatArray
+    images: FloatArray
+    residuals: FloatArray
+    neglected: float
+    products: int
+
+    def solve(self, noise: FloatArray) -> FloatArray:
+        """Multiply (I + UΛUᵀ)⁻¹ with (N,), or (k, N)."""
+        return noise - (noise @ self.vectors.T * (self.values / (1 + self.values))) @ self.vectors
+
+    def root(self, noise: FloatArray) -> FloatArray:
+        """Multiply (I + UΛUᵀ)^{−1/2} with (N,), or (k, N)."""
+        return noise + (noise @ self.vectors.T * ((1 + self.values) ** -0.5 - 1)) @ self.vectors
+
+
+def leading_pairs(
+    image: Map,
+    pull: Map,
+    size: int,
+    *,
+    cutoff: float = CUTOFF,
+    rank: int | None = None,
+    accuracy: float = ACCURACY,
+    block: int = BLOCK,
+    seed: int = 0,
+) -> Spectrum:
+    """Find the eigenpairs of AᵀA with λ above a cutoff.
+
+    Parameters
+    ----------
+    image, pull
+        Products of A with rows (k, N), and of Aᵀ with rows (k, n).
+    size
+        N.
+    cutoff
+        λ above which pairs are kept; what is rounding never is.
+    rank
+        Largest number of pairs that are kept.
+    accuracy
+        ‖AᵀAu − λu‖/λ that is tolerated.
+    block
+        Number of vectors whose products are formed together.
+    seed
+        Of the first block.
+    """
+    rng = np.random.default_rng(seed)
+    wanted = size if rank is None else min(rank, size)
+    AQ = HQ = np.zeros((0, 0))
+    Q = np.zeros((0, size))
+    new = _orthonormal(rng.standard_normal((min(block, size), size)), Q, 0.0)
+    while True:
+        images = image(new)
+        products = pull(images)
+        AQ = np.concatenate([AQ, images]) if len(Q) else images
+        HQ = np.concatenate([HQ, products]) if len(Q) else products
+        Q = np.concatenate([Q, new])
+        values, turn = np.linalg.eigh(AQ @ AQ.T)
+        values, turn = np.maximum(values[::-1], 0), turn[:, ::-1].T
+        rounding = VANISHING * float(values[0])
+        kept = min(int((values > max(cutoff, rounding)).sum()), wanted)
+        residuals = np.linalg.norm(turn[:kept] @ HQ - values[:kept, None] * (turn[:kept] @ Q), axis=1)
+        # What is found below the cutoff shows that nothing above it was missed (but for λ that more than `block`
+        # directions share exactly).
+        beyond = len(values) - kept
+        settled = (residuals <= accuracy * values[:kept]).all() and (beyond >= min(block, size - kept))
+        if settled or len(Q) == size:
+            break
+        room = size - len(Q)
+        new = _orthonormal(products, Q, rounding)[:room]
+        if len(new) == 0:  # the space is invariant: only other vectors can show more
+            new = _orthonormal(rng.standard_normal((min(block, room), size)), Q, 0.0)
+    neglected = float(values[kept]) if kept < len(values) else 0.0
+    return Spectrum(values[:kept], turn[:kept] @ Q, turn[:kept] @ AQ, residuals, neglected, len(Q))
+
+
+def _orthonormal(rows: FloatArray, basis: FloatArray, least: float) -> FloatArray:
+    """Orthonormal rows that span, with an orthonormal basis, what rows (k, N) add to it by more than `least`."""
+    from scipy.linalg import qr
+
+    rest = rows - (rows @ basis.T) @ basis
+    rest = rest - (rest @ basis.T) @ basis
+    columns, triangle, _ = qr(rest.T, mode="economic", pivoting=True)
+    found = columns.T[np.abs(np.diag(triangle)) > least]
+    # Rows of very different lengths: what was left of the basis may have grown with normalisation.
+    found = found - (found @ basis.T) @ basis
+    return np.asarray(qr(found.T, mode="economic")[0].T) if len(found) else found
+
+
+@dataclass(frozen=True, eq=False)
+class LowRankPosterior:
+    """The normal distribution N(m̂, Γ_post) of the N values of a field.
+
+    Attributes
+    ----------
+    mean
+        m̂ (N,).
+    noise
+        ξ̂ (N,).
+    residual
+        r (n,) there.
+    weights
+        1/σ (n,), times the root of the weights of Gauss–Newton; zero where nothing was measured.
+    prior, spectrum
+        What it is made of.
+    log_likelihood
+        ln p(y | m̂).
+    """
+
+    mean: FloatArray
+    noise: FloatArray
+    residual: FloatArray
+    weights: FloatArray
+    prior: Prior
+    spectrum: Spectrum
+    log_likelihood: float
+
+    @classmethod
+    def at(
+        cls,
+        mode: Point,
+        *,
+        cutoff: float = CUTOFF,
+        rank: int | None = None,
+        accuracy: float = ACCURACY,
+        block: int = BLOCK,
+        seed: int = 0,
+    ) -> LowRankPosterior:
+        """Find the directions at a mode that the data constrain, as `leading_pairs` does."""
+        posterior = mode.posterior
+        spectrum = leading_pairs(
+            mode.image,
+            mode.pull,
+            posterior.size,
+            cutoff=cutoff,
+            rank=rank,
+            accuracy=accuracy,
+            block=block,
+            seed=seed,
+        )
+        weights, likelihood = mode.root * posterior.weights, mode.log_likelihood
+        return cls(mode.values, mode.noise, mode.residual, weights, posterior.prior, spectrum, likelihood)
+
+    # --- the field ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """V (r, N): from what the data constrain most to what they hardly do; Vᵀ Γ_pr⁻¹ V = I.
+
+        What is orthogonal to all of them in that sense, the data constrain less than the last.
+        """
+        return self.prior.root(self.spectrum.vectors)
+
+    @property
+    def narrowing(self) -> FloatArray:
+        """Posterior over prior standard deviation (r,) along the directions: (1+λ)^{−1/2}."""
+        return np.asarray((1 + self.spectrum.values) ** -0.5)
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """Variances (N,)."""
+        share = self.spectrum.values / (1 + self.spectrum.values)
+        return np.asarray(self.prior.variance - share @ self.directions**2)
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations (N,)."""
+        return np.asarray(np.sqrt(np.maximum(self.variance, 0)))
+
+    def trace(self, weights: FloatArray | float = 1.0) -> float:
+        """Sum of the variances, weighted (N,): with volumes of the vertices, the integral over the body."""
+        return float((weights * self.variance).sum())
+
+    def covariance(self, g: FloatArray) -> FloatArray:
+        """Multiply Γ_post with g (N,), or (k, N)."""
+        return self.prior.root(self.spectrum.solve(self.prior.root_transposed(g)))
+
+    def samples(self, noise: FloatArray) -> FloatArray:
+        """Return samples (N,) of standard normal noises (N,), or (k, N)."""
+        return self.mean + self.prior.root(self.spectrum.root(noise))
+
+    def marginal(self, g: FloatArray) -> tuple[float, float]:
+        """Mean and standard deviation of the linear functional g·m (N,), for example the mean over a region."""
+        return float(g @ self.mean), float(np.sqrt(g @ self.covariance(g)))
+
+    def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Ends (N,) and (N,) of the central credible intervals of the values."""
+        from scipy.special import ndtri
+
+        half = float(ndtri((1 + level) / 2)) * self.std
+        return self.mean - half, self.mean + half
+
+    # --- numbers -----------------------------------------------------------------------------------------------------
+
+    @property
+    def log_determinant(self) -> float:
+        """Ln det(Γ_post Γ_pr⁻¹) = −Σ ln(1+λ)."""
+        return -float(np.log1p(self.spectrum.values).sum())
+
+    @property
+    def log_evidence(self) -> float:
+        """Ln p(y) = ln L(m̂) − ½|ξ̂|² − ½ Σ ln(1+λ); exact for linear models, but for the pairs left out."""
+        return self.log_likelihood - float(self.noise @ self.noise) / 2 + self.log_determinant / 2
+
+    @property
+    def information(self) -> float:
+        """Divergence (nat) of the posterior from the prior (S. Kullback, R. A. Leibler, 1951)."""
+        values = self.spectrum.values
+        spread = float((np.log1p(values) - values / (1 + values)).sum())
+        return (spread + float(self.noise @ self.noise)) / 2
+
+    @property
+    def determined(self) -> float:
+        """Number of directions that the data determine: the trace Σ λ/(1+λ) of S."""
+        values = self.spectrum.values
+        return float((values / (1 + values)).sum())
+
+    # --- the data ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def resolution(self) -> FloatArray:
+        """Diagonal (n,) of S: between 0 (the datum says nothing that the others do not) and 1 (it alone says it)."""
+        return np.asarray((self.spectrum.images**2 / (1 + self.spectrum.values[:, None])).sum(axis=0))
+
+    @property
+    def predictive_std(self) -> FloatArray:
+        """Standard deviations (n,) of the predicted outputs, without errors of measurement; NaN where not measured."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self.weights > 0, np.sqrt(self.resolution) / self.weights, np.nan))
+
+    @property
+    def standardised(self) -> FloatArray:
+        """Residuals r/√(1 − S_ii) (n,), each standard normal if model, prior and σ are right."""
+        return np.asarray(self.residual / np.sqrt(1 - self.resolution))
+
+    @property
+    def residual_test(self) -> tuple[float, float]:
+        """χ² = |r|² + |ξ̂|² of the mode, and the probability of a larger one if model, prior and σ are right.
+
+        For linear models it is that of as many degrees of freedom as there are data. Small probabilities: the model
+        does not explain the data; near one: σ is too large.
+        """
+        from scipy.special import chdtrc
+
+        square = float(self.residual @ self.residual + self.noise @ self.noise)
+        return square, float(chdtrc((self.weights > 0).sum(), square))

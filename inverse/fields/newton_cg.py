@@ -1,0 +1,187 @@
+"""The mode of a posterior of a field: inexact Gauss–Newton steps by conjugate gradients, and a line search.
+
+Conjugate gradients on (I + AᵀA) δ = −g are those of the density of m, preconditioned by the prior covariance. Where
+they become long, the directions that the data constrain most are found (`inverse.fields.low_rank`), and P = I + UΛUᵀ of
+these preconditions all that follow. They end at ‖(I + AᵀA) δ + g‖ ≤ η‖g‖ with η = min(0.1, √(‖g‖/‖g_0‖)), in the norm
+of P⁻¹: S. C. Eisenstat, H. F. Walker, SIAM J. Sci. Comput. 17 (1996) 16–32. Steps are halved until they descend by a
+share of what their slope promises (L. Armijo, Pacific J. Math. 16 (1966) 1–3), also where the model has no answer.
+
+In this norm the gradient says how far the mode is: P ≤ I + AᵀA, so that ‖g‖ is no smaller than the length of the step
+to the mode in standard deviations of the posterior.
+
+Second derivatives of the model are left out. They count as much as the residuals, which are noise at the mode; there
+the steps converge fast enough without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forward.model import FloatArray, SolveError
+from inverse.fields.field_posterior import FieldPosterior, Point
+from inverse.fields.low_rank import Spectrum, leading_pairs
+
+ARMIJO = 1e-4
+HALVINGS = 20
+ROUNDING = 1e-12  # of the cost: what it cannot be expected to descend below
+CLOSE = 1e-2  # ‖g‖ at which the search ends
+FORCING = 0.1  # largest η: a solve costs as much as many products
+LONG = 20  # products of one step at which the step ends, and pairs are found
+STRONG = 10.0  # λ of these pairs: what is left takes few products
+ROUGH = 0.5  # their accuracy
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of the search.
+
+    Attributes
+    ----------
+    misfit, penalty
+        ½ r·r and ½ ξ·ξ where the step starts.
+    gradient
+        ‖g‖ there, in the norm of P⁻¹.
+    pairs
+        Pairs of which P is made.
+    products
+        Hessian products that the step took, with those of new pairs.
+    length
+        Fraction of the step that was gone; zero in the last row.
+    solves
+        Solves that took.
+    """
+
+    misfit: float
+    penalty: float
+    gradient: float
+    pairs: int
+    products: int
+    length: float
+    solves: int
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Where the search for the mode ended.
+
+    Attributes
+    ----------
+    point
+        The mode.
+    converged
+        Whether the gradient has fallen to the tolerance.
+    iterations
+        The steps; the last row is the mode.
+    """
+
+    point: Point
+    converged: bool
+    iterations: tuple[Iteration, ...]
+
+    @property
+    def products(self) -> int:
+        """Hessian products of all steps."""
+        return sum(row.products for row in self.iterations)
+
+    @property
+    def solves(self) -> int:
+        """Solves of all steps, and the first."""
+        return 1 + sum(row.solves for row in self.iterations)
+
+
+def find_mode(
+    posterior: FieldPosterior,
+    start: FloatArray | None = None,
+    *,
+    tolerance: float = CLOSE,
+    steps: int = 50,
+    products: int = 500,
+) -> Mode:
+    """Find the mode.
+
+    Parameters
+    ----------
+    posterior
+        Of a model with derivatives.
+    start
+        ξ (N,) where the search starts; by default zero, the centre of the prior.
+    tolerance
+        Distance to the mode, in standard deviations of the posterior, at which the search ends.
+    steps
+        Largest number of steps.
+    products
+        Largest number of Hessian products of the conjugate gradients of one step, once pairs are found.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the start.
+    """
+    here = posterior.at(np.zeros(posterior.size) if start is None else start)
+    pairs: Spectrum | None = None
+    largest, used = 0.0, 0
+    table: list[Iteration] = []
+    for number in range(steps + 1):
+        spent = 0
+        if pairs is None and used == LONG:
+            pairs = leading_pairs(here.image, here.pull, posterior.size, cutoff=STRONG, accuracy=ROUGH)
+            largest, spent = 0.0, pairs.products  # the norm is another
+        size = _norm(here.gradient, pairs)
+        largest = max(largest, size)
+        rank = 0 if pairs is None else len(pairs.values)
+        row = Iteration(here.misfit, here.penalty, size, rank, spent, 0.0, 0)
+        if size <= tolerance or number == steps:
+            break
+        forcing = min(FORCING, float(np.sqrt(size / largest)))
+        step, used = conjugate_gradients(here, pairs, forcing, LONG if pairs is None else products)
+        row = replace(row, products=spent + used)
+        there, length, solves = _search(here, step)
+        row = replace(row, length=length, solves=solves)
+        if there is None:
+            break
+        table.append(row)
+        here = there
+    return Mode(here, row.gradient <= tolerance, (*table, row))
+
+
+def _norm(g: FloatArray, pairs: Spectrum | None) -> float:
+    return float(np.sqrt(g @ (g if pairs is None else pairs.solve(g))))
+
+
+def conjugate_gradients(here: Point, pairs: Spectrum | None, forcing: float, products: int) -> tuple[FloatArray, int]:
+    """Solve (I + AᵀA) δ = −g to a relative residual; return δ (N,) and the number of products."""
+    residual = -here.gradient
+    step = np.zeros_like(residual)
+    direction = residual if pairs is None else pairs.solve(residual)
+    square = float(residual @ direction)
+    target = forcing**2 * square
+    for used in range(products):
+        if square <= target:
+            return step, used
+        along = direction + here.product(direction)
+        length = square / float(direction @ along)
+        step = step + length * direction
+        residual = residual - length * along
+        conditioned = residual if pairs is None else pairs.solve(residual)
+        before, square = square, float(residual @ conditioned)
+        direction = conditioned + square / before * direction
+    return step, products
+
+
+def _search(here: Point, step: FloatArray) -> tuple[Point | None, float, int]:
+    """Return the next point, the fraction of the step that leads there and the number of solves; or no point."""
+    slope = float(here.gradient @ step)
+    change = here.predicted(step)
+    length = 1.0
+    for solves in range(1, HALVINGS + 1):
+        try:
+            there = here.posterior.at(here.noise + length * step, here.solution.state + length * change)
+        except SolveError:
+            pass
+        else:
+            if there.cost <= here.cost + ARMIJO * length * slope + ROUNDING * here.cost:
+                return there, length, solves
+        length /= 2
+    return None, 0.0, HALVINGS

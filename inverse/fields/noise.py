@@ -1,0 +1,195 @@
+"""Noise of unknown size in the data of a field.
+
+Standard deviations are sσ with an unknown s. With the model linearised at a mode, residuals r + A(ξ − ξ̂) of s = 1 and
+AᵀA u = λu, what remains of the field in the density of s is (D. J. C. MacKay, Neural Comput. 4 (1992) 415–447)
+
+    −ln p(y | s) = ½ dᵀ(s²I + AAᵀ)⁻¹d + n ln s + ½ Σ ln(1 + λ/s²) + const,   d = r − Aξ̂,
+
+in closed form for all s at once, since the pairs of s are those of s = 1 with λ/s². The most probable s gives the noise
+of the next mode, until s stands; linear models need one round, and one to see it. What is then neglected of the spread
+of s in the posterior of the field is of second order: s is known to about 1/√(2n).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forward.model import FloatArray
+from inverse.fields.field_posterior import FieldPosterior, Point
+from inverse.fields.low_rank import CUTOFF, LowRankPosterior, Spectrum
+from inverse.fields.newton_cg import Mode, find_mode
+from uq.inputs.distributions import Distribution
+
+ROUNDS = 10
+STANDS = 0.1  # change of ln s, over its standard deviation, that ends the rounds
+FARTHEST = 8.0  # of s, in standard deviations of its normal coordinate
+GRID, ZOOMS = 401, 4  # points of the integral over s, and times that they are drawn closer to where it is
+VANISHING = 1e-16  # density over the largest one
+
+
+@dataclass(frozen=True, eq=False)
+class InferredNoise:
+    """A posterior with the most probable size of its noise.
+
+    Attributes
+    ----------
+    factor
+        s.
+    log_std
+        Standard deviation of ln s.
+    posterior
+        That of the field, of which the standard deviations are sσ.
+    mode, found
+        Its mode and the Gaussian there.
+    log_evidence
+        ln p(y) with s integrated out; exact for linear models, but for the pairs left out.
+    rounds
+        s of each round.
+    converged
+        Whether s stands and the mode was found.
+    """
+
+    factor: float
+    log_std: float
+    posterior: FieldPosterior
+    mode: Mode
+    found: LowRankPosterior
+    log_evidence: float
+    rounds: tuple[float, ...]
+    converged: bool
+
+
+def infer_noise(
+    posterior: FieldPosterior,
+    prior: Distribution,
+    *,
+    start: FloatArray | None = None,
+    tolerance: float = STANDS,
+    cutoff: float = CUTOFF,
+    rank: int | None = None,
+) -> InferredNoise:
+    """Find the most probable size of the noise, with the mode and the Gaussian of the field there.
+
+    Parameters
+    ----------
+    posterior
+        Its standard deviations are those of s = 1.
+    prior
+        Of s; the most probable one is that of its standard normal coordinate.
+    start
+        ξ (N,) where the first search for the mode starts.
+    tolerance
+        Change of ln s, over its standard deviation, that ends the rounds.
+    cutoff, rank
+        Of the pairs, as of `leading_pairs`.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the start.
+    ValueError
+        If the median of the prior is not positive.
+    """
+    factor = float(prior.from_normal(np.zeros(1))[0][0])
+    if factor <= 0:
+        message = f"the median of the prior of the noise is {factor:g}, expected a positive one"
+        raise ValueError(message)
+    rounds: list[float] = []
+    for _ in range(ROUNDS):
+        scaled = replace(posterior, sigma=factor * posterior.sigma)
+        mode = find_mode(scaled, start)
+        found = LowRankPosterior.at(mode.point, cutoff=cutoff, rank=rank)
+        rounds.append(factor)
+        marginal = Marginal.at(mode.point, found.spectrum)
+        best, log_std, log_evidence = marginal.integrated(prior, factor)
+        stands = abs(np.log(best / factor)) <= tolerance * log_std
+        if stands:
+            break
+        factor, start = best, mode.point.noise
+    return InferredNoise(
+        rounds[-1], log_std, scaled, mode, found, log_evidence, tuple(rounds), stands and mode.converged
+    )
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """ln p(y | s) of the model linearised at a mode.
+
+    Attributes
+    ----------
+    values
+        λ (r,).
+    along
+        Squares (r,) of d along the eigenvectors of AAᵀ.
+    rest
+        What remains of |d|².
+    count
+        Number n of data.
+    constant
+        Σ ln σ + (n/2) ln 2π.
+    """
+
+    values: FloatArray
+    along: FloatArray
+    rest: float
+    count: int
+    constant: float
+
+    @classmethod
+    def at(cls, mode: Point, spectrum: Spectrum) -> Marginal:
+        """Linearise at a mode with the pairs there."""
+        gap = mode.residual - mode.image(mode.noise)
+        values = spectrum.values
+        along = (spectrum.images @ gap) ** 2 / np.where(values > 0, values, 1.0)
+        weights = mode.posterior.weights[mode.posterior.weights > 0]
+        constant = len(weights) / 2 * float(np.log(2 * np.pi)) - float(np.log(weights).sum())
+        rest = max(float(gap @ gap) - float(along.sum()), 0.0)
+        return cls(values, along, rest, len(weights), constant)
+
+    def log_density(self, s: FloatArray) -> FloatArray:
+        """Ln p(y | s) (k,) at factors (k,) on the standard deviations at the mode."""
+        square = np.maximum(np.asarray(s, dtype=float), 0)[:, None] ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            misfit = (self.along / (square + self.values)).sum(axis=1) + self.rest / square[:, 0]
+            spread = np.log1p(self.values / square).sum(axis=1) + self.count * np.log(square[:, 0])
+        return np.where(square[:, 0] > 0, -(misfit + spread) / 2 - self.constant, -np.inf)
+
+    def integrated(self, prior: Distribution, unit: float) -> tuple[float, float, float]:
+        """Return the most probable s, the standard deviation of ln s, and ln p(y) with s integrated out.
+
+        Parameters
+        ----------
+        prior
+            Of s.
+        unit
+            s at the mode.
+        """
+        low, high = -FARTHEST, FARTHEST
+        for _ in range(ZOOMS):
+            x = np.linspace(low, high, GRID)
+            s = prior.from_normal(x)[0]
+            log_density = self.log_density(s / unit) - x**2 / 2 - np.log(2 * np.pi) / 2
+            top = log_density.max()
+            density = np.exp(log_density - top)
+            seen = np.flatnonzero(density > VANISHING)
+            low, high = x[max(seen[0] - 1, 0)], x[min(seen[-1] + 1, GRID - 1)]
+        weights = density / density.sum()
+        log_s = np.log(np.where(s > 0, s, 1.0))
+        log_std = float(np.sqrt(weights @ (log_s - weights @ log_s) ** 2))
+        log_evidence = float(top + np.log(density.sum() * (x[1] - x[0])))
+        return self._peak(prior, unit, x, log_density), log_std, log_evidence
+
+    def _peak(self, prior: Distribution, unit: float, x: FloatArray, log_density: FloatArray) -> float:
+        from scipy.optimize import minimize_scalar
+
+        i = int(log_density.argmax())
+        ends = x[max(i - 1, 0)], x[min(i + 1, len(x) - 1)]
+
+        def minus(at: float) -> float:
+            s = prior.from_normal(np.array([at]))[0]
+            return float(at**2 / 2 - self.log_density(s / unit)[0])
+
+        best = minimize_scalar(minus, bounds=ends, method="bounded", options={"xatol": 1e-10})
+        return float(prior.from_normal(np.array([best.x]))[0][0])

@@ -1,0 +1,1 @@
+"""Posteriors and evidences of few parameters."""

@@ -1,0 +1,189 @@
+"""The mode of a posterior, and the Gaussian there (Laplace): few parameters, in standard normal coordinates.
+
+The mode is found by Gauss–Newton steps of limited length (K. Levenberg, Quart. Appl. Math. 2 (1944) 164–168; D. W.
+Marquardt, J. SIAM 11 (1963) 431–441), from several starts. There −ln p(y | x) + ½|x|² ≈ Φ̂ + ½ δᵀH δ, so that
+
+    x ~ N(x̂, H⁻¹),   ln Z ≈ −Φ̂ − ½ ln det H,
+
+which is exact for models that are linear in normal parameters (D. J. C. MacKay, Neural Comput. 4 (1992) 415–447).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from forward.model import FloatArray, SolveError
+from inverse.low_dimensional.posterior import Posterior
+from uq.inputs.sampling import sobol_points
+
+STEPS = 50
+CLOSE = 1e-13  # squared Newton decrement that ends the search: the density is known to half of it
+FARTHEST = 3.0  # length of a step, in standard deviations of the prior
+STIFFER, SOFTER = 8.0, 3.0
+DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
+
+
+@dataclass(frozen=True)
+class Step:
+    """One iteration of the search: start, log posterior, squared Newton decrement, damping."""
+
+    start: int
+    log_posterior: float
+    decrement: float
+    damping: float
+
+
+@dataclass(frozen=True)
+class Laplace:
+    """A Gaussian for a posterior.
+
+    Attributes
+    ----------
+    mode
+        x̂ (c,).
+    log_posterior
+        ln p(y | x̂) − ½|x̂|².
+    hessian
+        H (c, c), positive definite.
+    outputs
+        ψ (m,) at the mode.
+    converged
+        Whether the search ended at a stationary point.
+    steps
+        The iterations of all starts.
+    modes
+        Where each start ended (k, c), and `ends` (k,), the log posterior there.
+    """
+
+    mode: FloatArray
+    log_posterior: float
+    hessian: FloatArray
+    outputs: FloatArray
+    converged: bool
+    steps: tuple[Step, ...]
+    modes: FloatArray
+    ends: FloatArray
+
+    @property
+    def log_evidence(self) -> float:
+        """Ln Z of the Gaussian."""
+        return float(self.log_posterior - np.linalg.slogdet(self.hessian)[1] / 2)
+
+    @property
+    def root(self) -> FloatArray:
+        """L (c, c) with L Lᵀ = H⁻¹, which makes samples x̂ + L z of standard normal z."""
+        return np.linalg.inv(np.linalg.cholesky(self.hessian)).T
+
+    @property
+    def covariance(self) -> FloatArray:
+        """H⁻¹ (c, c)."""
+        root = self.root
+        return np.asarray(root @ root.T)
+
+
+def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool = True) -> Laplace:
+    """Find the mode, and the second derivatives there.
+
+    Parameters
+    ----------
+    posterior
+        Of a model with derivatives.
+    starts
+        Number of starts: the centre of the prior, and points of a scrambled Sobol' sequence.
+    seed
+        Of that.
+    exact
+        Take second derivatives by central differences of the gradient (two solves for each coordinate), or those of
+        Gauss–Newton.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at any of the starts.
+    """
+    from scipy.special import ndtri
+
+    c = len(posterior.names)
+    # Starts at which every coordinate is within a standard deviation or two: the far tails have no answers.
+    others = ndtri(0.05 + 0.9 * sobol_points(seed, 0, 0, starts - 1, c)) if starts > 1 else np.zeros((0, c))
+    ends: list[tuple[FloatArray, float, bool]] = []
+    steps: list[Step] = []
+    for number, x in enumerate(np.vstack([np.zeros((1, c)), others])):
+        found = _climb(posterior, x, number, steps)
+        if found is not None:
+            ends.append(found)
+    if not ends:
+        message = f"the model has no answer at any of the {starts} starts of the search for the mode"
+        raise SolveError(message)
+    best, value, converged = max(ends, key=lambda end: end[1])
+    here = posterior.at(best[None, :], derivatives=True)
+    hessian = here.curvature[0]
+    if exact:
+        hessian = _differences(posterior, best, hessian)
+    return Laplace(
+        best,
+        value,
+        hessian,
+        here.outputs[0],
+        converged,
+        tuple(steps),
+        np.array([end[0] for end in ends]),
+        np.array([end[1] for end in ends]),
+    )
+
+
+def _climb(
+    posterior: Posterior, x: FloatArray, number: int, steps: list[Step]
+) -> tuple[FloatArray, float, bool] | None:
+    here = posterior.at(x[None, :], derivatives=True)
+    if not np.isfinite(here.log_likelihood[0]):
+        return None
+    damping = 0.0
+    for _ in range(STEPS):
+        gradient, curvature = here.gradient[0], _positive(here.curvature[0])
+        decrement = float(gradient @ np.linalg.solve(curvature, gradient))
+        value = float(here.log_posterior[0])
+        steps.append(Step(number, value, decrement, damping))
+        if decrement < CLOSE:
+            return here.x[0], value, True
+        for _ in range(STEPS):
+            step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient)
+            step *= min(1.0, FARTHEST / float(np.linalg.norm(step)))
+            there = posterior.at(here.x + step, derivatives=True)
+            gain = float(there.log_posterior[0]) - value
+            expected = float(-gradient @ step - step @ curvature @ step / 2)
+            if gain > 1e-4 * expected:
+                break
+            if abs(expected) < 1e-12 * abs(value):  # rounding
+                return here.x[0], value, True
+            damping = max(STIFFER * damping, 1e-2)
+        else:
+            return here.x[0], value, False
+        if gain > 0.5 * expected:
+            damping = damping / SOFTER if damping > 1e-3 else 0.0
+        here = there
+    return here.x[0], float(here.log_posterior[0]), False
+
+
+def _positive(matrix: FloatArray) -> FloatArray:
+    """Return the nearest matrix whose eigenvalues are those of a posterior that is no wider than 30 priors."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray(vectors * np.maximum(values, 1e-3) @ vectors.T)
+
+
+def _differences(posterior: Posterior, mode: FloatArray, curvature: FloatArray) -> FloatArray:
+    """Second derivatives by differences of the gradient, along directions in which the posterior is about as wide."""
+    directions = np.linalg.inv(np.linalg.cholesky(_positive(curvature))).T  # columns
+    moves = DIFFERENCE * directions.T
+    found = posterior.at(np.concatenate([mode + moves, mode - moves]), derivatives=True)
+    if not np.isfinite(found.log_likelihood).all():
+        return _positive(curvature)
+    c = len(mode)
+    change = (found.gradient[:c] - found.gradient[c:]) / (2 * DIFFERENCE)  # rows: H times a direction
+    whitened = change @ directions
+    inverse = np.linalg.inv(directions)
+    values, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
+    # In these coordinates Gauss–Newton says 1.
+    return np.asarray(inverse.T @ (vectors * np.maximum(values, 1e-2) @ vectors.T) @ inverse)

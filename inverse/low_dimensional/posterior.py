@@ -1,0 +1,184 @@
+"""The posterior density of a few random parameters given measured outputs, in standard normal coordinates.
+
+With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) + e and independent e_i ~ N(0, (s σ_i)²),
+
+    −ln p(y | x) = ½ r·r + Σ ln(s σ_i) + (m/2) ln 2π,   r_i = (ψ_i(ω) − y_i)/(s σ_i),
+
+where s = 1, or is unknown too, with a prior of its own and one more coordinate. The prior of x has no constants that
+depend on the model, so that evidences of different models compare (for errors with heavy tails see
+`inverse.data.errors`):
+
+    Z = ∫ p(y | x) N(x; 0, I) dx.
+
+Where only a part A of the prior is of materials (`Inputs.admissible`), the prior is N(x; 0, I)/P(A) in A and zero
+elsewhere: outside A the model has no answer, and what is called p(y | x) here is divided by P(A).
+
+Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
+multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
+Wright, Numerical Optimization (2006), section 10.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from uq.evaluation.evaluate import Evaluate, Request, Start
+from uq.inputs.distributions import Distribution
+from uq.inputs.random_parameters import Inputs
+
+NOISE = "noise"  # name of the coordinate of s
+
+
+@dataclass(frozen=True)
+class Density:
+    """The posterior at n points.
+
+    Attributes
+    ----------
+    x
+        Points (n, c).
+    parameters
+        The model's parameters ω (n, d) there.
+    outputs
+        ψ (n, m); NaN where the model has no answer.
+    log_likelihood
+        ln p(y | x) (n,); −∞ where the model has no answer.
+    everything
+        All outputs (n, M) of the model, of which ψ are those that were measured.
+    tangents
+        ∂ψ/∂ω (n, M, d) of all outputs, where derivatives were asked for.
+    gradient, curvature
+        Of −ln p(y | x) + ½|x|²: (n, c), and its second derivatives (n, c, c) but for those of ψ; NaN where the model
+        has no answer, empty where they were not asked for.
+    """
+
+    x: FloatArray
+    parameters: FloatArray
+    outputs: FloatArray
+    log_likelihood: FloatArray
+    everything: FloatArray
+    tangents: FloatArray | None
+    gradient: FloatArray
+    curvature: FloatArray
+
+    @property
+    def log_posterior(self) -> FloatArray:
+        """Ln p(y | x) − ½|x|² (n,): what the mode is the largest value of."""
+        return np.asarray(self.log_likelihood - (self.x**2).sum(axis=1) / 2)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Density], order: NDArray[np.intp] | None = None) -> Density:
+        """Put points together, in a new order if one is given; with derivatives where all parts have them."""
+
+        def column(name: str) -> FloatArray:
+            values = np.concatenate([getattr(part, name) for part in parts])
+            return values if order is None else np.asarray(values[order])
+
+        n, differentiated = sum(len(part.x) for part in parts), all(part.tangents is not None for part in parts)
+        return cls(
+            x=column("x"),
+            parameters=column("parameters"),
+            outputs=column("outputs"),
+            log_likelihood=column("log_likelihood"),
+            everything=column("everything"),
+            tangents=column("tangents") if differentiated else None,
+            gradient=column("gradient") if differentiated else np.zeros((n, 0)),
+            curvature=column("curvature") if differentiated else np.zeros((n, 0, 0)),
+        )
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Measured outputs and what is believed of their parameters and errors before.
+
+    Parameters
+    ----------
+    inputs
+        The d parameters of the model.
+    evaluate
+        The model.
+    data
+        y (m,), in the units of the outputs.
+    sigma
+        Standard deviations σ (m,) of the errors, or what they are in proportion to where s is unknown.
+    noise
+        Prior of s; nothing where s = 1.
+    which
+        Outputs (m,) of the model that were measured, by number.
+    start
+        Where the solver starts.
+    errors
+        Distribution of the errors over their scale sσ.
+    """
+
+    inputs: Inputs
+    evaluate: Evaluate
+    data: FloatArray
+    sigma: FloatArray
+    noise: Distribution | None = None
+    which: tuple[int, ...] | None = None
+    start: Start | None = None
+    errors: NormalErrors | StudentErrors = NORMAL
+
+    def __post_init__(self) -> None:
+        if self.data.shape != self.sigma.shape:
+            message = f"{self.data.size} data with {self.sigma.size} standard deviations, expected as many"
+            raise ValueError(message)
+        if not (self.sigma > 0).all():
+            message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
+            raise ValueError(message)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the c coordinates: the parameters, and the noise where it is unknown."""
+        return self.inputs.names + ((NOISE,) if self.noise is not None else ())
+
+    def physical(self, x: FloatArray) -> FloatArray:
+        """Return the parameters, and s where it is unknown, (n, c) at x (n, c)."""
+        d = len(self.inputs.names)
+        values = self.inputs.from_normals(x[:, :d])[0]
+        if self.noise is None:
+            return values
+        return np.column_stack([values, self.noise.from_normal(x[:, d])[0]])
+
+    def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
+        """Solve at the points x (n, c)."""
+        d, m = len(self.inputs.names), self.data.size
+        errors = self.errors
+        n, c = x.shape
+        points, slopes = self.inputs.from_normals(x[:, :d])
+        found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
+        which = slice(None) if self.which is None else list(self.which)
+        outputs = found.outputs[:, which]
+        s, ln_s_slope = np.ones(n), np.zeros(n)
+        if self.noise is not None:
+            s, s_slope = self.noise.from_normal(x[:, d])
+            ln_s_slope = s_slope / s
+        scale = s[:, None] * self.sigma
+        residual = (outputs - self.data) / scale
+        misfit = errors.misfit(residual, np.log(scale).sum(axis=1)) + np.log(self.inputs.admitted)
+        log_likelihood = np.where(found.ok, -misfit, -np.inf)
+        if not derivatives:
+            empty = np.zeros((n, 0))
+            return Density(x, points, outputs, log_likelihood, found.outputs, None, empty, empty[:, :, None])
+        assert found.tangents is not None
+        A = np.zeros((n, m, c))
+        A[:, :, :d] = found.tangents[:, which] @ slopes / scale[:, :, None]
+        score = errors.score(residual)
+        gradient = x + np.einsum("zm,zmc->zc", score, A)
+        curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, errors.information(residual), A)
+        if self.noise is not None:
+            # r falls with ln s: d(Σρ + m ln s)/d ln s = m − r·ψ; the second derivatives are exact in ln s.
+            gradient[:, d] += (m - (residual * score).sum(axis=1)) * ln_s_slope
+            turn = errors.turn(residual)
+            cross = -np.einsum("zm,zmc->zc", turn, A) * ln_s_slope[:, None]
+            curvature[:, d, :] += cross
+            curvature[:, :, d] += cross
+            curvature[:, d, d] += (residual * turn).sum(axis=1) * ln_s_slope**2
+        return Density(x, points, outputs, log_likelihood, found.outputs, found.tangents, gradient, curvature)

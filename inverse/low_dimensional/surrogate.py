@@ -1,0 +1,338 @@
+"""A polynomial that stands for a model where a posterior is, and points drawn from the posterior that it gives.
+
+The outputs are fitted by least squares to values and derivatives at points that were solved, in Hermite polynomials
+about the weighted mean of these points; far points count less. Polynomials of the parameters or of their standard
+normal coordinates, and their degree: the ones that predict left-out points best. The posterior of the polynomial costs
+nothing, so it can be sampled as densely as it takes: from a mixture of Gaussians, each as wide as the posterior is
+about its centre, whose centres are drawn from the points of the round before (population Monte Carlo: O. Cappé et al.,
+Stat. Comput. 18 (2008) 447–459).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from forward.model import WORK, FloatArray, SolveError
+from inverse.criticism.weights import effective_number, normalised
+from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.posterior import Density, Posterior
+from uq.evaluation.evaluate import Evaluations, Failure, Request
+from uq.inputs.coordinates import Coordinates
+from uq.inputs.distributions import Normal
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.surrogates.basis import Basis, hyperbolic
+
+DEGREE = 6
+ROWS_PER_TERM = 1.5
+FOLDS = 4
+NEAR = 0.5  # share of the points that the weights of the fit are worth
+COUNTED = 1e-3  # weight, over the largest, of a point that the polynomial can be said to know
+MARGIN = 0.3  # of its size, that is added on either side of the box of these points
+BEYOND = "the polynomial is not known there"
+WIDER = 1.3  # τ: standard deviations of the first proposal over those of Laplace
+SHARE = 0.7  # α: of the points from the Gaussians; the others are from the prior
+CENTRES = 64
+REACH = 0.4  # most that a Gaussian of the mixture is wide, in standard deviations of the prior
+SCRAMBLES = 8
+FIRST, LAST = 2**11, 2**13  # points of the first clouds and of the last one
+ROUNDS = 4
+ENOUGH = 0.2  # effective share of a cloud that needs no better proposal
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """A polynomial for the outputs of a model; an evaluation that costs nothing.
+
+    Attributes
+    ----------
+    parameters, outputs
+        Names.
+    basis
+        The P polynomials.
+    coefficients
+        (P, m).
+    lower, upper
+        The box (d,) beyond which there is no answer: a polynomial far from its points says anything.
+    """
+
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    basis: Basis
+    coefficients: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    differentiable: bool = True
+    displacements: int = 0
+
+    def on(self, model: int) -> Surrogate:
+        """Return itself: it stands for one model."""
+        return self
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate the polynomial at all points of a request."""
+        points = request.points
+        n = len(points)
+        outside = ((points < self.lower) | (points > self.upper)).any(axis=1)
+        outputs = self.basis.values(points) @ self.coefficients
+        outputs[outside] = np.nan
+        tangents = None
+        if request.tangents:
+            slopes = self.basis.derivatives(points) @ self.coefficients
+            tangents = np.swapaxes(slopes / self.basis.coordinates.scale[:, None], 1, 2)
+            tangents[outside] = np.nan
+        failures = tuple(Failure(int(i), (), BEYOND) for i in np.flatnonzero(outside))
+        work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals = np.where(outside, np.nan, 0.0)
+        return Evaluations(
+            points,
+            outputs,
+            tangents,
+            failures,
+            np.zeros(n),
+            work,
+            residuals,
+            ~outside,
+            np.zeros(n, dtype=np.int8),
+            np.zeros((0, 0)),
+        )
+
+
+def fit(posterior: Posterior, solved: Density) -> Posterior:
+    """Return the posterior of a polynomial that is fitted to points which were solved with their derivatives.
+
+    Raises
+    ------
+    SolveError
+        If fewer points have an answer than a polynomial needs.
+    """
+    assert solved.tangents is not None
+    good = np.isfinite(solved.log_likelihood)
+    n, d = int(good.sum()), len(posterior.inputs.names)
+    if n < 2 * FOLDS:
+        message = f"{n} points have an answer, too few for a polynomial"
+        raise SolveError(message)
+    weights = _tempered(solved.log_posterior[good], NEAR * n)
+    x, outputs = solved.x[good, :d], solved.everything[good]
+    slopes = posterior.inputs.from_normals(x)[1]
+    normals = Inputs(dict.fromkeys(posterior.inputs.names, Normal(mean=0.0, std=1.0)))
+    near = weights > COUNTED * weights.max()
+    fits = [
+        (*_regression(points, outputs, tangents, weights), points[near], inputs)
+        for inputs, points, tangents in (
+            (posterior.inputs, solved.parameters[good], solved.tangents[good]),
+            (normals, x, solved.tangents[good] @ slopes),
+        )
+    ]
+    _, basis, coefficients, box, inputs = min(fits, key=lambda fitted: fitted[0])
+    evaluate = posterior.evaluate
+    ends = np.array([box.min(axis=0), box.max(axis=0)])
+    lower, upper = ends + MARGIN * np.ptp(ends, axis=0) * np.array([[-1.0], [1.0]])
+    surrogate = Surrogate(evaluate.parameters, evaluate.outputs, basis, coefficients, lower, upper)
+    return replace(posterior, inputs=inputs, evaluate=surrogate, start=None)
+
+
+def _regression(
+    points: FloatArray, outputs: FloatArray, tangents: FloatArray, weights: FloatArray
+) -> tuple[float, Basis, FloatArray]:
+    """Fit values and derivatives by the degree with the smallest error at left-out points; that error too."""
+    n, d = points.shape
+    centre = weights @ points
+    scale = np.sqrt(weights @ (points - centre) ** 2)
+    root = np.sqrt(np.maximum(weights / weights.max(), 1e-8))[:, None, None]
+    right = np.concatenate([outputs[:, None, :], np.swapaxes(tangents, 1, 2) * scale[:, None]], axis=1) * root
+    spread = np.sqrt((root[:, 0] ** 2 * (outputs - weights @ outputs) ** 2).sum(axis=0))
+    size = np.where(spread > 0, spread, 1.0)
+    fold = np.arange(n) % FOLDS
+    best: tuple[float, Basis, FloatArray] | None = None
+    for degree in range(1, DEGREE + 1):
+        basis = _hermite(centre, scale, d, degree)
+        if degree > 1 and ROWS_PER_TERM * len(basis.indices) > n * (d + 1) * (FOLDS - 1) / FOLDS:
+            break
+        left = np.concatenate([basis.values(points)[:, None, :], basis.derivatives(points)], axis=1) * root
+        missed = 0.0
+        for k in range(FOLDS):
+            kept, out = fold != k, fold == k
+            error = left[out, 0] @ _solve(left[kept], right[kept]) - right[out, 0]
+            missed += float(((error / size) ** 2).sum())
+        if best is None or missed < 0.8 * best[0]:
+            best = missed, basis, _solve(left, right)
+    assert best is not None
+    return best
+
+
+def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
+    terms, m = left.shape[2], right.shape[2]
+    return np.asarray(np.linalg.lstsq(left.reshape(-1, terms), right.reshape(-1, m), rcond=1e-10)[0])
+
+
+def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basis:
+    beta = np.maximum(np.arange(degree + 1.0), 1.0)
+    indices = hyperbolic(d, degree, 1.0)
+    return Basis(Coordinates.linear(centre, scale), np.zeros((d, degree + 1)), np.tile(beta, (d, 1)), indices)
+
+
+def _tempered(log_density: FloatArray, least: float) -> FloatArray:
+    """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 for which they are worth `least` points."""
+
+    def weights(power: float) -> FloatArray:
+        w = np.exp(power * (log_density - log_density.max()))
+        return np.asarray(w / w.sum())
+
+    if 1 / (weights(1.0) ** 2).sum() >= least:
+        return weights(1.0)
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        power = (low + high) / 2
+        low, high = (power, high) if 1 / (weights(power) ** 2).sum() >= least else (low, power)
+    return weights(low)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Gaussians of equal weight and the prior: a proposal.
+
+    Attributes
+    ----------
+    centres
+        (k, c).
+    roots
+        L (k, c, c), with L Lᵀ the covariances.
+    """
+
+    centres: FloatArray
+    roots: FloatArray
+
+    @classmethod
+    def of(cls, gaussian: Laplace) -> Mixture:
+        """Return that of Laplace's Gaussian, made wider."""
+        return cls(gaussian.mode[None, :], WIDER * gaussian.root[None, :, :])
+
+    def draw(self, cubes: FloatArray) -> FloatArray:
+        """Map points (n, c + 1) of the unit cube to points (n, c): the first number chooses the component."""
+        from scipy.special import ndtri
+
+        z = ndtri(cubes[:, 1:])
+        which = np.minimum((cubes[:, 0] / SHARE * len(self.centres)).astype(int), len(self.centres) - 1)
+        x = self.centres[which] + np.einsum("zij,zj->zi", self.roots[which], z)
+        return np.where((cubes[:, 0] < SHARE)[:, None], x, z)
+
+    def log_over_prior(self, x: FloatArray) -> FloatArray:
+        """Ln of the density at x (n, c) over that of the prior, (n,)."""
+        log_prior = -(x**2).sum(axis=1) / 2
+        parts = []
+        for centre, root in zip(self.centres, self.roots, strict=True):
+            deviation = (x - centre) @ np.linalg.inv(root).T
+            parts.append(-(deviation**2).sum(axis=1) / 2 - np.linalg.slogdet(root)[1])
+        top = np.max(parts, axis=0)
+        gaussians = top + np.log(np.exp(np.array(parts) - top).mean(axis=0))
+        return np.asarray(np.logaddexp(np.log(SHARE) + gaussians - log_prior, np.log(1 - SHARE)))
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Many points with their weights in the posterior of a polynomial; every eighth part is a scramble of its own.
+
+    Nine of ten points that are picked from it are drawn by their weights w; one by √w, which reaches farther out.
+
+    Attributes
+    ----------
+    surrogate
+        The posterior of the polynomial.
+    mixture
+        What the points were drawn from.
+    x
+        Points (N, c).
+    log_weights
+        ln p(y | x) N(x; 0, I)/q(x), (N,), by the polynomial.
+    """
+
+    surrogate: Posterior
+    mixture: Mixture
+    x: FloatArray
+    log_weights: FloatArray
+
+    @property
+    def weights(self) -> FloatArray:
+        """Weights (N,) of sum 1."""
+        return normalised(self.log_weights)
+
+    @property
+    def effective(self) -> float:
+        """Effective number of points."""
+        return effective_number(self.weights)
+
+    @property
+    def error(self) -> float:
+        """Standard error of the logarithm of the mean weight, from the scatter of the scrambles."""
+        means = self.weights.reshape(SCRAMBLES, -1).mean(axis=1)
+        return float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / means.mean())
+
+    def pick(self, seed: int, count: int) -> FloatArray:
+        """Draw points (count, c), in eight independent sweeps."""
+        chance = np.exp(self._log_picked(self.log_weights)) / len(self.x)
+        # Neighbours along the longest axis of the cloud stand beside each other, so that a sweep covers it evenly.
+        w = self.weights
+        deviation = self.x - w @ self.x
+        axis = np.linalg.eigh((deviation * w[:, None]).T @ deviation)[1][:, -1]
+        order = np.argsort(deviation @ axis, kind="stable")
+        ends = np.cumsum(chance[order])
+        each = count // SCRAMBLES
+        offsets = np.random.default_rng([seed, count]).random(SCRAMBLES)
+        places = np.concatenate([(np.arange(each) + offset) / each for offset in offsets])
+        picked = order[np.minimum(np.searchsorted(ends, places * ends[-1]), len(w) - 1)]
+        return np.asarray(self.x[picked])
+
+    def log_over_prior(self, x: FloatArray) -> FloatArray:
+        """Ln of the density of picked points at x (n, c) over that of the prior, (n,)."""
+        over = self.mixture.log_over_prior(x)
+        return np.asarray(over + self._log_picked(self.surrogate.at(x).log_likelihood - over))
+
+    def _log_picked(self, log_weights: FloatArray) -> FloatArray:
+        """Ln of the density of picked points over q, where ln w is known."""
+        top = self.log_weights.max()
+        mean, mean_root = (np.exp(power * (self.log_weights - top)).mean() for power in (1.0, 0.5))
+        parts = (0.9 * np.exp(log_weights - top) / mean, 0.1 * np.exp((log_weights - top) / 2) / mean_root)
+        return np.asarray(np.log(np.maximum(parts[0] + parts[1], 1e-300)))
+
+
+def sample(surrogate: Posterior, gaussian: Laplace, seed: int) -> Cloud:
+    """Draw a cloud from the posterior of a polynomial, with proposals that are fitted to it round by round."""
+    mixture = Mixture.of(gaussian)
+    cloud = _cloud(surrogate, mixture, seed, FIRST)
+    for k in range(ROUNDS):
+        if cloud.effective > ENOUGH * len(cloud.x):
+            break
+        better = _mixture(surrogate, cloud, seed + k)
+        after = _cloud(surrogate, better, seed + 1 + k, FIRST)
+        if k and after.effective < 1.1 * cloud.effective:
+            break
+        mixture, cloud = better, after
+    return _cloud(surrogate, mixture, seed + ROUNDS + 1, LAST)
+
+
+def _cloud(surrogate: Posterior, mixture: Mixture, seed: int, count: int) -> Cloud:
+    c = mixture.centres.shape[1]
+    each = count // SCRAMBLES
+    cubes = np.concatenate([sobol_points(seed, r, 0, each, c + 1) for r in range(SCRAMBLES)])
+    x = mixture.draw(cubes)
+    over = mixture.log_over_prior(x)
+    pieces = [surrogate.at(piece).log_likelihood for piece in np.array_split(x, max(1, count // 4096))]
+    return Cloud(surrogate, mixture, x, np.concatenate(pieces) - over)
+
+
+def _mixture(surrogate: Posterior, cloud: Cloud, seed: int) -> Mixture:
+    """Gaussians about points of a cloud, with the covariances (H + I/ρ²)⁻¹ of the posterior about each."""
+    tempered = _tempered(cloud.log_weights, 2 * CENTRES)
+    places = (np.arange(CENTRES) + np.random.default_rng([seed, CENTRES]).random()) / CENTRES
+    order = np.argsort(cloud.x[:, 0], kind="stable")
+    centres = cloud.x[
+        order[np.searchsorted(np.cumsum(tempered[order]), places * tempered.sum()).clip(0, len(order) - 1)]
+    ]
+    there = surrogate.at(centres, derivatives=True)
+    c = centres.shape[1]
+    values, vectors = np.linalg.eigh(there.curvature)
+    spread = WIDER / np.sqrt(np.maximum(values, 1.0) + 1 / REACH**2)
+    return Mixture(centres, vectors * spread[:, None, :] @ np.broadcast_to(np.eye(c), vectors.shape))

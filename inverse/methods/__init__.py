@@ -1,0 +1,1 @@
+"""Inversion and selection as methods of a study."""

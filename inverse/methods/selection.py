@@ -1,0 +1,255 @@
+"""Model selection as a method: which evidences are found, and with which variants.
+
+The probability of model k given the data is P_k ∝ π_k Z_k (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995)
+773–795). Groups of data (specimens, regions) have constants of their own under one law: the ln Z of the groups add.
+What it depends on is shown by variants: other noise, other data, and priors half and twice as wide, which reweight the
+points that were solved already (in standard normal coordinates, N(0, s²I) in place of N(0, I)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, SolveError
+from forward.settings import Settings
+from inverse.criticism.comparison import Assessment, Candidate, Data, comparison
+from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
+from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.nested import nested
+from inverse.low_dimensional.posterior import Posterior
+from uq.evaluation.evaluate import Evaluate
+from uq.inputs.distributions import Distribution
+from uq.surrogates.linearisation import linearise
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+WIDTHS = (0.5, 2.0)  # of the priors, in the variants
+STATED = "as stated"
+NonNegative = Annotated[float, Field(ge=0)]
+
+
+class Noise(Settings):
+    """Errors of the data: independent and normal, with standard deviation s σ_i, σ_i = max(relative |y_i|, absolute).
+
+    Parameters
+    ----------
+    absolute, relative
+        In the units of the data, and in proportion to them; without both, σ_i stands with the data.
+    factor
+        Prior of s; without it s = 1.
+    """
+
+    absolute: NonNegative = 0.0
+    relative: NonNegative = 0.0
+    factor: Distribution | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether σ stands with the data."""
+        return self.absolute == 0 and self.relative == 0
+
+    def sigma(self, values: FloatArray, given: FloatArray | None) -> FloatArray:
+        """Return σ (m,) for data (m,).
+
+        Raises
+        ------
+        ValueError
+            If one of them is not positive.
+        """
+        if self.given:
+            if given is None:
+                message = "neither absolute nor relative noise, and no sigma with the data: expected one of them"
+                raise ValueError(message)
+            return given
+        sigma = np.maximum(self.relative * np.abs(values), self.absolute)
+        if not (sigma > 0).all():
+            message = "relative noise vanishes where a datum is zero, expected a floor: absolute = ..."
+            raise ValueError(message)
+        return sigma
+
+
+class Select(Settings):
+    """Bayesian model selection: evidence and probability of every candidate, and what they are worth.
+
+    Parameters
+    ----------
+    samples
+        Solves for each evidence, beside those of the search for the mode.
+    noise
+        Errors of the data.
+    other_noises
+        By name: what else the errors might be; all evidences are found again with each.
+    subsets
+        By name: tests whose data are taken alone; all evidences are found again with each.
+    held_out
+        Predict every test from the others too: all evidences are found again without each of them.
+    seed
+        Of all draws.
+    starts
+        Starts of each search for the mode.
+    check
+        "dynesty": find the evidences by nested sampling too.
+    """
+
+    kind: Literal["select"] = "select"
+    samples: Annotated[int, Field(ge=LEAST)] = 256
+    noise: Noise
+    other_noises: dict[str, Noise] = Field(default={})
+    subsets: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(default={})
+    held_out: bool = False
+    seed: Annotated[int, Field(ge=0)] = 0
+    starts: Annotated[int, Field(ge=1)] = 4
+    check: Literal["dynesty"] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Select:
+        names = [STATED, *self.other_noises, *self.subsets]
+        if len(set(names)) < len(names):
+            message = f"other_noises and subsets: names {', '.join(names)}, expected different ones"
+            raise ValueError(message)
+        return self
+
+    @property
+    def variants(self) -> int:
+        """Number of times that all evidences are found, without those for tests that are held out."""
+        return 1 + len(self.other_noises) + len(self.subsets)
+
+    def run(
+        self,
+        candidates: Mapping[str, Candidate],
+        groups: Mapping[str, Data],
+        evaluate: Callable[[str, str], Evaluate],
+        free: Callable[[str, str], Evaluate] | None = None,
+    ) -> xr.Dataset:
+        """Compare candidates.
+
+        Parameters
+        ----------
+        candidates
+            By name.
+        groups
+            Data by the name of the group.
+        evaluate
+            The model of a candidate in a group; its first outputs are the data of the group, others are predicted.
+        free
+            The same without cost, for nested sampling.
+
+        Returns
+        -------
+        xarray.Dataset
+            See docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If a model has no answer at any start or any point.
+        """
+        pairs = [(name, group) for name in candidates for group in groups]
+        posteriors, stated = {}, {}
+        for name, group in pairs:
+            one = started(posterior(candidates[name], groups[group], self.noise, evaluate(name, group)))
+            posteriors[name, group], stated[name, group] = self._assess(one, (name, group))
+        variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
+            STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
+        }
+        for width in WIDTHS:
+            label = f"priors × {width:g}"
+            variants[label] = {
+                pair: _rescaled(found.evidence, posteriors[pair], width) for pair, found in stated.items()
+            }
+        for label, noise in self.other_noises.items():
+            variants[label] = {
+                pair: self._value(_with_noise(posteriors[pair], groups[pair[1]], noise), pair) for pair in pairs
+            }
+        for label, tests in self.subsets.items():
+            variants[label] = {
+                pair: self._value(_only(posteriors[pair], groups[pair[1]], tests), pair)
+                for pair in pairs
+                if set(tests) & set(_tests(groups[pair[1]]))
+            }
+        checks = {}
+        if self.check is not None:
+            source = free or evaluate
+            checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
+        left_out = (
+            {test: self._without(test, groups, posteriors) for test in _testnames(groups)} if self.held_out else {}
+        )
+        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out)
+
+    def _without(
+        self, test: str, groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
+    ) -> dict[tuple[str, str], tuple[float, float]]:
+        """Return ln Z and its error without a test, in the groups that have it and others."""
+        found = {}
+        for pair, posterior in posteriors.items():
+            rest = _tests(groups[pair[1]])
+            if test in rest and len(rest) > 1:
+                others = tuple(other for other in rest if other != test)
+                found[pair] = self._value(_only(posterior, groups[pair[1]], others), pair)
+        return found
+
+    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[Posterior, Assessment]:
+        """Find mode and evidence; the posterior too, with solves that start from the mode."""
+        try:
+            gaussian = laplace(posterior, starts=self.starts, seed=self.seed)
+            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
+            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
+        except SolveError as error:
+            message = f"candidate '{pair[0]}': {error.reason}"
+            raise SolveError(message, error.history) from None
+
+    def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
+        found = self._assess(posterior, pair)[1].evidence
+        return found.log_evidence, found.error
+
+
+def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate) -> Posterior:
+    """Return the posterior of a candidate."""
+    sigma = noise.sigma(data.values, data.sigma)
+    return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
+
+
+def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
+    """Let solves of a model with states start from its tangent at a point (d,), by default the mean of the prior."""
+    if posterior.start is None and point is not None:
+        return posterior  # a model without states, or without an answer at the mean
+    try:
+        start = linearise(posterior.inputs, posterior.evaluate, point).prediction
+    except SolveError:
+        return posterior
+    return replace(posterior, start=start)
+
+
+def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
+    """The same with other errors."""
+    return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
+
+
+def _tests(data: Data) -> tuple[str, ...]:
+    """Names of the tests that were measured."""
+    return tuple(dict.fromkeys(data.tests[: data.values.size]))
+
+
+def _testnames(groups: Mapping[str, Data]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(test for data in groups.values() for test in _tests(data)))
+
+
+def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:
+    """The same with the data of some tests only."""
+    which = np.array([i for i in range(data.values.size) if data.tests[i] in tests])
+    return replace(posterior, data=posterior.data[which], sigma=posterior.sigma[which], which=tuple(which.tolist()))
+
+
+def _rescaled(found: Evidence, posterior: Posterior, width: float) -> tuple[float, float]:
+    """Return ln Z and its error with priors of another width, by the points that were solved."""
+    inputs = posterior.inputs
+    x = found.density.x[:, : len(inputs.names)]
+    change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - x.shape[1] * np.log(width)
+    change += np.log(inputs.admitted / inputs.admitted_at(width))
+    return found.reweighted(change)

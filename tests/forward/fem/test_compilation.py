@@ -1,0 +1,74 @@
+"""Forms are compiled once, however many processes start together with an empty cache, and whoever is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.launch import ROOT, environment, on_ranks
+
+pytestmark = [pytest.mark.fem, pytest.mark.mpi]
+
+SCRIPT = """
+import pathlib, sys, tempfile
+from mpi4py import MPI
+import ufl
+from forward.fem import fenicsx
+from forward.bodies.geometry import Box
+
+make, made = tempfile.mkdtemp, []
+def counted(*arguments, **options):
+    made.append(make(*arguments, **options))
+    return made[-1]
+tempfile.mkdtemp = counted
+comm = MPI.COMM_WORLD
+msh, _ = fenicsx.mesh_body(comm, Box(size=(1.0, 2.0, 3.0), cells=(2, 2, 2), degree=1))
+v = ufl.TestFunction(fenicsx.scalar_space(msh, 1))
+one = fenicsx.constant(msh, 1.0)
+volume = fenicsx.VectorAssembler(one * v * ufl.dx(domain=msh), None, comm)
+found = comm.gather((round(comm.allreduce(volume().sum()), 12), len(made)))
+for line in found or ():  # two ranks that print may mix their lines
+    print(*line)
+"""
+
+
+def start(cache, ranks=None):
+    return subprocess.Popen(
+        on_ranks(ranks, sys.executable, "-c", SCRIPT),
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=environment() | {"XDG_CACHE_HOME": str(cache)},
+        start_new_session=True,
+    )
+
+
+def found(process):
+    """Lines of volume and number of compilations, one for each rank."""
+    output, _ = process.communicate(timeout=100)
+    assert process.returncode == 0
+    return [line.split() for line in output.splitlines()]
+
+
+@pytest.mark.wheel
+def test_forms_are_compiled_once_by_many_processes(tmp_path):
+    lines = [line for process in [start(tmp_path, ranks) for ranks in (None, None, None, 2)] for line in found(process)]
+    assert [volume for volume, _ in lines] == ["6.0"] * 5
+    folders = [path for path in (tmp_path / "tissuq").glob("forms-*/*") if path.is_dir()]
+    assert sum(int(made) for _, made in lines) == len(folders)
+    assert all(len(list(folder.glob("*.so"))) == 1 for folder in folders)
+
+
+def test_whoever_is_killed_while_compiling_is_not_waited_for(tmp_path):
+    killed = start(tmp_path)
+    while not list((tmp_path / "tissuq").glob("forms-*/*/*.c")):
+        assert killed.poll() is None
+        time.sleep(0.005)
+    os.killpg(killed.pid, signal.SIGKILL)
+    killed.wait()
+    ((volume, made),) = found(start(tmp_path))
+    assert volume == "6.0"
+    assert int(made) > 0

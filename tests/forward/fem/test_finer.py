@@ -1,0 +1,151 @@
+"""Graded and divided meshes, and specimens on them."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from pydantic import ValidationError
+
+from forward.bodies.geometry import Block, Box
+from forward.bodies.mesh_file import OwnMesh, divided
+from forward.fem.finer import FinerMesh, finer
+from forward.model import ModelError
+from forward.specimen import Specimen
+from tests.forward.bodies.test_mesh_file import box, numbered
+
+meshio = pytest.importorskip("meshio")
+
+
+def test_a_grading_is_nested_and_as_steep_as_it_says():
+    line = np.linspace(0, 1, 257)
+    points = np.column_stack([line] * 3)
+    placed = Box(size=(1.0, 1.0, 2.0), cells=(4, 4, 4), grading={"x-min": 8, "y-min": 4, "y-max": 2}).place(
+        points * [1, 1, 2]
+    )
+    steps = np.diff(placed, axis=0)
+    np.testing.assert_allclose(placed[[0, -1]], [[0, 0, 0], [1, 1, 2]], atol=1e-15)
+    assert steps[-1, 0] / steps[0, 0] == pytest.approx(8, rel=0.01)
+    assert steps[127, 1] / steps[0, 1] == pytest.approx(4, rel=0.02)
+    assert steps[128, 1] / steps[-1, 1] == pytest.approx(2, rel=0.02)
+    assert steps[128, 1] == pytest.approx(steps[127, 1], rel=0.02)  # no jump in the middle
+    np.testing.assert_allclose(steps[:, 2], 2 / 256)
+    coarse = Box(size=(1.0, 1.0, 1.0), cells=(3, 3, 3), grading={"x-max": 5})
+    thirds = np.column_stack([np.arange(4) / 3] * 3)
+    assert coarse.longest_edge == pytest.approx(np.diff(coarse.place(thirds)[:, 0]).max())
+    fine = coarse.refined(1)
+    assert fine.cells == (6, 6, 6)
+    np.testing.assert_allclose(fine.place(thirds), coarse.place(thirds))
+
+
+def test_a_block_is_graded_before_it_is_shaped():
+    corners = tuple((2 * x + z, y, z) for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0))
+    block = Block(corners=corners, cells=(2, 2, 2), grading={"x-min": 8})
+    middle = block.place(np.array([[0.5, 0.5, 0.5]]))[0]
+    share = (np.sqrt(8) - 1) / 7
+    np.testing.assert_allclose(middle, [2 * share + 0.5, 0.5, 0.5])
+    inside = np.random.default_rng(0).uniform(size=(9, 3))
+    np.testing.assert_allclose(block.nearest(block.shaped(inside)), block.shaped(inside), atol=1e-9)
+
+
+@pytest.mark.parametrize("grading", [{"x-min": 0.5}, {"top": 2}, {"x-min": 1e5}])
+def test_gradings_that_are_none(grading):
+    with pytest.raises(ValidationError):
+        Box(size=(1.0, 1.0, 1.0), cells=(2, 2, 2), grading=grading)
+
+
+def volume(mesh):
+    at = mesh.points[mesh.cells]
+    return np.abs(np.linalg.det(at[:, 1:] - at[:, :1])) / 6
+
+
+def test_tetrahedra_are_divided_into_eight(tmp_path):
+    meshio.write(tmp_path / "box.vtu", numbered(box("tetra")))
+    whole = OwnMesh(file=str(tmp_path / "box.vtu"))
+    mesh = whole.load()
+    held = whole.boundaries[0]
+    for towards in ((), (held,)):
+        fine = divided(mesh, towards)
+        assert len(fine.cells) == 8 * len(mesh.cells)
+        assert len(np.unique(fine.points.round(12), axis=0)) == len(fine.points)
+        parts = volume(fine).reshape(-1, 8)
+        np.testing.assert_allclose(parts.sum(axis=1), volume(mesh), rtol=1e-12)
+        assert (parts.min(axis=1) > 0.005 * volume(mesh)).all()
+        faces = np.sort(fine.cells[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
+        unique, count = np.unique(faces, axis=0, return_counts=True)
+        assert count.max() == 2  # conforming: every face is inside, or on the surface
+        outer = {tuple(face) for face in unique[count == 1].tolist()}
+        for name, facets in fine.boundaries.items():
+            assert len(facets) == 4 * len(mesh.boundaries[name])
+            assert {tuple(sorted(facet)) for facet in facets.tolist()} <= outer
+    body = whole.finer(1.5, (held,), 8.0, 4.0)
+    assert body.cell_count == 8 * whole.cell_count
+    assert sum(body.found.areas.values()) == pytest.approx(sum(whole.found.areas.values()))
+    with pytest.raises(ModelError, match="divided already"):
+        body.finer(1.5, (held,), 8.0, 4.0)
+    meshio.write(tmp_path / "hexahedra.vtu", numbered(box("hexahedron")))
+    with pytest.raises(ModelError, match="hexahedra of a file are not divided"):
+        OwnMesh(file=str(tmp_path / "hexahedra.vtu")).finer(1.5, (), 8.0, 4.0)
+
+
+CUBE = {
+    "body": {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (2, 2, 2), "degree": 1},
+    "material": {"kind": "neo-hookean-coupled", "mu": 1e4, "lmbda": 4e4},
+    "cases": [
+        {
+            "name": "pull",
+            "clamp": ["z-min"],
+            "loads": [{"kind": "traction", "on": "z-max", "direction": [0, 0, 1], "size": 900}],
+        }
+    ],
+    "observed": [{"on": "z-max"}],
+}
+FIELD = {"of": "stiffness", "length": 0.6, "std": 0.4}
+
+
+def test_meshes_are_graded_to_the_faces_that_are_held():
+    spec = finer(Specimen.model_validate(CUBE))
+    assert spec.body.cells == (3, 3, 3)
+    beside = dict.fromkeys(("x-min", "x-max", "y-min", "y-max"), 4.0)
+    assert {face: ratio for face, ratio in spec.body.grading.items() if ratio > 1} == {"z-min": 8.0} | beside
+    fields = [{**FIELD, "basis": "modes", "modes": 3}, {**FIELD, "of": "density", "basis": "modes", "modes": 3}]
+    heavy = {"kind": "gravity", "direction": (0, 0, -1), "density": 1000}
+    cases = [{**CUBE["cases"][0], "loads": [*CUBE["cases"][0]["loads"], heavy]}]
+    with pytest.raises(ModelError, match="density is a random field"):
+        finer(Specimen.model_validate(CUBE | {"cases": cases, "fields": fields}))
+
+
+@pytest.mark.fem
+def test_the_finer_mesh_is_nearer_to_the_truth():
+    """And the same as a specimen that has this mesh from the start."""
+    model = Specimen.model_validate(CUBE).build(MPI.COMM_SELF, ("material.mu",))
+    point = np.array([1.1e4])
+    here, there = model.solve(point).outputs, FinerMesh(model).outputs(model, point)
+    spec = finer(model.spec)
+    plain = spec.build(MPI.COMM_SELF, ("material.mu",)).observing(model.places, model.axes, model.cases)
+    np.testing.assert_allclose(there, plain.solve(point).outputs, rtol=1e-12)
+    body = spec.body.model_copy(update={"cells": (8, 8, 8)})
+    best = spec.model_copy(update={"body": body}).build(MPI.COMM_SELF, ("material.mu",))
+    truth = best.observing(model.places, model.axes, model.cases).solve(point).outputs
+    seen = (there - here) @ (truth - here) / ((truth - here) @ (truth - here))
+    assert 0.4 < seen < 1
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("basis", ["nodes", "modes"])
+def test_fields_are_those_of_the_mesh_itself(basis):
+    """A field that is linear in space is the same on both meshes."""
+    field = {**FIELD, "basis": basis} | ({"modes": 2} if basis == "modes" else {})
+    spec = Specimen.model_validate(CUBE | {"fields": [field]})
+    names = (*spec.coefficients, "material.mu")
+    model = spec.build(MPI.COMM_SELF, names)
+    rest = np.zeros(2) if basis == "modes" else model.vertices.coordinates @ [0.3, -0.2, 0.5]
+    log = model.log_fields(np.array([[*rest, 1e4]]))[0]
+    mesh = FinerMesh(model)
+    around, weights = mesh._interpolation
+    fine = (weights * log[around]).sum(axis=1)
+    if basis == "nodes":
+        places = mesh._model.vertices.coordinates
+        np.testing.assert_allclose(fine - fine[0], (places - places[0]) @ [0.3, -0.2, 0.5], atol=1e-12)
+    there = mesh.outputs(model, np.array([*rest, 1e4]))
+    np.testing.assert_allclose(
+        there, model.solve(np.array([*rest, 1e4])).outputs, rtol=0.2, atol=0.05 * np.abs(there).max()
+    )

@@ -1,0 +1,126 @@
+"""Doubts about posteriors: each is raised by what it is meant for, by name, and not by what is right."""
+
+import numpy as np
+import pytest
+
+from inverse.criticism.doubts import (
+    at_an_end,
+    far_from_prior,
+    mesh_too_coarse,
+    noise_far,
+    scores,
+    strangers,
+    too_large_errors,
+)
+from uq.inputs.distributions import Beta, LogNormal, LogUniform, Normal, Uniform
+
+RNG = np.random.default_rng(2)
+BELL = Normal(mean=1e3, std=300.0)
+
+
+def test_distances_are_in_prior_deviations():
+    np.testing.assert_allclose(scores(BELL, np.array([1e3, 3.4e3, -1.4e3])), [0, 8, -8], atol=1e-9)
+    skewed = LogNormal(mean=3.0, std=3.0)
+    z = np.array([-3.0, 0.0, 2.5])
+    np.testing.assert_allclose(scores(skewed, skewed.from_normal(z)[0]), z, atol=1e-4)
+
+
+def test_a_posterior_far_from_its_prior_is_named():
+    priors = {"mu": BELL, "kappa": Normal(mean=0.0, std=1.0)}
+    mode, mean = np.array([3.4e3, 0.5]), np.array([3.3e3, 0.4])
+    (doubt,) = far_from_prior(priors, mode, mean, 64.0, 2.0)
+    assert doubt.severity == "error"
+    assert "mu (3400) lies 8.0 prior deviations from the prior (1000)" in doubt.text
+    assert "kappa" not in doubt.text
+    assert not far_from_prior(priors, np.array([1500.0, 1.0]), np.array([1500.0, 1.0]), 3.0, 2.0)
+    (doubt,) = far_from_prior(priors, np.array([1500.0, 0.0]), np.array([2000.0, 0.0]), 3.0, 2.0)  # the mean alone
+    assert doubt.severity == "warning"
+
+
+def test_all_together_may_be_far_where_none_is():
+    priors = {f"p{i}": Normal(mean=0.0, std=1.0) for i in range(30)}
+    x = np.full(30, 1.9)
+    (doubt,) = far_from_prior(priors, x, x, float(x @ x), 30.0)
+    assert "all unknowns together" in doubt.text
+    assert not far_from_prior(priors, 0 * x, 0 * x, 30.0, 30.0)
+    assert not far_from_prior(priors, 0 * x, 0 * x, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "prior", [Uniform(lower=1, upper=3), LogUniform(lower=1, upper=3), Beta(a=2, b=2, lower=1, upper=3)]
+)
+def test_ends_of_ranges_are_named(prior):
+    u = RNG.uniform(size=400)
+    draws = prior.quantile(u)[:, None]
+    middle = prior.quantile(np.array([0.5]))
+    assert not at_an_end({"a": prior}, middle, draws)  # the prior itself
+    assert not at_an_end({"a": prior}, middle, prior.quantile(0.4 + 0.05 * u)[:, None])
+    (doubt,) = at_an_end({"a": prior}, prior.quantile(np.array([0.99])), prior.quantile(1 - 0.05 * u)[:, None])
+    assert doubt.text.startswith("a is at the upper end of its range (3)")
+    (doubt,) = at_an_end({"a": prior}, prior.quantile(np.array([0.002])), prior.quantile(0.3 * u)[:, None])
+    assert "lower end of its range (1)" in doubt.text
+    assert not at_an_end({"a": BELL}, np.array([9e3]), np.full((10, 1), 9e3))
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (1.2, None),
+        (2.9, None),
+        (12.0, "12 times the stated"),
+        (0.1, "0.1 times"),
+        (92.0, "does not explain these data"),
+    ],
+)
+def test_an_inferred_noise_far_from_the_stated_one_is_said(factor, told):
+    values = RNG.standard_normal(200)
+    found = noise_far(factor, 1.0, np.full(200, 0.01), values)
+    assert (told is None and not found) or told in found[0].text
+    assert not found or found[0].severity == ("error" if factor > 50 else "warning")
+
+
+def test_a_prior_of_the_noise_may_expect_it_elsewhere():
+    assert not noise_far(0.1, 0.1, np.full(9, 0.01), np.ones(9))
+    assert noise_far(12.0, 2.0, np.full(9, 0.01), np.ones(9))
+
+
+def test_errors_that_are_said_too_large():
+    assert too_large_errors(1.0, 100.0, 1.0)[0].text.startswith("residuals are 0.1 times the stated errors")
+    assert not too_large_errors(80.0, 100.0, 0.9)
+    assert not too_large_errors(0.0, 0.0, 1.0)
+
+
+def test_data_that_do_not_belong_are_listed():
+    r = RNG.standard_normal(300)
+    labels = [f"line {i}" for i in range(300)]
+    assert not strangers(r, np.zeros(300), labels, heavy=False)
+    r[[7, 200]] = 9.0, -6.0
+    (doubt,) = strangers(r, np.zeros(300), labels, heavy=False)
+    assert "2 data do not belong" in doubt.text
+    assert "line 7: +9.0; line 200: -6.0" in doubt.text
+    assert doubt.severity == "warning"
+    assert strangers(r, np.zeros(300), labels, heavy=True)[0].severity == "note"
+    assert not strangers(
+        10 * RNG.standard_normal(300), np.zeros(300), labels, heavy=False
+    )  # all are: the model is wrong
+    r = RNG.standard_normal(300)
+    r[3] = 1.5
+    resolution = np.zeros(300)
+    resolution[3] = 0.95  # a datum that all but decides on its own prediction
+    (doubt,) = strangers(r, resolution, labels, heavy=False)
+    assert "line 3: +6.7" in doubt.text
+
+
+def test_the_mesh_is_doubted_by_what_it_does_to_the_unknowns():
+    error = np.array([0.1, -0.3])
+    none = np.zeros(0)
+    (note,) = mesh_too_coarse(True, "", error, {"x": 0.1, "noise": np.nan}, none)
+    assert note.severity == "note"
+    (doubt,) = mesh_too_coarse(True, "", error, {"x": 0.1, "radius": -0.9}, none)
+    assert doubt.severity == "warning"
+    assert "radius -0.9, x +0.1" in doubt.text
+    assert mesh_too_coarse(True, "", error, {"x": 2.5}, none)[0].severity == "error"
+    assert mesh_too_coarse(True, "", error, {"mean": 0.0}, np.full(9, 0.7))[0].severity == "warning"
+    (doubt,) = mesh_too_coarse(False, "method.mesh_check = false", np.full(2, np.nan), {"x": np.nan}, none)
+    assert doubt.text == "not checked for the mesh: method.mesh_check = false"
+    assert doubt.severity == "warning"

@@ -1,0 +1,159 @@
+"""Derived quantities, predictions and residual tests of posteriors, against closed forms."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from forward.model import FunctionModel
+from inverse.criticism.predictive import (
+    derived_by_laplace,
+    derived_by_weights,
+    derived_of_field,
+    examine,
+    examine_few,
+    predictive_std,
+    summary,
+)
+from inverse.data.neighbours import neighbours
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
+from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.posterior import Posterior
+from tests.inverse.fields.test_low_rank import DATA, Linear, N, solved
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import Normal
+from uq.inputs.random_parameters import Inputs
+
+G = np.random.default_rng(5).standard_normal((30, 3))
+PLACES = np.random.default_rng(6).uniform(size=(30, 3))
+
+
+def few(seed=0, wave=0.0, noise=None):
+    """A linear model of three parameters, with data that a wave through all places may have been added to."""
+    rng = np.random.default_rng(seed)
+    names = ("a", "b", "c")
+    model = FunctionModel(lambda p: G @ p, names, tuple(f"y{i}" for i in range(30)), lambda p: G)
+    data = G @ rng.standard_normal(3) + 0.5 * rng.standard_normal(30) + wave * np.sin(8 * PLACES[:, 0])
+    inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in names})
+    return Posterior(inputs, SerialEvaluate(model), data, np.full(30, 0.5), noise)
+
+
+def test_derived_quantities_of_few_parameters():
+    posterior = few()
+    gaussian = laplace(posterior)
+    H = np.eye(3) + G.T @ G / 0.25
+    g = np.array([1.0, -2.0, 0.5])
+    mean, std = g @ np.linalg.solve(H, G.T @ posterior.data / 0.25), np.sqrt(g @ np.linalg.solve(H, g))
+
+    def function(points):
+        return np.column_stack([points @ g, np.exp(points @ g)])
+
+    by_laplace = derived_by_laplace(posterior, gaussian, function, draws=2**14)
+    by_weights = derived_by_weights(posterior, evidence(posterior, gaussian, 512), function)
+    log_normal = stats.lognorm(std, scale=np.exp(mean))
+    for found, allowed in ((by_laplace, 0.02), (by_weights, 0.1)):
+        np.testing.assert_allclose(found.mean, [mean, log_normal.mean()], rtol=allowed * std)
+        np.testing.assert_allclose(found.std, [std, log_normal.std()], rtol=2 * allowed)
+        bands = np.array([stats.norm(mean, std).ppf(found.levels), log_normal.ppf(found.levels)]).T
+        np.testing.assert_allclose((found.quantiles - bands) / [std, log_normal.std()], 0, atol=3 * allowed)
+    with pytest.raises(ValueError, match="1 of 2 points"):
+        summary(np.array([[1.0], [np.nan]]))
+    assert summary(np.array([[1.0], [np.nan]]), np.array([1.0, 0.0])).mean == 1.0
+
+
+def test_derived_quantities_and_predictions_of_fields():
+    problem = Linear(holes=7)
+    mode, found = solved(problem, cutoff=1e-12)
+    g = np.random.default_rng(1).standard_normal(N)
+    centre, width = found.marginal(g)
+    drawn = derived_of_field(found, lambda m: (m @ g)[:, None], draws=4000)
+    assert drawn.mean[0] == pytest.approx(centre, abs=4 * width / np.sqrt(4000))
+    assert drawn.std[0] == pytest.approx(width, rel=4 / np.sqrt(2 * 4000))
+    spread = np.sqrt(np.diag(problem.G @ problem.covariance @ problem.G.T))
+    np.testing.assert_allclose(predictive_std(mode.point, found), spread[:7], rtol=1e-7)
+    np.testing.assert_allclose(predictive_std(mode.point, found, np.arange(9, 20)), found.predictive_std[9:20])
+
+
+def test_residuals_of_a_right_model_pass_as_often_as_they_should():
+    """The moments of |r|² are exact, its probability is uniform, and so is that of neighbours."""
+    squares, probabilities, agreements = [], [], []
+    which = neighbours(np.column_stack([np.arange(DATA)] * 3).astype(float), np.zeros(DATA, dtype=np.int64))
+    problem = Linear()
+    for seed in range(100):
+        rng = np.random.default_rng(1000 + seed)
+        truth = problem.m_0 + problem.posterior.prior.root(rng.standard_normal(N))
+        data = problem.G @ truth + problem.sigma * rng.standard_normal(DATA)
+        posterior = FieldPosterior(problem.posterior.model, data, problem.sigma, problem.posterior.prior, problem.m_0)
+        mode = find_mode(posterior, tolerance=1e-4).point
+        if seed == 0:
+            found = LowRankPosterior.at(mode, cutoff=1e-9)
+            expected = (1 / (1 + problem.values[:DATA])).sum()
+        test = examine(mode.residual, found.spectrum, posterior.weights, which)
+        assert test.degrees == pytest.approx(expected, rel=1e-6)
+        assert test.degrees == pytest.approx(DATA - found.determined, rel=1e-9)
+        squares.append(test.square)
+        probabilities.append(test.probability)
+        agreements.append(test.agreement_probability)
+    assert np.mean(squares) == pytest.approx(expected, abs=3 * np.std(squares) / np.sqrt(100))
+    for values in (probabilities, agreements):
+        assert stats.kstest(values, "uniform").pvalue > 0.01
+
+
+def test_residuals_tell_a_wrong_model():
+    where = neighbours(PLACES, np.zeros(30, dtype=np.int64))
+    right = examine_few(few(), laplace(few()), where)
+    assert right.passed
+    assert right.degrees == pytest.approx(30 - np.trace(G @ np.linalg.solve(np.eye(3) * 0.25 + G.T @ G, G.T)))
+    assert not examine_few(few(wave=2.0), laplace(few(wave=2.0)), where).passed
+    scaled = few(wave=2.0, noise=Normal(mean=3.0, std=0.5))
+    found = examine_few(scaled, laplace(scaled), where)
+    # What was inferred of the noise explains the size of the residuals, not that neighbours agree.
+    assert found.probability > 0.01
+    assert found.agreement_probability < 0.02
+
+
+def test_few_data_of_many_parameters():
+    model = FunctionModel(lambda p: [p.sum()], ("a", "b", "c"), ("y",), lambda p: [[1.0, 1.0, 1.0]])
+    inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in "abc"})
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([2.0]), np.array([1.0]))
+    found = examine_few(posterior, laplace(posterior))
+    assert found.degrees == pytest.approx(1 / 4)  # y ~ N(0, 1 + 3), and r = −y/4
+    assert found.probability == pytest.approx(stats.chi2(1).sf(4 / 4), rel=1e-8)
+    assert np.isnan(found.agreement)
+    assert found.passed
+
+
+def test_neighbours_are_of_the_same_group_and_measured():
+    places = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [0, 0, 0], [0.1, 0, 0], [0.1, 0, 0]])
+    groups = np.array([0, 0, 0, 1, 1, 1])
+    first, second = neighbours(places, groups)
+    assert list(zip(first, second, strict=True)) == [(0, 1), (1, 2), (3, 4), (3, 5), (4, 5)]
+    first, second = neighbours(places, groups, np.array([1, 0, 1, 1, 0, 0]))
+    assert list(zip(first, second, strict=True)) == [(0, 2)]
+
+
+def test_neighbours_depend_on_distances_only():
+    """No third place is nearer to both: by all pairs of 60 places, turned and in another order, with repeated ones."""
+    rng = np.random.default_rng(0)
+    for dimension in (1, 2, 3):
+        places = rng.uniform(size=(50, dimension))
+        places = np.concatenate([places, places[:10]])
+        far = np.linalg.norm(places[:, None] - places[None], axis=2)
+        larger = np.maximum(far[:, None, :], far[None, :, :])  # of the distances from i and from j to k
+        related = (larger >= far[:, :, None] * (1 - 1e-9)).all(axis=2)
+        expected = {(i, j) for i, j in np.argwhere(related).tolist() if i < j}
+        turn = np.linalg.qr(rng.standard_normal((dimension, dimension)))[0]
+        order = rng.permutation(60)
+        for moved, back in ((places, np.arange(60)), (places @ turn, np.arange(60)), (places[order], order)):
+            first, second = neighbours(moved, np.zeros(60, dtype=np.int64))
+            pairs = zip(back[first].tolist(), back[second].tolist(), strict=True)
+            assert {(min(i, j), max(i, j)) for i, j in pairs} == expected
+
+
+def test_neighbours_on_a_grid_stand_along_its_axes():
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 0.3, 4)), axis=-1).reshape(-1, 2)
+    first, second = neighbours(grid, np.zeros(28, dtype=np.int64))
+    differ = np.abs(grid[first] - grid[second]) > 1e-9
+    assert (differ.sum(axis=1) == 1).all()

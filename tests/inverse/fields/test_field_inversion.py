@@ -1,0 +1,270 @@
+"""Inversion of stiffness fields by finite elements: load cases, derivatives, recovery, and what the data constrain."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from pydantic import ValidationError
+
+from benchmarks.inversion import FIELD, NOISE, problem, specimen, truth
+from forward.bodies.geometry import Box
+from forward.bodies.random_fields import Matern
+from forward.conformance import check_derivatives
+from forward.hyperelastic import Hyperelastic
+from forward.model import SolveError
+from forward.specimen import Specimen
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
+from tests.launch import run_script
+
+POINTS = 9  # along each edge of the cube
+SMALL = {"size": (1.0, 0.7, 0.8), "cells": (2, 2, 2), "degree": 1}
+MATERIAL = {"kind": "neo-hookean-coupled", "mu": 1e4, "lmbda": 4e4}
+PULLED = {
+    "name": "pulled",
+    "clamp": ("z-min",),
+    "loads": ({"kind": "traction", "on": "z-max", "direction": (1, 0, 1), "size": 900.0},),
+}
+MOVED = {"name": "moved", "clamp": ("x-min",), "displacements": ({"on": "x-max", "x": 0.1, "y": 0.05},)}
+OBSERVED = ({"on": "y-max", "components": "xz"}, {"at": ((0.55, 0.3, 0.71), (1.0, 0.0, 0.8)), "cases": ("moved",)})
+
+
+def small(**changes):
+    blocks = {
+        "body": SMALL,
+        "material": MATERIAL,
+        "fields": ({"of": "stiffness", "length": 0.6, "std": 0.4, "basis": "nodes"},),
+        "cases": (PULLED, MOVED),
+        "observed": OBSERVED,
+        "solver": {"tolerance": 1e-12},
+    }
+    return Specimen.model_validate(blocks | changes)
+
+
+def built(comm=MPI.COMM_SELF):
+    spec = small()
+    names = ("material.mu", "displacements.x-max.x", *spec.coefficients)
+    point = np.concatenate([[1.1e4, 0.12], 0.3 * np.random.default_rng(0).standard_normal(len(spec.coefficients))])
+    return spec.build(comm, names), point
+
+
+# --- load cases ------------------------------------------------------------------------------------------------------
+
+
+def test_observations_are_displacements_of_the_same_body_in_each_case():
+    model, point = built()
+    found = model.solve(point).outputs
+    assert len(found) == len(model.outputs) == len(model.places) == 2 * 9 * 2 + 2 * 3
+    assert model.outputs[0] == "pulled.y-max.0.x"
+    assert model.outputs[-1] == "moved.points.1.z"
+    np.testing.assert_allclose(model.places[:18, 1], 0.7)
+    expected = []
+    for number, case in enumerate((PULLED, MOVED)):
+        mine = model.cases == number
+        outputs = tuple(
+            {"kind": "displacement", "name": str(i), "at": tuple(place), "component": "xyz"[axis]}
+            for i, (place, axis) in enumerate(zip(model.places[mine].tolist(), model.axes[mine], strict=True))
+        )
+        blocks = {name: getattr(model.spec, name) for name in ("body", "material", "fields", "solver")}
+        acting = {name: value for name, value in case.items() if name != "name"}
+        body = Hyperelastic.model_validate(blocks | acting | {"outputs": outputs})
+        names = tuple(name for name in model.parameters if name in body.scalars or name.startswith("fields"))
+        values = [value for name, value in zip(model.parameters, point, strict=True) if name in names]
+        expected.append(body.build(MPI.COMM_SELF, names).solve(np.array(values)).outputs)
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-9, atol=1e-14)
+
+
+def test_derivatives_of_all_cases():
+    model, point = built()
+    scale = np.concatenate([[300.0, 0.01], np.full(len(point) - 2, 0.3)])
+    directions = np.vstack([np.eye(len(point))[[0, 1, 5]], np.random.default_rng(2).uniform(-1, 1, len(point))])
+    check_derivatives(
+        model, point, scale, directions=directions, steps=(1 / 32, 1 / 64, 1 / 128), noise=1e-12
+    ).require()
+
+
+def test_products_use_the_factors_of_their_solution():
+    model, point = built()
+    solution = model.solve(point)
+    solution.tangent(point)
+    before = solution.work
+    for _ in range(3):
+        solution.adjoint(solution.tangent(np.stack([point, point])))
+    assert solution.work.factorisations == before.factorisations
+    assert solution.work.back_substitutions == before.back_substitutions + 3 * 2 * 2 * 2  # rows, cases, ways
+
+
+def test_states_of_all_cases_start_solves():
+    model, point = built()
+    solution = model.solve(point)
+    near = point * (1 + 1e-6)
+    assert model.solve(near, solution.state).work.factorisations < model.solve(near).work.factorisations
+    whole = model.gather(solution.state[None])
+    np.testing.assert_array_equal(model.scatter(whole)[0], solution.state)
+
+
+def test_the_case_without_an_answer_is_named():
+    model, point = built()
+    with pytest.raises(SolveError, match="load case 'moved'"):
+        model.solve(np.array([point[0], -1.5, *point[2:]]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cases": (PULLED, PULLED)}, "2 of them are called 'pulled'"),
+        ({"cases": (PULLED, {**MOVED, "clamp": ()})}, "nothing holds the body along z"),
+        ({"observed": ({"on": "top"},)}, "unknown boundary"),
+        ({"observed": ({"on": "z-max", "cases": ("push",)},)}, "unknown load case"),
+        ({"observed": ({"on": "z-max", "cases": ("moved",)},)}, "nothing is measured"),
+        ({"observed": ({"at": ((2.0, 0.0, 0.0),)},)}, "outside the body"),
+        ({"observed": ({"name": "top"},)}, "either a boundary"),
+    ],
+)
+def test_mistakes_are_named(changes, message):
+    with pytest.raises(ValidationError, match=message):
+        small(**changes)
+
+
+SCRIPT = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from tests.inverse.fields.test_field_inversion import built
+
+model, point = built(MPI.COMM_WORLD)
+solution = model.solve(point)
+found = solution.outputs, solution.tangent(point), solution.adjoint(np.ones(len(model.outputs)))
+state = model.gather(solution.state[None])
+if MPI.COMM_WORLD.rank == 0:
+    np.savez(sys.argv[1], *found, state)
+"""
+
+
+@pytest.mark.mpi
+def test_ranks_do_not_matter(tmp_path):
+    run = run_script(2, SCRIPT, tmp_path / "found.npz")
+    assert run.returncode == 0, run.stderr
+    model, point = built()
+    solution = model.solve(point)
+    expected = solution.outputs, solution.tangent(point), solution.adjoint(np.ones(len(model.outputs)))
+    with np.load(tmp_path / "found.npz") as found:
+        for name, values in zip(found.files, (*expected, model.gather(solution.state[None])), strict=True):
+            np.testing.assert_allclose(found[name], values, atol=1e-9 * np.abs(values).max())
+
+
+# --- prior -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_prior_has_the_variance_that_was_asked_and_the_closed_form_inside():
+    body = Box(size=(1.0, 1.0, 1.0), cells=(8, 8, 8), degree=1)
+    prior = FIELD.prior(body)
+    identity = np.eye(body.vertex_count)
+    root = prior.root(identity)  # rows: the columns of the root
+    np.testing.assert_allclose((root**2).sum(axis=0), np.log1p(0.6**2), rtol=1e-10)
+    np.testing.assert_allclose(prior.variance, np.log1p(0.6**2))
+    np.testing.assert_allclose(prior.root_transposed(identity), root.T, atol=1e-12)
+    # Before it is divided by its standard deviation, the field at the centre has the variance of unbounded space.
+    assert Matern.on(body, 0.4).inflation[364] == pytest.approx(1, abs=0.1)
+
+
+# --- inversion -------------------------------------------------------------------------------------------------------
+
+
+@cache
+def coarse():
+    posterior, true = problem(5)
+    return posterior, true, find_mode(posterior)
+
+
+def part(posterior, measured):
+    """The same posterior of some of its data."""
+    return FieldPosterior(posterior.model, np.where(measured, posterior.data, np.nan), posterior.sigma, posterior.prior)
+
+
+def test_gradient_and_product_are_derivatives_of_the_density():
+    posterior, _, _ = coarse()
+    rng = np.random.default_rng(0)
+    noise, direction = 0.3 * rng.standard_normal((2, posterior.size))
+    exact = FieldPosterior(
+        posterior.model, posterior.model.solve(posterior.values(noise)).outputs, posterior.sigma, posterior.prior
+    )
+    for which, about in ((posterior, noise + 0.1), (exact, noise)):
+        point = which.at(about)
+        gradient, curve = point.gradient, direction + point.product(direction)
+        moved = {h: which.at(about + h * direction) for h in (1e-2, 5e-3)}
+        errors = [abs(there.cost - point.cost - h * gradient @ direction) for h, there in moved.items()]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.2)
+        if which is exact:  # nothing is left of the residual: Gauss–Newton is Newton
+            errors = [np.linalg.norm(there.gradient - gradient - h * curve) for h, there in moved.items()]
+            assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.2)
+
+
+def test_the_mode_is_found_and_explains_the_data():
+    _, true, mode = coarse()
+    assert mode.converged
+    assert mode.solves <= 20
+    assert mode.products <= 400
+    found = LowRankPosterior.at(mode.point, cutoff=1.0)
+    assert found.residual_test[1] > 0.01
+    assert (np.abs(found.mean - true) < 2 * found.std).mean() >= 0.9
+    again = mode.point.product(found.spectrum.vectors[:3])
+    expected = found.spectrum.values[:3, None] * found.spectrum.vectors[:3]
+    np.testing.assert_allclose(again, expected, atol=1e-2 * found.spectrum.values[2])
+
+
+def test_three_load_cases_constrain_more_directions_than_any_one():
+    posterior, _, mode = coarse()
+    noise = mode.point.noise
+
+    def spectrum(measured):
+        return LowRankPosterior.at(part(posterior, measured).at(noise), cutoff=1.0).spectrum.values
+
+    cases = posterior.model.cases
+    together = spectrum(cases >= 0)
+    for number in range(3):
+        alone = spectrum(cases == number)
+        assert len(alone) < len(together)
+        assert (alone < together[: len(alone)] * (1 + 1e-6)).all()
+
+
+def recovered(fine, cells, **settings):
+    """Posteriors of all data that a finer mesh has made, and of 5 % of the points; with the truth."""
+    maker, model = (
+        spec.build(MPI.COMM_SELF, spec.coefficients) for spec in (specimen(fine, POINTS), specimen(cells, POINTS))
+    )
+    clean = maker.solve(truth(maker.models[0].layout.coordinates)).outputs
+    rng = np.random.default_rng(0)
+    sigma = NOISE * np.array([np.sqrt((values**2).mean()) for values in model.values(clean)])[model.cases]
+    data = clean + sigma * rng.standard_normal(len(clean))
+    posterior = FieldPosterior(model, data, sigma, FIELD.prior(model.spec.body))
+    few = np.repeat(rng.uniform(size=len(data) // 3) < 0.05, 3)
+    posteriors = [posterior, part(posterior, few)]
+    found = [LowRankPosterior.at(find_mode(p).point, **settings) for p in posteriors]
+    return found, truth(model.models[0].layout.coordinates)
+
+
+@pytest.mark.slow
+def test_an_inclusion_is_recovered_from_another_mesh():
+    (everything, few), true = recovered(12, 8, cutoff=0.5)
+    assert (np.abs(everything.mean - true) < 2 * everything.std).mean() >= 0.9
+    inside, outside = true > np.quantile(true, 0.95), true < np.quantile(true, 0.5)
+    contrast = everything.mean[inside].mean() - everything.mean[outside].mean()
+    assert contrast > 0.5 * (true[inside].mean() - true[outside].mean())  # the inclusion is seen
+    assert np.corrcoef(everything.mean, true)[0, 1] > 0.7
+    assert (few.std > everything.std - 1e-9).mean() > 0.99
+    assert few.std.mean() > 1.2 * everything.std.mean()
+    assert few.determined < everything.determined
+
+
+@pytest.mark.slow
+def test_meshes_do_not_matter():
+    rows = []
+    for cells in (7, 12):
+        posterior, _ = problem(cells)
+        mode = find_mode(posterior)
+        found = LowRankPosterior.at(mode.point, rank=100)
+        rows.append([mode.solves, mode.products + found.spectrum.products, found.determined, found.spectrum.values[0]])
+    np.testing.assert_allclose(*rows, rtol=0.2)

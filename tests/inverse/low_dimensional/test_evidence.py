@@ -1,0 +1,242 @@
+"""Evidence: closed forms, brute force, nested sampling, and whether the stated errors are honest."""
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from forward.materials.admissible import Materials
+from forward.materials.material_point import HomogeneousModel, MaterialTest
+from forward.model import FunctionModel, SolveError
+from inverse.criticism.weights import tail_shape
+from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.nested import nested
+from inverse.low_dimensional.posterior import Posterior
+from inverse.low_dimensional.surrogate import fit
+from inverse.methods.selection import _rescaled
+from inverse.methods.selection import posterior as assemble
+from tests.rubber import CONFIGS, CURVED, FACTOR, LINEAR, on_treloar, treloar
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from workflows.config.study import load
+
+NAMES = ("a", "b", "c", "d")
+TRUTH = np.array([1.4, 0.8, 1.1, 1.3])
+
+
+def curved(points):
+    a, b, c, d = np.moveaxis(np.asarray(points), -1, 0)
+    return np.stack([a * b + 0.3 * c, a * c**2 + 0.5 * d * b], axis=-1)
+
+
+def slopes(point):
+    a, b, c, d = point
+    return [[b, a, 0.3, 0.0], [c**2, 0.5 * d, 2 * a * c, 0.5 * b]]
+
+
+def ridge(noise):
+    """Four parameters and two observations, which leave a curved ridge."""
+    inputs = Inputs({name: Uniform(lower=0.5, upper=2.0) for name in NAMES})
+    y = curved(TRUTH)
+    model = FunctionModel(curved, NAMES, ("u", "v"), slopes)
+    return Posterior(inputs, SerialEvaluate(model), y, noise * y)
+
+
+def brute_force(posterior, draws=2**19):
+    """Ln of the mean likelihood over points of the prior."""
+    points = posterior.inputs.points(sobol_points(5, 0, 0, draws, 4))
+    misfit = (((curved(points) - posterior.data) / posterior.sigma) ** 2).sum(axis=1) / 2
+    return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.sigma.prod())
+
+
+@pytest.mark.parametrize(("noise", "allowed", "repeats"), [(0.3, 0.03, 4), (0.1, 0.1, 4), (0.03, 0.3, 4)])
+def test_curved_ridge(noise, allowed, repeats):
+    posterior = ridge(noise)
+    truth = brute_force(posterior)
+    gaussian = laplace(posterior)
+    assert abs(gaussian.log_evidence - truth) > 0.3
+    found = [evidence(posterior, gaussian, 256, seed=seed) for seed in range(repeats)]
+    errors = np.array([one.log_evidence - truth for one in found])
+    stated = np.array([one.error for one in found])
+    assert np.sqrt((errors**2).mean()) < allowed
+    # Squared errors over stated ones: χ² with as many degrees of freedom, but for the eight replicates each.
+    assert 0.1 < ((errors / stated) ** 2).mean() < 5
+    assert all(one.trusted and one.density.x.shape[0] <= 256 for one in found)
+    assert {one.route for one in found} <= {"surrogate", "importance"}
+
+
+def test_route_and_reason_are_stated():
+    wide = on_treloar("mooney-rivlin", LINEAR["mooney-rivlin"])  # to where there is no material, nor a Gaussian
+    assert evidence(wide, laplace(wide), 64).route != "closed form"
+    narrow = {"C1": Normal(mean=2e5, std=2e4), "C2": Normal(mean=0.0, std=1e4)}
+    linear = on_treloar("mooney-rivlin", narrow)
+    found = evidence(linear, laplace(linear), 64)
+    assert (found.route, found.log_evidence) == ("closed form", laplace(linear).log_evidence)
+    assert found.error < 1e-8
+    one = on_treloar("neo-hookean", {"C1": LogNormal(mean=2e5, std=1e5)})
+    found = evidence(one, laplace(one), 256)
+    assert found.route == "importance"
+    assert "even weights" in found.why
+    posterior = ridge(0.03)
+    found = evidence(posterior, laplace(posterior), 64)
+    assert found.route == "surrogate"
+    assert "the first 16 points are worth" in found.why
+
+
+def test_same_seed_same_bits():
+    posterior = ridge(0.1)
+    one, other, third = (evidence(posterior, laplace(posterior), 64, seed=s) for s in (3, 3, 4))
+    assert one.log_evidence == other.log_evidence
+    np.testing.assert_array_equal(one.log_weights, other.log_weights)
+    assert one.log_evidence != third.log_evidence
+
+
+def test_polynomial_models_are_fitted_exactly():
+    posterior = ridge(0.1)
+    x = np.random.default_rng(1).normal(size=(64, 4))
+    surrogate = fit(posterior, posterior.at(x, derivatives=True))
+    other = 0.7 * x[::-1]
+    np.testing.assert_allclose(surrogate.at(other).outputs, posterior.at(other).outputs, rtol=1e-6)
+    derived, true = (p.at(other, derivatives=True) for p in (surrogate, posterior))
+    np.testing.assert_allclose(derived.gradient, true.gradient, rtol=1e-4, atol=1e-4)
+
+
+def test_wider_priors_by_the_same_points():
+    """For normal priors of a linear model, the answer is that of the study with these priors."""
+    posterior = on_treloar("yeoh", LINEAR["yeoh"])
+    found = evidence(posterior, laplace(posterior), 256)
+    for width in (0.5, 2.0):
+        priors = {name: Normal(mean=p.mean, std=width * p.std) for name, p in LINEAR["yeoh"].items()}
+        exact = laplace(on_treloar("yeoh", priors)).log_evidence
+        x = found.density.x
+        change = -(x**2).sum(axis=1) / 2 * (1 / width**2 - 1) - 3 * np.log(width)
+        value, error = found.reweighted(change)
+        assert abs(value - exact) < 4 * error + 1e-6
+        assert error < 0.1
+
+
+def test_tail_shapes_are_those_of_arviz():
+    """Values of psislw of ArviZ 0.21 for the same weights."""
+    for n, k, expected in (
+        (1000, 0.3, 0.4814277852303459),
+        (256, 0.8, 1.236827414482715),
+        (4000, 0.6, 0.7003246300733824),
+        (128, -0.2, -0.14748732811851475),
+    ):
+        u = np.random.default_rng([n]).random(n)
+        assert tail_shape(((1 - u) ** -k - 1) / k + 0.1) == pytest.approx(expected, abs=1e-10)
+    assert tail_shape(np.ones(20)) == np.inf
+
+
+def test_where_there_is_no_answer():
+    model = FunctionModel(curved, NAMES, ("u", "v"), slopes)
+    good = ridge(0.1)
+    gaussian = laplace(good)
+
+    def refuse(point):
+        raise SolveError("never")
+
+    posterior = Posterior(
+        good.inputs, SerialEvaluate(FunctionModel(refuse, NAMES, ("u", "v"), slopes)), good.data, good.sigma
+    )
+    with pytest.raises(SolveError, match="no answer at any of the points"):
+        evidence(posterior, gaussian, 64)
+    with pytest.raises(ValueError, match="16 samples, expected at least 32"):
+        evidence(good, gaussian, 16)
+    assert model.differentiable
+
+
+def test_models_that_end_somewhere_are_weighted_by_nothing_there():
+    """Half of the prior has no answer; the evidence is that of brute force over the other half."""
+
+    def ends(point):
+        if point[0] < 1.25:
+            raise SolveError("ends")
+        return curved(point)
+
+    whole = ridge(0.1)
+    posterior = Posterior(
+        whole.inputs, SerialEvaluate(FunctionModel(ends, NAMES, ("u", "v"), slopes)), whole.data, whole.sigma
+    )
+    points = whole.inputs.points(sobol_points(5, 0, 0, 2**18, 4))
+    misfit = (((curved(points) - whole.data) / whole.sigma) ** 2).sum(axis=1) / 2
+    misfit[points[:, 0] < 1.25] = np.inf
+    truth = logsumexp(-misfit) - np.log(2**18) - np.log(2 * np.pi * whole.sigma.prod())
+    found = evidence(posterior, laplace(posterior), 256)
+    assert abs(found.log_evidence - truth) < 4 * found.error
+    assert found.error < 0.15
+
+
+def test_nested_sampling_agrees():
+    pytest.importorskip("dynesty")
+    model = FunctionModel(lambda p: [p[0], p[0] + p[1]], ("a", "b"), ("u", "v"), lambda p: [[1.0, 0.0], [1.0, 1.0]])
+    inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in ("a", "b")})
+    posterior = Posterior(inputs, SerialEvaluate(model), np.array([0.3, 0.9]), np.array([0.2, 0.3]))
+    value, error = nested(posterior, live=60)
+    assert abs(value - laplace(posterior).log_evidence) < 4 * error
+
+
+@pytest.mark.slow
+def test_nested_sampling_agrees_on_treloar():
+    pytest.importorskip("dynesty")
+    study = treloar()
+    cases = [(name, candidate.parameters) for name, candidate in study.candidates.items()]
+    for kind, priors in [*cases, ("demiray", CURVED["demiray"])]:
+        posterior = on_treloar(kind, priors, FACTOR)
+        found = evidence(posterior, laplace(posterior), 256)
+        value, error = nested(posterior)
+        assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind
+
+
+@pytest.mark.slow
+def test_nested_sampling_agrees_on_brain():
+    pytest.importorskip("dynesty")
+    study = load(CONFIGS / "brain.toml")
+    for kind in study.candidates:
+        it = SerialEvaluate(study.build(kind, "cortex"))
+        whole = assemble(study.models[kind], study.groups["cortex"], study.method.noise, it)
+        found = evidence(whole, laplace(whole), 256)
+        value, error = nested(whole)
+        assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_evidence_of_priors_with_inadmissible_tails(correlated):
+    """Gaussian priors of C1 and C2 reach where C1 + C2 < 0: ln Z is that of quadrature over what is left of them.
+
+    The widened and narrowed priors are restricted anew.
+    """
+    priors = {"C1": Normal(mean=100.0, std=200.0), "C2": Normal(mean=0.0, std=200.0)}
+    pairs = (("C1", "C2", 0.6),) if correlated else ()
+    materials = Materials("mooney-rivlin", {"material": {"C1": "C1", "C2": "C2"}})
+    inputs = Inputs(priors, pairs, materials)
+    tests = [MaterialTest(mode="uniaxial", at=(0.8, 1.2, 1.5))]
+    model = HomogeneousModel("mooney-rivlin", {}, tests, ("C1", "C2"))
+    data, sigma = model.stresses(np.array([[80.0, -20.0]]))[0], np.full(3, 150.0)
+    x = np.linspace(-8, 8, 1601)
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = inputs.from_normals(grid)[0]
+    good = points.sum(axis=1) > 0
+    misfit = (((model.stresses(points) - data) / sigma) ** 2).sum(axis=1) / 2 + np.log(2 * np.pi * sigma**2).sum() / 2
+    exact = {}
+    for width in (1.0, 0.5, 2.0):
+        prior = -((grid / width) ** 2).sum(axis=1) / 2
+        exact[width] = logsumexp((prior - misfit)[good]) - logsumexp(prior[good])
+    whole = Posterior(inputs, SerialEvaluate(model), data, sigma)
+    share = np.exp(logsumexp(-(grid[good] ** 2).sum(axis=1) / 2) - logsumexp(-(grid**2).sum(axis=1) / 2))
+    assert inputs.admitted == pytest.approx(share, abs=2e-3)
+    found = evidence(whole, laplace(whole), 1024)
+    assert found.route != "closed form"
+    assert abs(found.log_evidence - exact[1.0]) < max(4 * found.error, 5e-3)
+    assert found.error < 0.05
+    for width in (0.5, 2.0):
+        value, error = _rescaled(found, whole, width)
+        assert abs(value - exact[width]) < max(4 * error, 5e-3)
+    assert not found.weights[found.density.parameters.sum(axis=1) <= 0].any()
+    if not correlated and find_spec("dynesty"):
+        value, error = nested(whole, live=200)
+        assert abs(value - exact[1.0]) < 4 * error

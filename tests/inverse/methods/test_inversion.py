@@ -1,0 +1,622 @@
+"""Inversion as a study: records, few parameters and fields, batches, synthetic data, and the command line."""
+
+import csv
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import xarray as xr
+
+import inverse.methods.inversion
+from forward.model import FunctionModel
+from inverse.criticism.chains import weigh_field
+from inverse.data.observations import Components
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
+from inverse.methods.inversion import (
+    Inversions,
+    Invert,
+    Synthesize,
+    Variables,
+    Vertices,
+    invert_by_all,
+    invert_by_group,
+    invert_field,
+    sentence,
+    variables,
+)
+from tests.inverse.fields.test_low_rank import curved
+from tests.launch import run, run_script
+from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.inputs.distributions import LogNormal, LogUniform, Normal
+from uq.inputs.random_parameters import Inputs
+from workflows.config.study import StudyError, document, load, parse, schema
+from workflows.run import run as study_runs
+from workflows.run.plan import plan
+from workflows.run.run import run as run_study
+from workflows.starter import starter
+from workflows.studies.inversion import _volumes, groups
+
+TISSUQ = Path(sys.executable).parent / "tissuq"
+ROOT = Path(__file__).parent.parent.parent.parent
+
+# --- records ---------------------------------------------------------------------------------------------------------
+
+
+def test_records_are_vectors():
+    found = Variables({"a": ("x",), "b": (), "c": ("y", "x")}, {"x": 3, "y": 2})
+    row = found.pack({"a": np.array([1.0, 2.0]), "b": np.array(5.0), "c": np.ones((2, 4))})
+    assert len(found.names) == len(row) == 3 + 1 + 6
+    record = found.unpack(row[None])
+    np.testing.assert_array_equal(record["a"], [[1, 2, np.nan]])
+    np.testing.assert_array_equal(record["b"], [5])
+    np.testing.assert_array_equal(record["c"], np.ones((1, 2, 3)))
+
+
+# --- few parameters, by closed forms ---------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(5)
+MATRIX = RNG.standard_normal((12, 3))
+PRIORS = {name: Normal(mean=mean, std=std) for name, mean, std in (("a", 1.0, 0.5), ("b", -1.0, 2.0), ("c", 0.0, 1.0))}
+DATA = Components(
+    RNG.uniform(size=(12, 3)),
+    np.arange(12) % 3,
+    np.repeat([0, 1], 6),
+    MATRIX @ [1.2, -0.5, 0.4] + 0.1 * RNG.standard_normal(12),
+    np.full(12, 0.1),
+)
+
+
+def linear():
+    return FunctionModel(lambda p: MATRIX @ p, ("a", "b", "c"), tuple(map(str, range(12))), lambda p: MATRIX)
+
+
+def exactly(rows):
+    """Mean and covariance of the posterior by some of the data."""
+    A = MATRIX[rows] / 0.1
+    mean, std = np.array([(p.mean, p.std) for p in PRIORS.values()]).T
+    precision = A.T @ A + np.diag(std**-2.0)
+    right = A.T @ DATA.values[rows] / 0.1 + mean / std**2
+    return np.linalg.solve(precision, right), np.linalg.inv(precision)
+
+
+def test_linear_models_have_the_exact_posterior():
+    method = Invert(samples=64, starts=2)
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    prior_std = np.array([p.std for p in PRIORS.values()])
+    mean = np.array([p.mean for p in PRIORS.values()])
+
+    exact, covariance = exactly(np.arange(12))
+    np.testing.assert_allclose(record["mode"], exact, rtol=1e-8)
+    np.testing.assert_allclose(record["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
+    np.testing.assert_allclose(record["std"], np.sqrt(np.diag(covariance)), rtol=0.3)
+    np.testing.assert_allclose(record["laplace_std"], np.sqrt(np.diag(covariance)), rtol=0.02)
+    S = 0.01 * np.eye(12) + (MATRIX * prior_std**2) @ MATRIX.T
+    gap = DATA.values - MATRIX @ mean
+    log_evidence = -(gap @ np.linalg.solve(S, gap) + np.linalg.slogdet(S)[1] + 12 * np.log(2 * np.pi)) / 2
+    assert record["log_evidence"] == pytest.approx(log_evidence, abs=1e-8)
+    for k in range(2):
+        rows = np.flatnonzero(DATA.cases == k)
+        np.testing.assert_allclose(record["alone_std"][k], np.sqrt(np.diag(exactly(rows)[1])), rtol=1e-8)
+        A = MATRIX[rows] * prior_std / 0.1
+        np.testing.assert_allclose(record["alone_eigenvalue"][k], np.linalg.eigvalsh(A.T @ A)[::-1], rtol=1e-8)
+        assert record["misfit"][k] == pytest.approx((record["residual"][rows] ** 2).sum())
+    assert (record["alone_eigenvalue"] <= record["eigenvalue"]).all()
+    assert record["misfit_degrees"].sum() == pytest.approx(record["residual_degrees"])
+    assert sentence(record["why"]).startswith("Laplace's Gaussian can be trusted")
+
+
+def test_the_noise_can_be_unknown():
+    method = Invert(samples=256, starts=1, noise=LogUniform(lower=0.1, upper=10.0))
+    record = invert_by_all(Inputs(PRIORS), SerialEvaluate(linear()), DATA, method, lambda points: points[:, :1])
+    assert len(record["mode"]) == 4
+    assert record["lower"][3] < 1 < record["upper"][3]
+    assert np.isnan(record["alone_std"][:, 3]).all()
+    np.testing.assert_array_equal(record["direction_parameter"][:, 3], 0)
+
+
+@pytest.mark.parametrize("kind", ["pcn", pytest.param("emcee", marks=pytest.mark.slow)])
+def test_what_is_left_is_of_chains_that_have_mixed(kind):
+    """Moments, intervals and draws: those of the exact posterior, closer than so few weighted points come."""
+    method = Invert(samples=32, starts=1, chains=kind)
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, method, lambda points: points[:, :1])
+    exact, covariance = exactly(np.arange(12))
+    std = np.sqrt(np.diag(covariance))
+    assert record["chains"] == {"pcn": 4, "emcee": 8}[kind]
+    assert record["chain_rhat"] < 1.01
+    assert record["chain_effective"] > 400
+    np.testing.assert_allclose(record["mean"], exact, atol=0.15 * std.min())
+    np.testing.assert_allclose(record["std"], std, rtol=0.1)
+    np.testing.assert_allclose((record["upper"] - record["lower"]) / std, 2 * 1.96, rtol=0.1)
+    assert len(np.unique(record["draw"], axis=0)) > 200  # of 32 points there would be no more
+    r = (record["draw"][0] @ MATRIX.T - DATA.values) / 0.1
+    np.testing.assert_allclose(record["draw_log_likelihood"][0], -(r**2) / 2 - np.log(0.1 * np.sqrt(2 * np.pi)))
+
+
+def test_what_is_predicted_is_as_sure_as_the_parameters():
+    record = invert_by_group(Inputs(PRIORS), linear(), DATA, Invert(samples=32, starts=1), lambda points: points[:, :1])
+    _, covariance = exactly(np.arange(12))
+    np.testing.assert_allclose(record["predicted_std"], np.sqrt(np.diag(MATRIX @ covariance @ MATRIX.T)), rtol=1e-8)
+
+
+def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
+    """Laplace's moments and draws where it can be trusted; else those of the weighted samples, with their evidence."""
+    posterior = curved()
+    n = len(posterior.data)
+    data = Components(np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.int64), posterior.data, posterior.sigma)
+    vertices = Vertices(np.full(posterior.size, 0.1), np.ones(posterior.size))
+    method = Invert(samples=512, draws=100)
+    plain = invert_field(posterior, data, method, vertices)
+    assert plain["trust"] == 0
+    np.testing.assert_array_equal(plain["stiffness_mean"], plain["stiffness_mode"])
+    assert abs(plain["log_evidence"] - plain["laplace_log_evidence"]) > 1e-6
+    assert 0 < plain["log_evidence_error"] < 0.5
+    verdict = inverse.methods.inversion.Verdict("corrected", "")
+    monkeypatch.setattr(inverse.methods.inversion, "verdict_on_field", lambda *_: verdict)
+    record = invert_field(posterior, data, method, vertices)
+    mode = find_mode(posterior)
+    weighed = weigh_field(mode.point, LowRankPosterior.at(mode.point), 512)
+    np.testing.assert_allclose(record["stiffness_mean"], 0.1 + weighed.mean, rtol=1e-6)
+    np.testing.assert_allclose(record["stiffness_std"], weighed.std, rtol=1e-6)
+    assert record["mean"][0] == pytest.approx(0.1 + weighed.mean.mean())
+    assert record["lower"][0] < record["mean"][0] < record["upper"][0]
+    distance = np.abs(record["stiffness_draw"][:, None] - 0.1 - weighed.values).max(axis=2).min(axis=1)
+    assert distance.max() < 1e-6
+
+
+def test_inversions_are_evaluations():
+    """Two data sets, one of which has no answer: the other's record is that of the inversion alone."""
+    method = Invert(samples=32, starts=1)
+    names = ("a", "b", "c")
+    layout = variables(names, field=False, cases=2, data=14, nodes=1, method=method)
+
+    def look(points):
+        return points[:, :1]
+
+    def invert(parameters):
+        return layout.pack(invert_by_group(Inputs(PRIORS), linear(), DATA, method, look))
+
+    found = SerialEvaluate(Inversions(invert, ("data_set",), layout.names))(Request(np.array([[0.0], [1.0]])))
+    record = layout.unpack(found.outputs)
+    np.testing.assert_array_equal(record["mode"][0], record["mode"][1])
+    np.testing.assert_array_equal(np.isnan(record["measured"][0]), np.arange(14) >= 12)
+
+
+def test_synthetic_data_have_the_errors_that_were_asked():
+    points = np.repeat(np.arange(200), 3)
+    cases = np.repeat([0, 1], 300)
+    model = FunctionModel(
+        lambda p: p[0] * np.where(cases == 0, 1.0, 10.0), ("a",), tuple(map(str, range(600))), lambda p: None
+    )
+    method = Synthesize(noise={"relative": 0.1}, fraction=(1.0, 0.25), missing=0.2, seed=3)
+    inputs = Inputs({"a": LogNormal(mean=2.0, std=0.5)})
+    found = method.run(inputs, SerialEvaluate(model), cases, points)
+    a = found["truth"].to_numpy()[:, 0]
+    np.testing.assert_allclose(found["sigma"].to_numpy()[:, [0, 300]], np.outer(a, [0.1, 1.0]))
+    z = ((found["values"] - found["clean"]) / found["sigma"]).to_numpy()
+    assert np.nanstd(z) == pytest.approx(1, abs=0.1)
+    assert np.isnan(z[0]).mean() == pytest.approx(0.2, abs=0.05)
+    kept = np.isfinite(z[1]).reshape(200, 3)
+    assert kept.any(axis=1).sum() <= 50
+    xr.testing.assert_identical(found, method.run(inputs, SerialEvaluate(model), cases, points))
+
+
+# --- studies ---------------------------------------------------------------------------------------------------------
+
+CUBE = """
+[model]
+kind = "specimen"
+body = { size = [1.0, 1.0, 1.0], cells = [CELLS, CELLS, CELLS], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e4, lmbda = 4e4 }
+cases = [
+    { name = "shear", clamp = ["z-min"], loads = [TRACTION, direction = [1, 0, 0] }] },
+    { name = "pull", clamp = ["z-min"], loads = [TRACTION, direction = [0, 0, 1] }] },
+]
+""".replace("TRACTION", '{ kind = "traction", on = "z-max", size = 900')
+LUMP = 'inclusions = [{ name = "lump", x = 0.6, y = 0.5, z = 0.5, radius = 0.3, contrast = 4, width = 0.4 }]\n'
+MADE = (
+    CUBE.replace("CELLS", "3")
+    + LUMP
+    + """
+observed = [{ on = "x-max" }, { on = "z-max" }]
+
+[method]
+kind = "synthesize"
+noise = { relative = 0.02 }
+fraction = [1.0, 0.3]
+seed = 1
+"""
+)
+FEW = (
+    CUBE.replace("CELLS", "2")
+    + LUMP
+    + """
+[parameters]
+"inclusions.lump.contrast" = { kind = "log-uniform", lower = 1, upper = 16 }
+"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }
+
+[data]
+files = ["data"]
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+draws = 50
+"""
+)
+FIELD = (
+    CUBE.replace("CELLS", "2")
+    + """
+fields = [{ of = "stiffness", length = 0.6, std = 0.4, basis = "nodes" }]
+
+[data]
+files = ["data/made-1.csv"]
+
+[method]
+kind = "invert"
+draws = 20
+"""
+)
+
+
+def here(path, out, *changes):
+    """Run a study in this process."""
+    return run_study(load(path, changes), path.stem, out, quiet=True)
+
+
+WITHOUT_REPORT = """
+import sys
+import workflows.run.run
+from workflows.__main__ import main
+
+workflows.run.run._report = lambda directory: None
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Studies with two synthetic data sets, one that has the wrong columns, and one of other units."""
+    place = tmp_path_factory.mktemp("inversion")
+    for name, text in (("made", MADE), ("few", FEW), ("field", FIELD)):
+        (place / f"{name}.toml").write_text(text)
+    assert here(place / "made.toml", place / "made") == 0
+    (place / "made" / "data").rename(place / "data")
+    (place / "data" / "wrong.csv").write_text("x,y,z,vx\n0,0,0,1\n")
+    return place
+
+
+def test_synthetic_data_say_what_they_are_of(folder):
+    text = (folder / "data" / "made-2.csv").read_text()
+    assert "# truth.inclusions.lump.contrast = 4.0\n" in text
+    assert text.startswith("# Synthetic: 3 × 3 × 3 cells (hexahedron, degree 1), errors relative 0.02, seed 1.")
+    study = load(folder / "few.toml", ["data.files=['data/made-*.csv']"])
+    counts = [len(set(map(tuple, m.observations.places))) for m in study.measurements]
+    assert counts == [28, round(0.3 * 28)]
+    assert study.measurements[0].truth["material.mu"] == 1e4
+    page = (folder / "made" / "report.html").read_text()
+    assert "2 data sets" in page
+
+
+def test_one_bad_file_does_not_stop_the_others(folder):
+    assert here(folder / "few.toml", folder / "one") == 3
+    rows = list(csv.DictReader((folder / "one" / "batch.csv").read_text().splitlines()))
+    assert [(row["data_set"], row["ok"]) for row in rows] == [("made-1", "yes"), ("made-2", "yes"), ("wrong", "no")]
+    assert "unknown column" in rows[2]["why"]
+    widths = [float(row["inclusions.lump.contrast std"]) for row in rows[:2]]
+    assert widths[1] > widths[0]
+    summary = json.loads((folder / "one" / "summary.json").read_text())
+    assert summary["failed"] == 1
+    assert summary["data_sets"]["wrong"] == {"failed": rows[2]["why"]}
+    assert set(summary["data_sets"]["made-1"]["posterior"]["material.mu"]) == {"mode", "std", "lower", "upper"}
+    page = (folder / "one" / "report.html").read_text()
+    for words in ("All data sets", "could not be inverted", "Load cases", "data:image/png", "log-uniform"):
+        assert words in page
+    assert (folder / "one" / "fields" / "made-1.vtu").exists()
+    found = xr.load_dataset(folder / "one" / "results.nc", engine="h5netcdf")
+    np.testing.assert_array_equal(found["ok"], [True, True, False])
+    assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
+
+
+KILLED = """
+import os
+import sys
+import workflows.run.run
+from uq.evaluation.checkpoint import Checkpoint
+from workflows.__main__ import main
+
+workflows.run.run._report = lambda directory: None
+save, saved = Checkpoint.save, []
+
+
+def kill_after(self, key, block):
+    save(self, key, block)
+    saved.append(key)
+    if len(saved) == int(os.environ.get("BLOCKS", 0)):
+        os._exit(9)
+
+
+Checkpoint.save = kill_after
+code = main(sys.argv[1:])
+print(f"{len(saved)} blocks")
+sys.exit(code)
+"""
+
+
+def test_an_interrupted_batch_keeps_its_solves_and_its_rows(folder, monkeypatch):
+    """Killed in the first data set, and in the second: nothing is solved twice, and what is finished is shown."""
+    assert (folder / "one").exists()
+    study, out = folder / "few.toml", folder / "killed"
+    blocks, rows = [], []
+    for count in ("10", "15", ""):
+        monkeypatch.setenv("BLOCKS", count or "0")
+        done = run_script(None, KILLED, "run", study, "--out", out)
+        assert done.returncode == (9 if count else 3), done.stderr
+        blocks.append(count or done.stdout.rpartition(" blocks")[0].split()[-1])
+        table = out / "batch.csv"
+        rows.append([row["data_set"] for row in csv.DictReader(table.open())] if table.exists() else [])
+    assert rows == [[], ["made-1"], ["made-1", "made-2", "wrong"]]
+    assert not (out / "evaluations").exists()
+    assert (folder / "one/batch.csv").read_bytes() == (out / "batch.csv").read_bytes()
+    assert (folder / "one/results.nc").read_bytes() == (out / "results.nc").read_bytes()
+    monkeypatch.setenv("BLOCKS", "0")
+    whole = run_script(None, KILLED, "run", study, "--out", folder / "unkilled")
+    assert sum(map(int, blocks)) == int(whole.stdout.rpartition(" blocks")[0].split()[-1])
+
+
+def test_an_interrupted_field_keeps_its_solves(folder, monkeypatch):
+    """The states of the search and of the samples: a kept one is accepted as it is, and the result the same."""
+    study, settings = folder / "field.toml", ("--set", "method.samples=32")
+    counts = []
+    for out, count in (("field-whole", "0"), ("field-killed", "12"), ("field-killed", "0")):
+        monkeypatch.setenv("BLOCKS", count)
+        done = run_script(None, KILLED, "run", study, "--out", folder / out, *settings)
+        assert done.returncode in (9, 0, 3), done.stderr
+        counts.append(12 if count == "12" else int(done.stdout.rpartition(" blocks")[0].split()[-1]))
+    assert counts[0] == counts[1] + counts[2] > 20
+    assert not (folder / "field-killed" / "evaluations").exists()
+    assert (folder / "field-whole/results.nc").read_bytes() == (folder / "field-killed/results.nc").read_bytes()
+
+
+def test_progress_counts_the_solves_of_inversions(folder):
+    """Of all data sets, in a line off the terminal."""
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "counted")
+    solves = json.loads((folder / "counted/summary.json").read_text())["solves"]
+    assert re.search(rf"^{solves}/{solves} solves, .* per second, 0:00 left$", done.stderr, re.MULTILINE), done.stderr
+    quiet = run_script(None, WITHOUT_REPORT, "run", "--quiet", folder / "few.toml", "--out", folder / "counted2")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
+
+
+def test_two_ranks_give_the_same_bytes(folder):
+    assert (folder / "one").exists()  # of the test before
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "two")
+    assert done.returncode == 3, done.stderr
+    assert "wrong: failed: wrong.csv: unknown column 'vx'; did you mean" in done.stdout
+    assert (folder / "one/results.nc").read_bytes() == (folder / "two/results.nc").read_bytes()
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(
+    ("study", "tasks", "code"),
+    [("field.toml", 1, 3), ("made.toml", 2, 0)],  # the mesh of the field is too coarse, which is found
+)
+def test_fewer_tasks_than_ranks(folder, study, tasks, code):
+    one, two = (folder / f"{study}-{ranks}" for ranks in (1, tasks + 1))
+    done = [
+        run_script(ranks, WITHOUT_REPORT, "run", folder / study, "--out", out, "--quiet")
+        for ranks, out in ((None, one), (tasks + 1, two))
+    ]
+    assert [each.returncode for each in done] == [code, code], done[1].stderr
+    assert f"{tasks + 1} groups of ranks were started for {tasks} tasks: 1 have nothing to do" in done[1].stderr
+    assert (one / "results.nc").read_bytes() == (two / "results.nc").read_bytes()
+
+
+def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    # On two cells along an edge: the program finds itself that they are too few.
+    assert here(folder / "few.toml", folder / "single", "data.files=['data/made-1.csv']") == 3
+    summary = json.loads((folder / "single" / "summary.json").read_text())
+    assert summary["evaluations"] > 32
+    assert set(summary["posterior"]) == {"inclusions.lump.contrast", "material.mu"}
+    assert summary["log_evidence_error"] < 1
+    assert summary["verdict"].startswith("not to be trusted: ")
+    said = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert any("a finer mesh moves the data by" in text and "material.mu +" in text for text in said)
+    arviz = pytest.importorskip("arviz")
+    kept = arviz.from_netcdf(folder / "single" / "results.nc")
+    assert kept.posterior["material.mu"].shape == (1, 50)
+    assert kept.log_likelihood["displacement"].shape[:2] == (1, 50)
+    assert np.isfinite(arviz.loo(kept).elpd_loo)
+    assert set(kept.prior.data_vars) == set(kept.posterior.data_vars)
+
+
+@pytest.mark.mpi
+def test_all_groups_share_one_data_set(folder):
+    """The same bytes as of one rank, the solve on the finer mesh among them."""
+    assert (folder / "single").exists()  # of the test before
+    changes = ("--set", "data.files=['data/made-1.csv']")
+    done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "shared", "--quiet", *changes)
+    assert done.returncode == 3, done.stderr
+    assert (folder / "single/results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
+
+
+def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    changes = ("data.files=['data/made-2.csv']", "method.mesh_check=false", "model.body.cells=[3,3,3]")
+    here(folder / "few.toml", folder / "unchecked", *changes)
+    summary = json.loads((folder / "unchecked" / "summary.json").read_text())
+    assert "not checked for the mesh" in summary["verdict"]
+    assert {"severity": "warning", "text": "made-2: not checked for the mesh: method.mesh_check = false."} in summary[
+        "findings"
+    ]
+    assert any("nothing will be said to be trusted" in line for line in plan(load(folder / "few.toml", changes)))
+    assert any("mesh check  one solve of 192 displ" in line for line in plan(load(folder / "few.toml")))
+
+
+def test_what_is_strange_is_said_with_the_inversion(folder, monkeypatch):
+    """Data that do not belong by their line, and the end of a range, on the mesh that made the data."""
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    rows = (folder / "data" / "made-1.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(rows) if line.startswith("1,"))
+    cells = rows[first].split(",")
+    cells[3] = str(float(cells[3]) + 20 * float(cells[6]))
+    (folder / "strange.csv").write_text("\n".join([*rows[:first], ",".join(cells), *rows[first + 1 :]]))
+    changes = ("data.files=['strange.csv']", "model.body.cells=[3,3,3]", "method.mesh_check=false")
+    contrast = "parameters.inclusions.lump.contrast={ kind = 'log-uniform', lower = 1, upper = 2 }"
+    for out, more in (("strange", ()), ("narrow", (contrast,))):
+        assert here(folder / "few.toml", folder / out, *changes, *more) == 3
+    strange, narrow = (
+        [one["text"] for one in json.loads((folder / out / "summary.json").read_text())["findings"]]
+        for out in ("strange", "narrow")
+    )
+    assert any(f"strange.csv: line {first + 1} at (1, " in text and "1 datum does not" in text for text in strange)
+    assert any("inclusions.lump.contrast is at the upper end of its range (2)" in text for text in narrow)
+
+
+def test_volumes_of_inclusions(folder):
+    """Those of the draws; nothing where no radius is unknown, or nothing was found."""
+    radius = "parameters.inclusions.lump.radius={kind = 'uniform', lower = 0.2, upper = 0.4}"
+    study = load(folder / "few.toml", [radius])
+    draws = np.full((3, 50, 3), [2.0, 9e3, 0.3])
+    draws[0, :, 2] = np.linspace(0.25, 0.35, 50)
+    draws[2] = np.nan
+    found = _volumes(study, {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+    ball = 4 / 3 * np.pi * np.linspace(0.25, 0.35, 50) ** 3
+    for name, expected in (
+        ("mean", ball.mean()),
+        ("std", ball.std()),
+        ("mode", ball[0]),
+        ("true", 4 / 3 * np.pi * 0.027),
+    ):
+        np.testing.assert_allclose(found[f"volume_{name}"][1][0], [expected])
+    assert found["volume_std"][1][1] == pytest.approx([0], abs=1e-12)
+    assert np.isnan(found["volume_mean"][1][2])
+    assert found["inclusion"][1] == ["lump"]
+    assert not _volumes(load(folder / "few.toml"), {"draw": draws, "mode": draws[:, 0]}, list(study.measurements))
+
+
+def test_chains_are_those_of_arviz(folder):
+    """Draws that stand chain after chain become chains, where all data sets have as many."""
+    study = load(folder / "few.toml", ["data.files=['data/made-1.csv']"])
+    draws = np.arange(100.0).reshape(1, 50, 2)
+    found = xr.Dataset(
+        {
+            "draw": (("data_set", "sample", "parameter"), draws),
+            "draw_log_likelihood": (("data_set", "sample", "datum"), draws),
+            "measured": (("data_set", "datum"), np.zeros((1, 2))),
+            "chains": ("data_set", [4.0]),
+            "ok": ("data_set", [True]),
+        },
+        {"data_set": ["made-1"], "parameter": list(study.names)},
+    )
+    kept = groups(study, found)
+    assert kept["log_likelihood"]["displacement"].shape == (4, 12, 2)
+    np.testing.assert_array_equal(kept["posterior"]["material.mu"], 1 + 2 * np.arange(48).reshape(4, 12))
+    assert groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
+
+
+def test_a_field_and_its_report(folder):
+    assert here(folder / "field.toml", folder / "field") == 3
+    found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
+    assert found.sizes["node"] == 27
+    assert (found["stiffness_std"] < found["stiffness_prior_std"]).all()
+    assert (found["alone_stiffness_std"] >= found["stiffness_std"] - 1e-9).all()
+    assert int((found["eigenvalue"] > 1).sum()) > int((found["alone_eigenvalue"] > 1).sum("direction").max())
+    assert np.isfinite(found["stiffness_true"]).all()
+    centre = int(np.abs(found["node_position"] - [0.5, 0.5, 0.5]).sum("axis").argmin())
+    assert float(found["stiffness_true"][centre]) == pytest.approx(np.log(4), abs=0.5)
+    page = (folder / "field" / "report.html").read_text()
+    for words in ("directions that the data constrain most", "by each load case alone", "log-normal field", "penalty"):
+        assert words in page
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "told"),
+    [
+        (FEW, 'files = ["data"]', 'files = ["nothing"]', r"data.files: nothing: no such file"),
+        (FEW, 'files = ["data"]', 'files = ["data/wrong.csv"]', r"data: wrong.csv: unknown column 'vx'"),
+        (FEW, 'files = ["data"]', 'files = ["data/made-1.csv"]\nunit = 1e3', r"expected a smaller one: is data\.unit"),
+        (FEW, 'files = ["data"]', 'files = "data/made-1.csv"\ntruth = { "material.nu" = 1 }',
+         "data.truth.material.nu: not a number of the model; did you mean 'material.mu'"),
+        (FEW, "draws = 50", 'noise = { kind = "normal", mean = 1, std = 1 }', "method.noise: reaches -.*is positive"),
+        (FEW, "lump.contrast", "lump.contarst", "parameters: not a number of the model; did you mean"),
+        (FEW, "lower = 1,", "lower = -1,", "lower"),
+        (FIELD, "[data]", '[parameters]\n"material.mu" = { kind = "log-normal", mean = 1e4, std = 2e3 }\n[data]',
+         "a field of nodal values is inverted alone"),
+        (FIELD, "draws = 20", 'chains = "emcee"', "expected 'pcn'"),
+        (FIELD, "draws = 20", "samples = 8", "expected at least 32"),
+        (FIELD, 'of = "stiffness"', 'of = "density"', "no load is gravity"),
+        (MADE, "observed = ", "# observed = ", "model.observed: nothing is observed"),
+        (MADE, "relative = 0.02", "", "expected either relative or absolute"),
+        (MADE, "fraction = [1.0, 0.3]", "fraction = [1.5]", "method.fraction"),
+    ],
+)  # fmt: skip
+def test_one_line_for_a_mistake(folder, text, old, new, told):
+    path = folder / "mistake.toml"
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(StudyError, match=told):
+        load(path)
+
+
+def test_points_outside_the_body_are_told(folder):
+    text = (folder / "data" / "made-1.csv").read_text().splitlines()
+    first = next(i for i, line in enumerate(text) if line.startswith("1,"))
+    text[first] = "1.001" + text[first][1:]
+    (folder / "outside.csv").write_text("\n".join(text))
+    study = load(folder / "few.toml", ["data.files=['outside.csv']"])  # a thousandth of a diagonal of √3 m is allowed
+    assert study.measurements[0].moved.max() == pytest.approx(1e-3)
+    assert any("1 point outside the body is moved to its surface, by up to 0.001 m" in line for line in plan(study))
+    with pytest.raises(StudyError, match=rf"line {first + 1}.*lies 0.001 m outside the body.*data\.tolerance = 0 m"):
+        load(folder / "few.toml", ["data.files=['outside.csv']", "data.tolerance=0.0"])
+    text[first] = "1.002" + text[first][5:]
+    (folder / "outside.csv").write_text("\n".join(text))
+    with pytest.raises(StudyError, match=r"lies 0.002 m outside the body.*data\.tolerance = 0.001732 m"):
+        load(folder / "few.toml", ["data.files=['outside.csv']"])
+
+
+def test_starters(tmp_path):
+    (tmp_path / "measured.csv").write_text("x,y,z,uz\n0.025,0.025,0.05,0.002\n")
+    study = parse(tomllib.loads(starter("invert")), folder=tmp_path)
+    assert study.method.kind == "invert"
+    for blocks in (tomllib.loads(starter("invert")), document(study)):
+        jsonschema.validate(blocks, schema())
+    assert parse(document(study)) == study
+    assert parse(tomllib.loads(starter("synthesize"))).method.kind == "synthesize"
+
+
+# --- what is recovered -----------------------------------------------------------------------------------------------
+
+
+def shipped(name, out, code):
+    done = run(None, TISSUQ, "run", ROOT / "configs" / f"{name}.toml", "--out", out)
+    assert done.returncode == code, done.stderr
+    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+
+
+@pytest.mark.slow
+def test_the_shipped_inclusion_is_recovered(tmp_path):
+    # The data are of equal cells, so that the errors at the clamp are alike; the finer mesh, graded there, sees them.
+    found = shipped("inclusion", tmp_path / "out", 3).isel(data_set=0)
+    assert "its mesh is too coarse" in str(found["why"].item())
+    assert float(np.sqrt((found["mesh_error"] ** 2).mean())) == pytest.approx(0.75, abs=0.1)
+    error = dict(zip(found.parameter.values, np.abs(found["mean"] - found["true"]).to_numpy(), strict=True))
+    assert max(error[f"inclusions.lump.{axis}"] for axis in "xyz") < 0.02 * 0.05
+    assert error["inclusions.lump.radius"] < 0.05 * 0.012
+    contrast = found.sel(parameter="inclusions.lump.contrast")
+    assert contrast["lower"] < contrast["true"] < contrast["upper"]
+
+
+@pytest.mark.slow
+def test_the_shipped_field_is_recovered(tmp_path):
+    found = shipped("stiffness-field", tmp_path / "out", 0).isel(data_set=0)
+    z = np.abs(found["stiffness_mean"] - found["stiffness_true"]) / found["stiffness_std"]
+    assert float((z < 2).mean()) >= 0.9
+    assert np.corrcoef(found["stiffness_mean"], found["stiffness_true"])[0, 1] > 0.7
+    assert int((found["eigenvalue"] > 1).sum()) > int((found["alone_eigenvalue"] > 1).sum("direction").max())

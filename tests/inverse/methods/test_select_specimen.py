@@ -1,0 +1,163 @@
+"""Selection among models of a specimen: evidence against quadrature, meshes as candidates, mistakes, ranks."""
+
+import os
+import signal
+import subprocess
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from mpi4py import MPI
+from scipy.special import logsumexp
+
+from tests.inverse.methods.test_select import TISSUQ
+from tests.launch import run
+from tests.rubber import CONFIGS
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal
+from workflows.config.study import StudyError, dump, load, parse
+from workflows.run.plan import plan
+
+pytestmark = pytest.mark.fem
+STUDY = """
+[model]
+kind = "specimen"
+body = { kind = "box", size = [1, 0.7, 0.8], cells = [2, 1, 1], cell = "hexahedron", degree = 1 }
+solver = { tolerance = 1e-10 }
+
+[[model.cases]]
+name = "bent"
+clamp = ["x-min"]
+loads = [{ kind = "traction", on = "x-max", direction = [0, 0, 1], size = 1e3 }]
+
+[data]
+file = "table.csv"
+
+[candidates.right]
+model.material = { kind = "neo-hookean", C1 = 1e4, D1 = 1e5 }
+parameters."material.C1" = { kind = "log-normal", mean = 1.2e4, std = 4e3 }
+
+[candidates.stiff]
+model.material = { kind = "neo-hookean", C1 = 1e4, D1 = 1e5 }
+model.body.cells = [1, 1, 1]
+parameters."material.C1" = { kind = "log-normal", mean = 1.2e4, std = 4e3 }
+weight = 3
+
+[method]
+kind = "select"
+samples = 32
+starts = 1
+noise = {}
+"""
+POINTS = ((1.0, 0.0, 0.8), (1.0, 0.7, 0.8), (0.5, 0.35, 0.8), (0.5, 0.7, 0.0))
+HEAD = "# made up\nx,y,z,ux,uy,uz,sigma\n"
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Data of the right candidate with errors of 3 mm."""
+    text = HEAD + "".join(f"{x},{y},{z},0,0,0,3e-3\n" for x, y, z in POINTS)
+    folder = Path(os.environ.get("TMPDIR", "/tmp"))
+    path = folder / f"select-{os.getpid()}.csv"
+    path.write_text(text)
+    study = parse(tomllib.loads(STUDY.replace("table.csv", path.name)), folder=folder)
+    path.unlink()
+    exact = study.build("right", "all", MPI.COMM_SELF).solve(np.array([1e4])).outputs.reshape(-1, 3)
+    noisy = exact + 3e-3 * np.random.default_rng(0).standard_normal(exact.shape)
+    rows = (",".join(map(str, (*point, *u, 3e-3))) for point, u in zip(POINTS, noisy.tolist(), strict=True))
+    return HEAD + "\n".join(rows) + "\n"
+
+
+@pytest.fixture
+def study(table, tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY)
+    (tmp_path / "table.csv").write_text(table)
+    return tmp_path / "study.toml"
+
+
+def test_evidence_is_that_of_quadrature(study):
+    """One parameter: ln Z of both meshes by the trapezoidal rule over the prior; the coarse mesh is found out."""
+    it = load(study)
+    models = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
+    found = it.method.run(it.models, it.groups, lambda name, _: SerialEvaluate(models[name]))
+    data = it.groups["all"]
+    grid = np.arange(-2.4, 0.7, 0.08)  # beyond, the data are far away
+    prior = LogNormal(mean=1.2e4, std=4e3)
+    for k, model in enumerate(models.values()):
+        logs = []
+        for x in grid:
+            r = (model.solve(prior.from_normal(np.array([x]))[0]).outputs - data.values) / data.sigma
+            logs.append(-r @ r / 2 - np.log(data.sigma * np.sqrt(2 * np.pi)).sum())
+        exact = logsumexp(logs, b=0.08 * np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi))
+        assert min(max(logs) - logs[0], max(logs) - logs[-1]) > 8
+        assert found["log_evidence"].values[k] == pytest.approx(exact, abs=0.05)
+        assert abs(found["log_evidence"].values[k] - exact) < 5 * found["log_evidence_error"].values[k] + 1e-3
+    assert found["probability"].values[0] > 0.95
+    assert found["misfit_probability"].values[0, 0] > 0.01
+
+
+def test_studies_are_complete_in_themselves(study):
+    it = load(study)
+    assert parse(tomllib.loads(dump(it))) == it
+    assert it.source == ("made up",)
+    assert it.described("stiff") == "neo-hookean on 1 × 1 × 1 cells (hexahedron, degree 1)"
+    assert any("12 displacements of 1 load cases" in line for line in plan(it))
+    shipped = load(CONFIGS / "inclusion-material.toml")
+    assert len(shipped.candidates) == 5
+    assert any("truth: material.C20 = 400.0" in line for line in shipped.source)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("table.csv", "tabel.csv", "cannot be read: No such file"),
+        ('kind = "neo-hookean"', 'kind = "neo-hokean"', "candidates.right.model.material"),
+        ('parameters."material.C1"', 'parameters."material.C2"', "not a number of the model; did you mean"),
+        ("cells = [1, 1, 1]", "cels = [1, 1, 1]", "candidates.stiff.model.body.*unknown key"),
+        ("starts = 1", 'check = "dynesty"', "method.check: nested sampling takes ten thousand solves"),
+        (
+            '"log-normal", mean = 1.2e4',
+            '"normal", mean = -1e4',
+            "candidates.right.parameters: 99.4 % of the values are impossible; at the medians, material: not stable",
+        ),
+        ('file = "table.csv"', 'file = "table.csv"\nunits = 1', "data.units: unknown key; did you mean 'unit'"),
+    ],
+)
+def test_one_line_for_a_mistake(study, old, new, told):
+    study.write_text(STUDY.replace(old, new, 1))
+    with pytest.raises(StudyError, match=told) as caught:
+        load(study)
+    assert len(caught.value.args) == 1
+
+
+@pytest.mark.mpi
+@pytest.mark.slow
+def test_a_study_from_the_command_line(study):
+    """One rank or two: the same bytes; the report shows what is left of the data."""
+    for name, ranks in (("one", None), ("two", 2)):
+        done = run(ranks, TISSUQ, "run", study, "--out", study.parent / name)
+        assert done.returncode == 0, done.stderr
+    assert (study.parent / "one/results.nc").read_bytes() == (study.parent / "two/results.nc").read_bytes()
+    page = (study.parent / "one" / "report.html").read_text()
+    for words in ("What is left of the data", "Posteriors of the constants", "neo-hookean on 1 × 1 × 1 cells"):
+        assert words in page
+    found = xr.load_dataset(study.parent / "one" / "results.nc")
+    assert found["prior_probability"].to_numpy() == pytest.approx([0.25, 0.75])
+
+
+@pytest.mark.slow
+def test_same_bits_after_a_kill(study):
+    directory = study.parent / "killed"
+    command = [TISSUQ, "run", study, "--out", directory, "--set", "method.samples=256"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    while process.poll() is None and len(list(directory.glob("evaluations/*"))) < 12:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    for out in (directory, study.parent / "whole"):
+        done = run(None, TISSUQ, "run", study, "--out", out, "--set", "method.samples=256")
+        assert done.returncode == 0, done.stderr
+    assert (directory / "results.nc").read_bytes() == (study.parent / "whole/results.nc").read_bytes()

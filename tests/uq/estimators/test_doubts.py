@@ -1,0 +1,216 @@
+"""What samples and expansions say against their own estimates: functions that fits, samples or both cannot see."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from benchmarks import tails
+from benchmarks.coverage import CASES, Vectorised, measure
+from forward.model import FunctionModel
+from uq.estimators.doubts import of_indices
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.findings import findings
+from uq.inputs.distributions import Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.methods import chaos
+from uq.methods.chaos import Chaos
+from uq.methods.compare import Compare
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.methods.sobol import Sobol
+
+UNIT = Uniform(lower=0.0, upper=1.0)
+BY_NAME = {case.name: case for case in CASES}
+
+
+@pytest.fixture(autouse=True)
+def _few_points(monkeypatch):
+    monkeypatch.setattr(chaos, "DRAWN", 13)
+
+
+def run(method, name):
+    case = BY_NAME[name]
+    return method.run(case.inputs, Vectorised(case))
+
+
+def severities(data):
+    return [finding.severity for finding in findings(data)]
+
+
+# --- expansions that explain nothing -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("samples", [40, 100])
+def test_what_no_expansion_explains_has_the_moments_of_its_samples_and_no_indices(samples, gradients):
+    data = run(
+        Sobol(samples=samples, gradients=gradients, second_order=True, groups={"ab": ("x0", "x1")}), "oscillation"
+    )
+    assert data["loo_error"].item() > 0.8
+    assert abs(data["mean"].item()) < 3 * data["mean_error"].item()
+    assert abs(data["std"].item() - 0.707) < 3 * data["std_error"].item() < 0.3
+    values = data["values"].to_numpy()[:, 0]
+    np.testing.assert_allclose(data["quantiles"].to_numpy()[:, 0], np.quantile(values, (0.05, 0.5, 0.95)))
+    for name in ("sobol_first", "sobol_total", "sobol_group_first", "sobol_second"):
+        for end in ("", "_error"):
+            assert np.isnan(data[f"{name}{end}"].to_numpy()).all()
+    assert severities(data)[0] == "error"
+    assert "explains nothing" in findings(data)[0].text
+
+
+def test_given_data_of_such_an_expansion_have_no_indices_either(tmp_path):
+    case = BY_NAME["oscillation"]
+    source = run(Chaos(samples=40), "oscillation")
+    source.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
+    data = Sobol(design="given-data", source=str(tmp_path)).run(case.inputs, Vectorised(case))
+    assert np.isnan(data["sobol_total"].to_numpy()).all()
+    assert "error" in severities(data)
+    samples = run(MonteCarlo(samples=40), "oscillation")
+    (tmp_path / "plain").mkdir()
+    samples.to_netcdf(tmp_path / "plain" / "results.nc", engine="h5netcdf")
+    data = Sobol(design="given-data", source=str(tmp_path / "plain")).run(case.inputs, Vectorised(case))
+    assert np.isnan(data["sobol_total"].to_numpy()).all()
+    assert "error" in severities(data)
+
+
+def test_a_rough_expansion_controls_its_own_samples():
+    """A jump of which the gradients know nothing: the fit has a third of the variance."""
+    data = run(Chaos(samples=40), "jump")
+    coefficients, indices = data["coefficients"].to_numpy()[:, 0], data["multi_index"].to_numpy()
+    fitted = np.sqrt((coefficients[indices.any(axis=1)] ** 2).sum())
+    exact = np.sqrt(1 / 12 + 0.35 * 0.65)
+    assert fitted < 0.8 * exact
+    assert abs(data["std"].item() - exact) < 2.5 * data["std_error"].item()
+    assert severities(data) == ["warning"]
+
+
+def test_errors_of_indices_have_what_the_fit_leaves_out():
+    for name in ("hinge", "jump", "absolute value", "Sobol' g", "peak"):
+        data = run(Sobol(samples=40), name)
+        left = (data["loo_error"].item() * data["values"].std().item() / data["std"].item()) ** 2
+        assert (data["sobol_total_error"].to_numpy() >= 0.9 * left).all()
+
+
+def test_smooth_functions_have_no_finding():
+    for name in ("Ishigami", "quadratic", "log-normals"):
+        assert findings(run(Sobol(samples=80), name)) == []
+
+
+def test_the_solve_at_the_mean_is_one_that_the_fit_has_not_seen():
+    """A peak of which no sample knows, but for the one at the mean."""
+    inputs = Inputs(dict.fromkeys("abc", UNIT))
+    model = FunctionModel(lambda p: p.sum() + 5 * np.exp(-((p - 0.5) ** 2).sum() / (2 * 0.02**2)), inputs.names, ("y",))
+    data = Chaos(samples=40).run(inputs, SerialEvaluate(model))
+    assert data["loo_error"].item() < 1e-3
+    (found,) = findings(data)
+    assert found.severity == "warning"
+    assert "mean parameters" in found.text
+
+
+# --- samples -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        MonteCarlo(samples=64),
+        SensitivityMonteCarlo(samples=64),
+        QuasiMonteCarlo(samples=64, control="none"),
+        QuasiMonteCarlo(samples=64),
+        Sobol(design="saltelli", samples=32),
+    ],
+    ids=lambda method: f"{method.kind}{getattr(method, 'control', '')}",
+)
+def test_heavy_tails_are_told(method):
+    told = [severities(run(method.model_copy(update={"seed": s}), "exponential")) == ["warning"] for s in range(10)]
+    assert sum(told) >= 8
+    inputs = Inputs({"a": UNIT, "b": Normal(mean=0.0, std=1.0)})
+    model = FunctionModel(lambda p: p[0] + p[1], inputs.names, ("y",), lambda p: [[1.0, 1.0]])
+    told = [
+        findings(method.model_copy(update={"seed": s, "samples": 128}).run(inputs, SerialEvaluate(model)))
+        for s in range(10)
+    ]
+    assert told == [[]] * 10
+
+
+def test_samples_that_look_log_normal_are_told_whatever_their_largest():
+    """1/ω: a third of the sets of 64 samples have no large one."""
+    case = next(case for case in tails.cases() if case.name == "1/ω, cv 1")
+    for seed in range(12):
+        assert severities(MonteCarlo(samples=64, seed=seed).run(case.inputs, Vectorised(case))) == ["warning"]
+
+
+def test_expansions_tell_what_is_beyond_their_samples():
+    case = next(case for case in tails.cases() if case.name == "product, cv 2")
+    told = [severities(Chaos(samples=16, seed=seed).run(case.inputs, Vectorised(case))) for seed in range(4)]
+    assert all("warning" in one for one in told)
+
+
+def test_comparisons_say_what_their_methods_found_out():
+    case = BY_NAME["exponential"]
+    block = {
+        "methods": ({"kind": "monte-carlo", "budgets": (64,)},),
+        "reference": {"kind": "given", "values": {"f": {"mean": 1.6487, "std": 2.1612}}},
+        "textbook": 0,
+        "repeats": 5,
+    }
+    (found,) = findings(Compare.model_validate(block).run(case.inputs, Vectorised(case)))
+    assert found.severity == "warning"
+    assert "monte-carlo with 64 samples" in found.text
+    assert "5 of 5" in found.text or "4 of 5" in found.text
+
+
+# --- indices beyond their bounds -----------------------------------------------------------------------------------
+
+
+def indices(**changes):
+    known = {
+        "sobol_first": [0.5, 0.3],
+        "sobol_first_error": [0.01, 0.01],
+        "sobol_total": [0.6, 0.5],
+        "sobol_total_error": [0.01, 0.01],
+        "total_bound": [0.9, 0.8],
+        "total_bound_error": [0.02, 0.02],
+    }
+    data = {name: (("output", "parameter"), [value]) for name, value in (known | changes).items()}
+    return xr.Dataset(data, coords={"output": ["y"], "parameter": ["a", "b"]})
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ()),
+        ({"sobol_total": [np.nan, np.nan], "sobol_total_error": [np.nan, np.nan]}, ()),
+        ({"sobol_total": [1.02, 0.5], "total_bound": [2.0, 0.8]}, ()),
+        (
+            {"sobol_total": [1.2, 0.5], "total_bound": [2.0, 0.8]},
+            ("of a for y, 1.2, is more than 1, by 20 standard errors",),
+        ),
+        ({"sobol_total": [0.6, 0.95]}, ("of b for y, 0.95, is more than its bound by derivatives, 0.8",)),
+        (
+            {"sobol_first": [0.5, 0.45], "sobol_total": [0.4, 0.5]},
+            ("of a for y, 0.5, is more than the total one, 0.4",),
+        ),
+        ({"sobol_first": [-0.2, 0.3]}, ("of a for y, -0.2, is less than 0",)),
+        ({"sobol_first": [0.59, 0.49]}, ("add up to 1.08 ± 0.014",)),
+    ],
+)
+def test_indices_beyond_their_bounds_are_errors_of_the_program(changes, said):
+    found = list(of_indices(indices(**changes)))
+    assert len(found) == len(said)
+    for finding, words in zip(found, said, strict=True):
+        assert finding.severity == "error"
+        assert words in finding.text
+
+
+# --- coverage ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["hinge", "jump", "oscillation", "absolute value", "peak"])
+def test_intervals_cover_what_is_not_smooth(name):
+    """A small part of the table of docs/measurements.md."""
+    for method in (Chaos(samples=40, fields=False), QuasiMonteCarlo(samples=64, fields=False)):
+        row = measure(BY_NAME[name], method, 24)
+        # 88 % of 24 are 21, three standard errors below that 16.
+        assert (row.covered >= 16 / 24).all(), (method.kind, row.covered)
+        assert (row.claimed[:2] < 6).all(), (method.kind, row.claimed)

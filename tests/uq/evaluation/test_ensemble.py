@@ -1,0 +1,119 @@
+"""Groups of ranks: same numbers as in one process, no hang when something breaks."""
+
+import time
+
+import pytest
+
+from tests.launch import run_script
+
+pytestmark = pytest.mark.mpi
+
+STUDY = """
+import sys
+import time
+import numpy as np
+from mpi4py import MPI
+from forward.model import FunctionModel, SolveError
+from uq.inputs.distributions import Uniform
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.inputs.random_parameters import Inputs
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+
+world, case = MPI.COMM_WORLD, sys.argv[1]
+inputs = Inputs({"a": Uniform(lower=0.0, upper=1.0), "b": Uniform(lower=0.0, upper=1.0)})
+
+def function(p):
+    if case == "fails" and p[0] > 0.95:
+        raise SolveError("too far")
+    if case == "breaks" and world.rank == world.size - 1 and p[0] > 0.5:
+        raise RuntimeError("a mistake in the model")
+    if case == "uneven":
+        time.sleep(0.02 * p[0] * (1 + world.rank))
+    return np.exp(p[0]) * (1 + p[1])
+
+model = FunctionModel(function, ("a", "b"), ("f",), lambda p: [[function(p), np.exp(p[0])]])
+ensemble = Ensemble.split(world)
+counts = [0, 0]
+
+def count(done, failed):
+    counts[0] += done
+    counts[1] += failed
+
+if case == "many":
+    def task(evaluate):
+        # Orders of different length and content in close succession.
+        points = np.random.default_rng(0).random((900, 7, 2))
+        for i, block in enumerate(points):
+            block = block[: 1 + i % 7]
+            evaluations = evaluate(Request(block))
+            assert (evaluations.outputs[:, 0] == [function(p) for p in block]).all()
+        return MonteCarlo(samples=2).run(inputs, evaluate)
+elif case == "models":
+    def task(evaluate):
+        points = np.random.default_rng(0).random((50, 2))
+        one = evaluate(Request(points)).outputs
+        two = evaluate.on(1)
+        assert two.outputs == ("g",)
+        assert (two(Request(points)).outputs == 2 * one).all()
+        assert (evaluate(Request(points)).outputs == one).all()
+        return MonteCarlo(samples=2).run(inputs, evaluate)
+elif case == "method":
+    def task(evaluate):
+        raise SolveError("the method gave up")
+else:
+    def task(evaluate):
+        return SensitivityMonteCarlo(samples=300, seed=3).run(inputs, evaluate)
+
+try:
+    other = FunctionModel(lambda p: 2 * function(p), ("a", "b"), ("g",))
+    data = ensemble.run(model, task, others=[lambda: other], progress=count)
+except SolveError as error:
+    print("caught", error)
+    sys.exit(1)
+if data is not None and case == "many":
+    assert counts == [3 + sum(1 + i % 7 for i in range(900)), 0], counts
+    print("same", counts)
+elif data is not None and case == "models":
+    assert counts == [153, 0], counts
+    print("same", counts)
+elif data is not None:
+    assert data.identical(SensitivityMonteCarlo(samples=300, seed=3).run(inputs, SerialEvaluate(model)))
+    assert counts == [301, int((~data.ok).sum())], counts
+    print("same", counts)
+"""
+
+
+@pytest.mark.parametrize("case", ["plain", "fails", "uneven", "many", "models"])
+@pytest.mark.parametrize("ranks", [1, 2, 3])
+def test_same_numbers_as_in_one_process(ranks, case):
+    done = run_script(ranks, STUDY, case)
+    assert done.returncode == 0, done.stderr
+    assert "same" in done.stdout
+
+
+def test_a_mistake_on_one_rank_stops_all_ranks():
+    begin = time.monotonic()
+    done = run_script(3, STUDY, "breaks")
+    assert done.returncode != 0
+    assert "a mistake in the model" in done.stderr
+    assert time.monotonic() - begin < 60
+
+
+def test_a_method_that_gives_up_releases_the_other_ranks():
+    done = run_script(3, STUDY, "method")
+    assert done.returncode == 1
+    assert "caught the method gave up" in done.stdout
+
+
+def test_ranks_that_cannot_be_split_evenly():
+    script = """
+from mpi4py import MPI
+from uq.evaluation.ensemble import Ensemble
+try:
+    Ensemble.split(MPI.COMM_WORLD, 2)
+except ValueError as error:
+    print(error)
+"""
+    done = run_script(3, script)
+    assert "3 ranks cannot be split into groups of ranks_per_model = 2" in done.stdout

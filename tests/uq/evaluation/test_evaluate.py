@@ -1,0 +1,158 @@
+"""Evaluation in blocks: order, failures, restart."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from forward.model import FunctionModel, SolveError
+from uq.evaluation.checkpoint import Checkpoint, DamagedError
+from uq.evaluation.checkpoint import load as load_evaluations
+from uq.evaluation.evaluate import BLOCKS, Request, SerialEvaluate
+
+
+def product(p):
+    if p[0] > 0.9:
+        message = "too stiff"
+        raise SolveError(message, ["iteration 0"])
+    return [p[0] * p[1], p[0]]
+
+
+MODEL = FunctionModel(product, ("a", "b"), ("ab", "a"), lambda p: [[p[1], p[0]], [1, 0]])
+POINTS = np.random.default_rng(0).random((1000, 2))
+
+
+def test_rows_are_in_the_order_of_the_points():
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS, tangents=True))
+    ok = POINTS[:, 0] <= 0.9
+    np.testing.assert_array_equal(evaluations.ok, ok)
+    np.testing.assert_array_equal(evaluations.outputs[ok, 0], POINTS[ok].prod(axis=1))
+    np.testing.assert_array_equal(evaluations.tangents[ok, 0], POINTS[ok][:, ::-1])
+
+
+def test_failures_are_kept_with_their_reason():
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS))
+    assert len(evaluations.failures) == (POINTS[:, 0] > 0.9).sum()
+    for failure in evaluations.failures:
+        assert failure.reason == "too stiff"
+        assert failure.history == ("iteration 0",)
+        assert failure.parameters == tuple(POINTS[failure.index])
+        assert np.isnan(evaluations.outputs[failure.index]).all()
+
+
+def test_residuals_are_kept(tmp_path):
+    request = Request(POINTS[:200], iterations=3)
+    evaluations = SerialEvaluate(MODEL)(request)
+    ok = POINTS[:200, 0] <= 0.9
+    np.testing.assert_array_equal(evaluations.residuals, np.where(ok, 0.0, np.nan))
+    np.testing.assert_array_equal(evaluations.converged, ok)
+    checkpoint = Checkpoint(tmp_path, "study")
+    assert checkpoint.key(request) != checkpoint.key(replace(request, iterations=4))
+    checkpoint.save("block", evaluations)
+    found = checkpoint.load("block")
+    np.testing.assert_array_equal(found.residuals, evaluations.residuals)
+    np.testing.assert_array_equal(found.converged, evaluations.converged)
+
+
+@pytest.mark.parametrize("n", [1, 2, BLOCKS, BLOCKS + 1, 10_000])
+def test_blocks_cover_all_points_in_order(n):
+    points = np.arange(n, dtype=float)[:, None]
+    blocks = Request(points).blocks()
+    assert len(blocks) <= BLOCKS
+    np.testing.assert_array_equal(np.concatenate([block.points for block in blocks]), points)
+    assert len(Request(points).blocks(n)) == n
+
+
+def test_checkpoint_returns_what_was_saved(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8], tangents=True)
+    evaluations = SerialEvaluate(MODEL)(request)
+    key = checkpoint.key(request)
+    assert not checkpoint.has(key)
+    checkpoint.save(key, evaluations)
+    assert checkpoint.has(key)
+    found = checkpoint.load(key)
+    np.testing.assert_array_equal(found.outputs, evaluations.outputs)
+    np.testing.assert_array_equal(found.tangents, evaluations.tangents)
+    assert found.failures == evaluations.failures
+    checkpoint.consolidate({"/": evaluations})
+    checkpoint.clear()
+    assert not (tmp_path / "evaluations").exists()
+    np.testing.assert_array_equal(load_evaluations(tmp_path / "evaluations.h5").outputs, evaluations.outputs)
+
+
+def test_a_damaged_block_is_computed_again(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8])
+    key = checkpoint.key(request)
+    checkpoint.save(key, SerialEvaluate(MODEL)(request))
+    path = tmp_path / "evaluations" / f"{key}.h5"
+    path.write_bytes(path.read_bytes()[:100])
+    assert not checkpoint.has(key)
+    assert not path.exists()
+
+
+def test_a_flipped_bit_anywhere_is_found(tmp_path, capsys):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8], tangents=True)
+    key = checkpoint.key(request)
+    whole = SerialEvaluate(MODEL)(request)
+    checkpoint.save(key, whole)
+    path = tmp_path / "evaluations" / f"{key}.h5"
+    content = path.read_bytes()
+    for place in np.random.default_rng(1).integers(8 * len(content), size=300):
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        head = 64 <= place // 8 < 512  # what nobody reads
+        assert checkpoint.has(key) == head
+        assert capsys.readouterr().err == (
+            "" if head else f"{path}: damaged, or not what it is named after; computed again\n"
+        )
+
+
+def test_exchanged_blocks_are_found(tmp_path, capsys):
+    checkpoint = Checkpoint(tmp_path, "study")
+    requests = [Request(POINTS[:8]), Request(POINTS[8:16])]
+    keys = [checkpoint.key(request) for request in requests]
+    for key, request in zip(keys, requests, strict=True):
+        checkpoint.save(key, SerialEvaluate(MODEL)(request))
+    one, two = (tmp_path / "evaluations" / f"{key}.h5" for key in keys)
+    one.rename(tmp_path / "other")
+    two.rename(one)
+    (tmp_path / "other").rename(two)
+    assert [checkpoint.has(key) for key in keys] == [False, False]
+    assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_damage_of_all_evaluations_is_found(tmp_path):
+    evaluations = SerialEvaluate(MODEL)(Request(POINTS[:8]))
+    Checkpoint(tmp_path, "study").consolidate({"a/b": evaluations, "c": evaluations})
+    path = tmp_path / "evaluations.h5"
+    assert load_evaluations(path, "c").failures == evaluations.failures
+    with h5py.File(path, "r+") as file:
+        file["a/b/outputs"][0, 0] += 1e-12
+    with pytest.raises(DamagedError, match=r"evaluations.h5: damaged"):
+        load_evaluations(path, "c")
+
+
+def test_a_block_is_found_by_what_was_asked(tmp_path):
+    checkpoint = Checkpoint(tmp_path, "study")
+    request = Request(POINTS[:8])
+    key = checkpoint.key(request)
+    assert key == checkpoint.key(Request(np.asfortranarray(POINTS[:8])))
+    assert key != checkpoint.key(replace(request, tangents=True))
+    assert key != checkpoint.key(Request(POINTS[:8] + 1e-15))
+    assert key != Checkpoint(tmp_path, "another study").key(request)
+
+
+def test_wrong_number_of_outputs_is_the_callers_mistake():
+    model = FunctionModel(lambda p: p, ("a",), ("x", "y"))
+    with pytest.raises(ValueError, match="expected"):
+        SerialEvaluate(model)(Request(np.ones((1, 1))))
+
+
+def test_values_that_are_not_finite_are_failures():
+    model = FunctionModel(lambda p: np.inf, ("a",), ("x",))
+    assert len(SerialEvaluate(model)(Request(np.ones((3, 1)))).failures) == 3

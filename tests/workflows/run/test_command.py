@@ -1,0 +1,274 @@
+"""The command line, run as users run it: exit codes, restart, ranks, bad directories."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.launch import ROOT, environment, on_ranks, run, run_script
+
+TINY = ROOT / "configs" / "tiny.toml"
+TISSUQ = Path(sys.executable).parent / "tissuq"
+
+
+def tissuq(*arguments, ranks=None):
+    return run(ranks, TISSUQ, *arguments)
+
+
+def assert_same_bits(a, b):
+    left, right = (xr.load_dataset(d / "results.nc") for d in (a, b))
+    for name in left.variables:
+        assert left[name].values.tobytes() == right[name].values.tobytes(), name
+    assert (a / "results.nc").read_bytes() == (b / "results.nc").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The tiny study, run in one process."""
+    directory = tmp_path_factory.mktemp("run") / "tiny"
+    done = tissuq("run", TINY, "--out", directory)
+    assert done.returncode == 0, done.stderr
+    return directory
+
+
+def test_check_needs_neither_fenicsx_nor_mpi():
+    script = (
+        "import sys; from workflows.__main__ import main; code = main(['check', sys.argv[1]]); "
+        "heavy = {'dolfinx', 'mpi4py', 'petsc4py', 'ufl', 'scipy', 'xarray', 'matplotlib', 'pyvista', 'h5py'}; "
+        "heavy |= {'inverse'}; "
+        "print(sorted(heavy & set(sys.modules))); sys.exit(code)"
+    )
+    done = run_script(None, script, TINY)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "unknowns    405" in done.stdout
+
+
+def test_uq_does_not_import_fenicsx():
+    script = (
+        "import sys, uq.methods.monte_carlo, uq.evaluation.evaluate, uq.evaluation.checkpoint; "
+        "import uq.inputs.random_parameters; "
+        "print(sorted({'dolfinx', 'mpi4py', 'inverse'} & set(sys.modules)))"
+    )
+    done = run_script(None, script)
+    assert done.stdout.strip() == "[]"
+
+
+def test_check_lists_every_mistake(tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text(TINY.read_text().replace("samples", "sampels").replace('"x-min"', '"x-mid"'))
+    done = tissuq("check", path)
+    assert done.returncode == 2
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert "did you mean 'samples'" in done.stderr
+    assert "did you mean 'x-min'" in done.stderr
+
+
+def test_usage_errors_exit_with_2():
+    assert tissuq("fly").returncode == 2
+    assert tissuq("run").returncode == 2
+    done = tissuq("init", "mcmc")
+    assert done.returncode == 2
+    assert "expected one of: monte-carlo" in done.stderr or "did you mean 'monte-carlo'" in done.stderr
+
+
+def test_init_lists_all_kinds():
+    done = tissuq("init", "list")
+    assert done.returncode == 0
+    assert {"monte-carlo", "sobol", "select", "invert"} <= set(done.stdout.split())
+
+
+def test_init_prints_a_study(tmp_path):
+    path = tmp_path / "new.toml"
+    path.write_text(tissuq("init", "monte-carlo").stdout)
+    assert tissuq("check", path).returncode == 0
+
+
+def test_report_needs_results(tmp_path):
+    done = tissuq("report", tmp_path)
+    assert done.returncode == 1
+    assert "holds no results" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.fem
+def test_the_directory_holds_what_is_promised(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    assert summary["study"] == "tiny"
+    assert summary["method"] == "sensitivity-monte-carlo"
+    assert summary["status"] == "complete"
+    assert (summary["evaluations"], summary["failed"]) == (25, 0)
+    assert summary["wall_seconds"] > 0
+    assert summary["cpu_seconds"] > 0
+    for output in ("uy_max", "ux_max"):
+        assert {"mean", "mean_error", "std", "std_error"} <= set(summary["outputs"][output])
+        assert set(summary["local"][output]) == {"loads.gravity.density", "material.D1"}
+    for name in ("study.toml", "results.nc", "evaluations.h5", "report.html", "fields/displacement.vtu"):
+        assert (finished / name).stat().st_size > 0
+    assert not (finished / "evaluations").exists()
+    assert not list(finished.glob(".*"))
+
+
+@pytest.mark.fem
+def test_a_finished_study_is_not_run_again(finished):
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
+    done = tissuq("run", TINY, "--out", finished)
+    assert done.returncode == 0
+    assert "nothing to do" in done.stdout
+    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.fem
+def test_another_study_is_refused(finished):
+    before = (finished / "study.toml").read_bytes()
+    done = tissuq("run", TINY, "--out", finished, "--set", "method.samples=25")
+    assert done.returncode == 2
+    assert "method.samples: 24 → 25" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert (finished / "study.toml").read_bytes() == before
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [1, 2, 3])
+def test_same_bits_on_any_number_of_groups(finished, tmp_path, ranks):
+    done = tissuq("run", TINY, "--out", tmp_path / "out", ranks=ranks)
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(finished, tmp_path / "out")
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_a_model_on_two_ranks_agrees(finished, tmp_path):
+    done = tissuq(
+        "run",
+        TINY,
+        "--out",
+        tmp_path / "out",
+        "--set",
+        "parallel.ranks_per_model=2",
+        "--set",
+        "parallel.blocks=5",
+        ranks=2,
+    )
+    assert done.returncode == 0, done.stderr
+    one, two = (xr.load_dataset(d / "results.nc") for d in (finished, tmp_path / "out"))
+    for name in ("values", "mean", "std", "derivative", "field_mean", "field_std"):
+        scale = np.abs(one[name].values).max()
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-9, atol=1e-9 * scale)
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
+    arguments = ("run", TINY, "--set", "method.samples=160", "--out")
+    whole = tmp_path / "whole"
+    assert tissuq(*arguments, whole, ranks=2).returncode == 0
+    broken = tmp_path / "broken"
+    chance = random.Random(1)
+    kills = 0
+    for ranks in (2, 1, 3, 2):
+        process = subprocess.Popen(
+            on_ranks(ranks, TISSUQ, *arguments, broken),
+            env=environment(),
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        # Wait until blocks are being finished, so that the kill falls into the work.
+        begin, before = time.monotonic(), len(list(broken.glob("evaluations/*.h5")))
+        while process.poll() is None and time.monotonic() - begin < 60:
+            if len(list(broken.glob("evaluations/*.h5"))) > before + chance.randint(1, 12):
+                break
+            time.sleep(0.02)
+        kills += process.poll() is None
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        # The ranks are children of mpirun in sessions of their own.
+        subprocess.run(["pkill", "-9", "-f", str(broken)], check=False)
+    assert kills >= 3
+    done = tissuq(*arguments, broken, ranks=3)
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(whole, broken)
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_more_ranks_than_work(tmp_path):
+    done = tissuq("run", ROOT / "configs" / "beam-local.toml", "--out", tmp_path / "out", ranks=2)
+    assert done.returncode == 2
+    said = [line for line in done.stderr.splitlines() if "ranks were started" in line]
+    assert len(said) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.fem
+def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
+    changes = (
+        "parameters.loads.gravity.density={kind='gamma', shape=1, scale=800, shift=100}",  # a long tail
+        "model.solver.minimum_load_step=1.0",
+        "model.solver.iterations=10",
+    )
+    done = tissuq("run", TINY, "--out", tmp_path / "out", *(word for c in changes for word in ("--set", c)))
+    assert done.returncode == 3, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["status"] == "partial"
+    assert summary["failed"] == len(summary["failures"]) > 0
+    assert "of the load" in summary["failures"][0]["reason"]
+    assert f"{summary['failed']} of 24 samples have no answer" in summary["note"]
+    assert "their errors do not cover" in summary["note"]
+    assert summary["failures"][0]["reason"] in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks_per_model", [1, 2])
+def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_model):
+    heavy = "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"
+    share = f"parallel.ranks_per_model={ranks_per_model}"
+    done = tissuq("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, ranks=2)
+    assert done.returncode == 1
+    assert done.stderr.count("failed: the model has no answer at the mean parameters") == 1
+
+
+@pytest.mark.fem
+def test_a_model_without_answer_exits_with_1_and_one_line(tmp_path):
+    heavy = ["--set", "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"]
+    done = tissuq("run", TINY, "--out", tmp_path / "out", *heavy)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("failed: the model has no answer at the mean parameters: stopped at")
+    assert "Traceback" not in done.stderr
+
+
+def test_directories_that_cannot_be_used(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").write_text("precious")
+    for directory, message in ((file / "out", "Not a directory"), (foreign, "is not empty and holds no study")):
+        done = tissuq("run", TINY, "--out", directory)
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert (foreign / "thesis.tex").read_text() == "precious"
+
+
+def test_point_outside_the_body(tmp_path):
+    path = tmp_path / "study.toml"
+    outside = '{ name = "p", kind = "displacement", at = [1, 0, 0], component = "x" },\n]\n\n[parameters]'
+    path.write_text(TINY.read_text().replace("]\n\n[parameters]", outside))
+    done = tissuq("run", path, "--out", tmp_path / "out")
+    assert done.returncode == 2, done.stderr
+    assert "model.outputs[2].at" in done.stderr
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)

@@ -1,0 +1,54 @@
+"""What `tissuq check` predicts."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workflows.config.study import load
+from workflows.run.plan import parts, plan
+
+CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("form", ["displacement", "mixed"])
+def test_predicted_times_grow_with_the_body(cell, form):
+    found = []
+    for n in (1, 2, 8, 30):
+        changes = [f"model.body.cells=[{n}, {n}, {n}]", f"model.body.cell={cell}", f"model.formulation={form}"]
+        study = load(CONFIGS / "tiny.toml", changes)
+        found.append([part.seconds for part in parts(study)])
+    assert np.isfinite(found).all()
+    assert (np.array(found) > 0).all()
+    grown = np.diff(np.sum(found, axis=1))
+    assert (grown > 0).all()
+    assert sum(found[0]) < 60  # little but the start of the program
+
+
+def test_the_plan_is_the_sum_of_its_parts(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    study = load(CONFIGS / "beam.toml")
+
+    def shown(groups):
+        lines = plan(study, groups)
+        (first,) = [i for i, line in enumerate(lines) if line.startswith("time ")]
+        return lines[first:]
+
+    told = "\n".join(shown(1))
+    for what in ("start", "compilation", "first solve", "its tangents", "reference factor", "256 further", "report"):
+        assert what in told
+    total, *each = [float(re.search(r"([0-9.]+) s", line)[1]) for line in shown(1)]
+    assert sum(each) == pytest.approx(total, abs=0.6)
+    assert float(re.search(r"about ([0-9.]+) s", shown(8)[0])[1]) < total  # samples are shared, the rest is not
+    (tmp_path / "tissuq" / "forms-0" / "libffcx_form").mkdir(parents=True)
+    assert "  compilation" not in "\n".join(shown(1))
+    assert "are not compiled yet" in shown(1)[-1]
+
+
+def test_newton_from_zero_takes_longer_than_corrections():
+    study, textbook = (load(CONFIGS / "beam.toml", [f"model.solver={kind}"]) for kind in ("predict-correct", "newton"))
+    seconds = [{part.what.partition(",")[0]: part.seconds for part in parts(one)} for one in (study, textbook)]
+    assert seconds[1]["256 further solves"] > 5 * seconds[0]["256 further solves"]
+    assert "reference factor" not in seconds[1]

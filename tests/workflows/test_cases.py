@@ -1,0 +1,102 @@
+"""Cases in which a wrong number was once printed, each with what is right now (docs/measurements.md)."""
+
+import json
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+from workflows.__main__ import main
+
+CASES = Path(__file__).parent.parent / "cases"
+DONE, PARTIAL = 0, 3
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a case, with changes as on the command line: exit code, summary and results."""
+
+    def run(name, *changes):
+        settings = [word for change in changes for word in ("--set", change)]
+        code = main(["run", str(CASES / f"{name}.toml"), "--quiet", "--out", str(tmp_path / "out"), *settings])
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        return code, summary, xr.load_dataset(tmp_path / "out" / "results.nc")
+
+    return run
+
+
+def severities(summary):
+    return [one["severity"] for one in summary["findings"]]
+
+
+def within(found, name, right, errors=3.0):
+    """Whether a number is right within a few of the errors that it claims."""
+    return abs(found[name] - right) <= errors * found[f"{name}_error"]
+
+
+def test_a_borehole(run):
+    # 2 million scrambled Sobol' points by NumPy alone: 73.73894(2) and 28.5958(2).
+    code, summary, _ = run("borehole")
+    flow = summary["outputs"]["flow"]
+    assert (code, summary["findings"]) == (DONE, [])
+    assert within(flow, "mean", 73.73894)
+    assert within(flow, "std", 28.5958)
+    assert flow["mean_error"] < 0.01
+    assert flow["std_error"] < 0.01
+
+
+def test_a_parameter_without_influence_has_no_index(run):
+    code, summary, _ = run("borehole-bounds", "method.samples=128")
+    r = summary["sobol"]["flow"]["r"]
+    assert code == DONE
+    assert r["total"] < 1e-4
+    assert r["total_error"] < 1e-4
+
+
+def test_an_oscillation_that_no_expansion_knows(run):
+    code, summary, results = run("oscillation")
+    assert code == PARTIAL
+    assert severities(summary) == ["error"]
+    assert "explains nothing" in summary["findings"][0]["text"]
+    assert within(summary["outputs"]["y"], "std", 0.7069)  # a million points
+    assert "sobol" not in summary or results["sobol_total"].isnull().all()
+
+
+@pytest.mark.fem
+def test_a_column_beyond_buckling(run):
+    code, summary, results = run("column", "method.samples=20")
+    load = results["points"].sel(parameter="loads.traction.size")
+    assert code == PARTIAL
+    assert "warning" in severities(summary)
+    assert any("no stable equilibrium" in one["text"] for one in summary["findings"])
+    assert not results["ok"].where(load > 125, drop=True).any()  # Euler's load is 122 Pa
+    assert results["ok"].where(load < 117, drop=True).all()
+
+
+@pytest.mark.fem
+def test_an_expansion_of_the_column(run):
+    code, summary, _ = run("column", "method.kind=chaos", "method.samples=12", "method.fields=false")
+    assert code == PARTIAL
+    assert "error" in severities(summary)
+
+
+@pytest.mark.fem
+def test_a_prior_that_locks(run):
+    code, summary, results = run("locking")
+    assert (code, summary["findings"]) == (DONE, [])
+    assert abs(results["nominal"].item()) == pytest.approx(0.0956, abs=1e-4)
+
+
+@pytest.mark.fem
+def test_displacements_alone_say_that_they_lock(run):
+    _, summary, results = run("locking", "model.formulation=displacement")
+    assert abs(results["nominal"].item()) == pytest.approx(0.0689, abs=1e-4)
+    assert severities(summary) == ["warning", "warning"]
+    assert "0.09561 m" in summary["findings"][0]["text"]
+
+
+@pytest.mark.fem
+def test_linear_cells_say_that_they_lock(run):
+    _, summary, results = run("cantilever")
+    assert severities(summary) == ["warning", "warning"]
+    assert f"tip = {results['nominal'].item():.4g} m, there 0.016" in summary["findings"][0]["text"]

@@ -1,0 +1,1 @@
+"""Estimates and their errors: moments, indices, and what speaks against them."""

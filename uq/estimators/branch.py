@@ -1,0 +1,139 @@
+"""Where the model has no answer: what samples that failed, or were refused as unstable, say about the parameters.
+
+A perfect column under a dead load has no stable straight state beyond its first buckling load, and the one it takes
+then is not found from the straight ones. What is computed from the other samples is about the branch that they are on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import Finding, FloatArray, Stability
+from uq.evaluation.evaluate import Evaluations
+from uq.inputs.random_parameters import Inputs
+
+SHOWN = 0.1  # share of the largest that a parameter must have in a direction to be named
+
+
+def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> Iterator[Finding]:
+    """Say where samples have no answer, and what that does to estimates.
+
+    Parameters
+    ----------
+    inputs, evaluations
+        What was sampled, and what came of it.
+    continued
+        Whether estimates rest on a function that goes on where the model has no answer (an expansion).
+    """
+    known, ok = evaluations.stability, evaluations.ok
+    refused = ~ok & (known >= Stability.REFUSED)
+    count, total = int(refused.sum()), len(known)
+    if count:
+        where = separated(inputs, evaluations.points, refused, ok)
+        text = f"{count} of {total} samples have no stable equilibrium, the body buckles there: {where}. "
+        if continued:
+            text += (
+                "The expansion goes on where the stable branch has ended: its moments, quantiles and indices cannot be "
+                "trusted. Keep the parameters where all samples have an answer, or give the body the imperfection or "
+                "the small load that decides how it buckles."
+            )
+        else:
+            text += "Estimates are of the stable branch alone, that is, over the samples that have an answer."
+        yield Finding("error" if continued else "warning", text)
+    failed = ~ok & ~refused
+    count = int(failed.sum())
+    if count:
+        text = f"{count} of {total} samples have no answer: {separated(inputs, evaluations.points, failed, ok)}. "
+        if continued:
+            text += (
+                "The expansion goes on there as it is elsewhere, which neither samples nor errors cover: its moments, "
+                "quantiles and indices hold only if the outputs do so too."
+            )
+        else:
+            text += "They are missing from the estimates, or are taken to follow the control."
+        yield Finding("warning", text)
+    missed = int((known == Stability.MISSED).sum())
+    if missed:
+        screened = int((known == Stability.SCREENED).sum())
+        text = (
+            f"The screen of stability passed {missed} unstable equilibri{'um' if missed == 1 else 'a'} that counting "
+            f"found: of the {screened} states that were only screened, some may be unstable too. "
+            'Count all of them with model.solver.kind = "newton".'
+        )
+        yield Finding("error" if screened else "warning", text)
+
+
+def separated(inputs: Inputs, points: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> str:
+    """Say in words what tells the points (n, d) that were refused (n,) from those that have an answer.
+
+    That is a bound of one parameter, or of a sum of several where that tells them better.
+    """
+    if not ok.any():
+        return "no sample has an answer"
+    names = inputs.names
+    bounds = [_bound(points[:, i], refused, ok) for i in range(len(names))]
+    i = min(range(len(names)), key=lambda k: bounds[k][0])
+    wrong, above = bounds[i]
+    if wrong > 0 and len(names) > 1:
+        scaled = (points - inputs.mean) / inputs.std
+        both = refused | ok
+        rows = np.column_stack([np.ones(both.sum()), scaled[both]])
+        weights = np.linalg.lstsq(rows, np.where(refused[both], 1.0, -1.0), rcond=None)[0][1:]
+        weights /= np.abs(weights).max()
+        along = scaled @ weights
+        together, above_together = _bound(along, refused, ok)
+        if together < wrong and above_together:
+            shown = [k for k in np.argsort(-np.abs(weights)) if abs(weights[k]) >= SHOWN]
+            terms = " ".join(f"{'−' if weights[k] < 0 else '+'} {abs(weights[k]):.2g} {names[k]}" for k in shown)
+            what = f"{terms.removeprefix('+ ')} (deviations from the means in standard deviations)"
+            return _words(what, along, refused, ok, together, above=True)
+    return _words(names[i], points[:, i], refused, ok, wrong, above=above)
+
+
+def _bound(x: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> tuple[int, bool]:
+    """Smallest number of points on the wrong side of a bound of x (n,), and whether the refused ones are above it."""
+    both = refused | ok
+    order = np.argsort(x[both], kind="stable")
+    bad = refused[both][order]
+    below = np.concatenate([[0], np.cumsum(bad)])  # refused ones among the k smallest
+    k = np.arange(len(below))
+    above = (below + (len(bad) - k - (bad.sum() - below))).min()  # refused below the bound, answered above it
+    under = ((k - below) + (bad.sum() - below)).min()
+    return int(min(above, under)), bool(above <= under)
+
+
+def _words(
+    what: str, x: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_], wrong: int, *, above: bool
+) -> str:
+    sign = 1 if above else -1
+    first = sign * (sign * x[refused]).min()
+    sides = "≥" if above else "≤", "≤" if above else "≥"
+    if wrong == 0:
+        last = sign * (sign * x[ok]).max()
+        return f"all with {what} {sides[0]} {first:.5g}, none with {what} {sides[1]} {last:.5g}"
+    inside = int(((sign * x >= sign * first) & ok).sum())
+    if 2 * inside > ok.sum():
+        return "no bound of the parameters tells them from the others"
+    others = "1 other has" if inside == 1 else f"{inside} others have"
+    return f"all with {what} {sides[0]} {first:.5g}, where {others} an answer"
+
+
+def counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
+    """Number of states by how their stability was looked at; empty where no model has equilibria."""
+    known = np.concatenate([np.zeros(0, dtype=np.int8), *(found.stability for found in evaluations)])
+    if not known.any():
+        return {}
+    return {one.name.lower(): int((known == one).sum()) for one in Stability}
+
+
+def by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
+    """Return what is known (n,) of the stability at points (n, d): of several solves there, that which says least."""
+    known: dict[bytes, list[int]] = {}
+    for point, one in zip(evaluations.points, evaluations.stability.tolist(), strict=True):
+        known.setdefault(point.tobytes(), []).append(one)
+    refused = int(Stability.REFUSED)
+    found = [known.get(np.ascontiguousarray(point).tobytes(), [0]) for point in points]
+    return np.array([max(several) if max(several) >= refused else min(several) for several in found], dtype=np.int8)

@@ -1,0 +1,250 @@
+"""Finished blocks on disk: one file each while a study runs, one file of all at its end.
+
+A file is written under another name and renamed into place, so that whatever carries its final name is whole. A block
+is found by what was asked, not by who asked: its name is a hash of the points and of everything else that decides the
+answer. It carries a checksum of its content together with its name, so that neither damage nor an exchange of files
+passes for an answer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields, is_dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import h5py
+import numpy as np
+
+from forward.machine import write_whole
+from forward.model import WORK, ModelError, Stability
+from uq.evaluation.evaluate import Evaluations, Failure
+
+_HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
+
+
+class DamagedError(OSError):
+    """A file of evaluations is not as it was written."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: damaged, or not what it is named after")
+
+
+class Code(Protocol):
+    """What of the user's code was loaded in the course of a run, beyond what the identity of the study covers."""
+
+    def note(self) -> str:
+        """Say what it is, to be kept with a block."""
+
+    def objection(self, note: str) -> str | None:
+        """Say why a block with a note is no longer valid, if it is not."""
+
+
+class Checkpoint:
+    """The finished blocks of a study in a directory.
+
+    Parameters
+    ----------
+    directory
+        The results directory; blocks are kept in its folder `evaluations`.
+    identity
+        Text that decides the answers besides the request (the study, the version of the program).
+    code
+        Knows what of the user's code was loaded in the course of the run.
+    """
+
+    def __init__(self, directory: Path, identity: str, code: Code | None = None) -> None:
+        self._directory = directory
+        self._folder = directory / "evaluations"
+        self._identity = identity.encode()
+        self._code = code
+
+    def key(self, block: object) -> str:
+        """Return the name of a block: of a request, or of whatever else says what was asked."""
+        return digest(block, self._identity).hex()[:24]
+
+    def has(self, key: str) -> bool:
+        """Whether a block is finished; one that is damaged, or that answers another request, is removed.
+
+        Raises
+        ------
+        ModelError
+            If a file of the user's from which it follows has changed.
+        """
+        path = self._path(key)
+        if not path.exists():
+            return False
+        try:
+            _check(path, key)
+            with h5py.File(path, "r") as file:
+                note = str(file.attrs["note"])
+        except DamagedError as error:
+            sys.stderr.write(f"{error}; computed again\n")
+            path.unlink(missing_ok=True)
+            return False
+        objection = self._code.objection(note) if self._code is not None else None
+        if objection is not None:
+            message = f"{self._directory}: {objection}"
+            raise ModelError(message)
+        return True
+
+    def save(self, key: str, block: Evaluations) -> None:
+        """Write a finished block and rename it into place."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        _write(self._path(key), {"/": block}, key, "" if self._code is None else self._code.note())
+
+    def load(self, key: str) -> Evaluations:
+        """Read a finished block, as `has` has found it."""
+        return _read(self._path(key), "/")
+
+    def drop(self, keys: Iterable[str]) -> None:
+        """Remove blocks that are no longer needed, since what follows from them is kept."""
+        for key in keys:
+            self._path(key).unlink(missing_ok=True)
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{key}.h5"
+
+    def consolidate(self, evaluations: Mapping[str, Evaluations]) -> None:
+        """Write all evaluations as `evaluations.h5`, each under its name; the blocks stay until `clear`."""
+        _write(self._directory / "evaluations.h5", evaluations)
+
+    def clear(self) -> None:
+        """Remove the files of the blocks: the study is finished."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def digest(value: object, before: bytes = b"") -> bytes:
+    """Return a hash of a value, after some text: of arrays by their numbers, of dataclasses by their fields."""
+    hashed = hashlib.sha256(before)
+    _feed(hashed, value)
+    return hashed.digest()
+
+
+def _feed(digest: Any, value: object) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(repr((value.shape, value.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif is_dataclass(value):
+        digest.update(type(value).__name__.encode())
+        for field in fields(value):
+            digest.update(field.name.encode())
+            _feed(digest, getattr(value, field.name))
+    else:
+        digest.update(repr(value).encode())
+
+
+def _write(
+    path: Path,
+    blocks: Mapping[str, Evaluations],
+    key: str = "",
+    note: str = "",
+) -> None:
+    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    creation.set_userblock(_HEAD)
+    with in_memory(creation) as file:
+        for name, block in blocks.items():
+            group = file.require_group(name)
+            group["points"] = block.points
+            group["outputs"] = block.outputs
+            group["seconds"] = block.seconds
+            group["work"] = block.work
+            group["work"].attrs["columns"] = list(WORK)
+            group["residuals"] = block.residuals
+            group["converged"] = block.converged
+            group["stability"] = block.stability
+            group["stability"].attrs["values"] = [known.name.lower().replace("_", " ") for known in Stability]
+            group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
+            if block.tangents is not None:
+                group["tangents"] = block.tangents
+            if block.fields.size:
+                group["fields"] = block.fields
+            group.attrs["note"] = note
+        body = image(file)  # without the head
+    write_whole(path, _checksum(BytesIO(body), key).encode().ljust(_HEAD, b"\0") + body)
+
+
+def in_memory(creation: Any = None) -> h5py.File:
+    """Return a new HDF5 file in memory: one on disk that cannot be written to the end kills its process.
+
+    `creation` is the list of properties that the file is created with.
+    """
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
+    access.set_fapl_core(2**20, backing_store=False)
+    return h5py.File(h5py.h5f.create(b"memory", fcpl=creation, fapl=access))
+
+
+def image(file: h5py.File) -> bytes:
+    """Return the bytes of a file in memory."""
+    file.flush()
+    return bytes(file.id.get_file_image())
+
+
+def _checksum(file: BinaryIO, key: str) -> str:
+    """Return a hash of the rest of a file, and of what the file was asked for."""
+    return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()  # type: ignore[arg-type]
+
+
+def _check(path: Path, key: str) -> None:
+    """Raise `DamagedError` unless all is as it was written, before HDF5, which a bit can crash, sees it."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+            if _checksum(file, key).encode() == head[:64]:
+                return
+            if not key and head.startswith(b"\x89HDF"):  # of a version that wrote none
+                return
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedError(path) from error
+    raise DamagedError(path)
+
+
+def load(path: Path, name: str = "/") -> Evaluations:
+    """Read evaluations, such as those of an `evaluations.h5`, which has several under their names if there were.
+
+    Parameters
+    ----------
+    path, name
+        The file, and the group in it.
+
+    Raises
+    ------
+    DamagedError
+        If the file cannot be read, or its content is not what was written.
+    FileNotFoundError
+        If there is none.
+    """
+    _check(path, "")
+    return _read(path, name)
+
+
+def _read(path: Path, name: str) -> Evaluations:
+    try:
+        with h5py.File(path, "r") as whole:
+            file = whole[name]
+            failures = tuple(
+                Failure(f["index"], tuple(f["parameters"]), f["reason"], tuple(f["history"]), f["inadmissible"])
+                for f in json.loads(file["failures"][()])
+            )
+            return Evaluations(
+                np.asarray(file["points"]),
+                np.asarray(file["outputs"]),
+                np.asarray(file["tangents"]) if "tangents" in file else None,
+                failures,
+                np.asarray(file["seconds"]),
+                np.asarray(file["work"]),
+                np.asarray(file["residuals"]),
+                np.asarray(file["converged"]),
+                np.asarray(file["stability"]),
+                np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
+            )
+    except (OSError, KeyError, ValueError) as error:
+        raise DamagedError(path) from error

@@ -1,0 +1,477 @@
+"""Evaluation of a model at many points: what a sampling method calls, and what it gets back.
+
+Work is cut into blocks of fixed size; sums of fields are formed in index order inside a block and the blocks are added
+in order. So the result does not depend on who computed which block.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
+from uq.inputs.coordinates import Coordinates
+
+TOGETHER = 16  # realisations whose part of a compact sum is formed at once
+BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A point without an answer, and why; whether there is no model there at all, or only no solution was found."""
+
+    index: int
+    parameters: tuple[float, ...]
+    reason: str
+    history: tuple[str, ...] = ()
+    inadmissible: bool = False
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Outputs of a model at n points.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    outputs
+        Outputs (n, m); NaN in the rows that failed.
+    tangents
+        dψ/dω (n, m, d) where they were asked for, NaN where a solve failed.
+    failures
+        The points that failed, by index.
+    seconds
+        Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
+    work
+        Counts (n, k) of the operations `forward.model.WORK`.
+    residuals
+        Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
+    converged
+        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
+    stability
+        Whether each state (n,) was counted or only screened, or refused as unstable: `forward.model.Stability`.
+    fields
+        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
+        `CompactSum`, the rows of these points themselves, one point after the other.
+    """
+
+    points: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray | None
+    failures: tuple[Failure, ...]
+    seconds: FloatArray
+    work: NDArray[np.int64]
+    residuals: FloatArray
+    converged: NDArray[np.bool_]
+    stability: NDArray[np.int8]
+    fields: FloatArray
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which points (n,) have an answer."""
+        good = np.ones(len(self.points), dtype=bool)
+        good[[failure.index for failure in self.failures]] = False
+        return good
+
+
+class FieldSum(Protocol):
+    """A quantity of each realisation's state that is summed as the realisations stream by."""
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
+
+
+@runtime_checkable
+class CompactSum(FieldSum, Protocol):
+    """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
+
+    `on` returns the few; the sum is formed where blocks are added, so that files and messages stay small.
+    """
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, k, U)."""
+
+
+class JointSum(Protocol):
+    """A quantity of the states of several points that follow each other, summed as these rows of points stream by.
+
+    A row is never cut by blocks; one in which a solve failed adds nothing.
+    """
+
+    @property
+    def size(self) -> int:
+        """Number K of points in a row."""
+
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
+        """Return the function states (K, U_local) → rows (k, U_local) to be summed, for one group's model."""
+
+
+class Start(Protocol):
+    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+
+    A dataclass, by whose fields the blocks that were started from it are found again.
+    """
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction of the state that is linear in the coordinates, with the factor at `point`.
+
+    Attributes
+    ----------
+    point
+        Parameters (d,) of the expansion.
+    state
+        State (U,) there, in canonical order.
+    slopes
+        Derivatives (d, U) of the state along the coordinates, or none (0, U): then the solver starts from the state at
+        `point`.
+    coordinates
+        The coordinates.
+    spread
+        Standard deviations (d,) of the parameters, for the screen of stability.
+    """
+
+    point: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+    coordinates: Coordinates
+    spread: FloatArray | None = None
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+        state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+        reference = Reference(self.point, state, self.spread)
+        if len(slopes) == 0:
+            return lambda _: state, reference
+        here = self.coordinates.of(self.point)
+        return lambda parameters: state + (self.coordinates.of(parameters) - here) @ slopes, reference
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of an evaluation.
+
+    Attributes
+    ----------
+    points
+        Parameters (n, d).
+    tangents
+        Whether the derivatives of the outputs are wanted.
+    fields
+        What is summed of the states.
+    start
+        Where the solver starts.
+    iterations
+        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
+    model
+        Which of the models that the evaluation has; `Evaluate.on` sets it.
+    joint
+        What is summed, in place of `fields`, of the states of points that follow each other.
+    """
+
+    points: FloatArray
+    tangents: bool = False
+    fields: FieldSum | None = None
+    start: Start | None = None
+    iterations: int | None = None
+    model: int = 0
+    joint: JointSum | None = None
+
+    def blocks(self, most: int | None = None) -> list[Request]:
+        """Cut into blocks that depend on the number of points, of those that belong together, and `most` only."""
+        together = 1 if self.joint is None else self.joint.size
+        size = together * max(1, -(-len(self.points) // (together * (most or BLOCKS))))
+        return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
+
+
+class Evaluate(Protocol):
+    """A model seen by a sampling method: points in, evaluations out."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state, see `ForwardModel.displacements`."""
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+
+    def on(self, model: int) -> Evaluate:
+        """Return the evaluation of another of the models (meshes, solvers), by its number; this one has number 0."""
+
+
+@dataclass(frozen=True)
+class SerialEvaluate:
+    """Evaluation of a model in this process, point after point.
+
+    Parameters
+    ----------
+    model
+        The model.
+    progress
+        Told the numbers of points that were done and that failed since it was last told.
+    others
+        Models number 1, 2, … that a method may ask for.
+    """
+
+    model: ForwardModel
+    progress: Callable[[int, int], None] = lambda done, failed: None
+    others: tuple[ForwardModel, ...] = ()
+
+    def on(self, model: int) -> SerialEvaluate:
+        """Return the evaluation of another of the models."""
+        return replace(self, model=(self.model, *self.others)[model])
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.model.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.model.displacements
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+        solver = BlockSolver(self.model, request)
+        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
+
+
+class Recorder:
+    """An evaluation that keeps what it returned, and says what that has cost.
+
+    Attributes
+    ----------
+    log
+        Every evaluation, in order, of all models; shared by the evaluations of the other models.
+    models
+        The number of the model of each.
+    """
+
+    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: int = 0) -> None:
+        self._evaluate = evaluate
+        self._model = model
+        self.log: list[Evaluations] = [] if whole is None else whole.log
+        self.models: list[int] = [] if whole is None else whole.models
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self._evaluate.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self._evaluate.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self._evaluate.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self._evaluate.displacements
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+        evaluations = self._evaluate(request)
+        # Derivatives and fields are the method's own business.
+        self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
+        self.models.append(self._model)
+        return evaluations
+
+    def on(self, model: int) -> Recorder:
+        """Return the evaluation of another of the models, with the same log."""
+        return Recorder(self._evaluate.on(model), self, model)
+
+    @property
+    def solves(self) -> int:
+        """Number of points so far."""
+        return sum(len(evaluations.points) for evaluations in self.log)
+
+    @property
+    def seconds(self) -> float:
+        """Processor time (s) of all points so far."""
+        return float(sum(evaluations.seconds.sum() for evaluations in self.log))
+
+
+class BlockSolver:
+    """Solves the blocks of one request on one group's model; collective over the group."""
+
+    def __init__(self, model: ForwardModel, request: Request) -> None:
+        self._model = model
+        self._tangents = request.tangents
+        self._iterations = request.iterations
+        self._row = request.fields.on(model) if request.fields is not None else None
+        self._compact = isinstance(request.fields, CompactSum)
+        self._joint = request.joint.on(model) if request.joint is not None else None
+        self._together = 1 if request.joint is None else request.joint.size
+        self._predict: Callable[[FloatArray], FloatArray] | None = None
+        self._reference: Reference | None = None
+        if request.start is not None:
+            self._predict, self._reference = request.start.on(model)
+
+    def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
+        """Solve at points (n, d); the fields are complete on the group's first rank only."""
+        model, n = self._model, len(points)
+        m, d = len(model.outputs), len(model.parameters)
+        outputs = np.full((n, m), np.nan)
+        tangents = np.full((n, m, d), np.nan) if self._tangents else None
+        seconds = np.empty(n)
+        work = np.zeros((n, len(WORK)), dtype=np.int64)
+        residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
+        stability = np.zeros(n, dtype=np.int8)
+        failures: list[Failure] = []
+        rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
+        states: list[FloatArray] = []  # of a row that is not complete
+        for i, point in enumerate(points):
+            begin = time.process_time()
+            row = None
+            try:
+                start = self._predict(point) if self._predict is not None else None
+                solution = model.solve(point, start, self._reference, self._iterations)
+                if self._row is not None:
+                    row = self._row(solution, point)
+                if tangents is not None:
+                    # One derivative for each parameter or for each output, whichever are fewer.
+                    tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
+            except SolveError as error:
+                row = None
+                lost = isinstance(error, InadmissibleError)
+                failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history, lost))
+                work[i], stability[i] = error.work.as_array(), error.stability
+            else:
+                outputs[i] = solution.outputs
+                work[i] = solution.work.as_array()
+                residuals[i], converged[i] = solution.residual, solution.converged
+                stability[i] = solution.stability
+                states += [solution.state] if self._joint is not None else []
+            if self._joint is not None and (i + 1) % self._together == 0:
+                row = self._joint(np.array(states)) if len(states) == self._together else None
+                states = []
+            if row is not None and (self._compact or not rows):
+                rows.append(row.copy())
+            elif row is not None:
+                # In place: these are the largest arrays there are, and a new one for each sample takes longer.
+                rows[0] += row
+            seconds[i] = time.process_time() - begin
+            progress(1, int(bool(failures) and failures[-1].index == i))
+        fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
+        if fields is None:
+            fields = np.zeros((0, 0))
+        return Evaluations(
+            points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, stability, fields
+        )
+
+
+def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
+    """Put the blocks of a request for these fields together, or several evaluations, in their order."""
+    merger = Merger(fields)
+    for block in blocks:
+        merger.add(block)
+    return merger.result()
+
+
+class Merger:
+    """Adds blocks in their order, keeping one sum of fields.
+
+    Parameters
+    ----------
+    fields
+        The sum that the blocks are parts of; none where each of them is complete.
+
+    Attributes
+    ----------
+    count
+        Number of blocks added so far.
+    """
+
+    def __init__(self, fields: FieldSum | None = None) -> None:
+        self._compact = fields if isinstance(fields, CompactSum) else None
+        self._blocks: list[Evaluations] = []
+        self._fields = np.zeros((0, 0))
+        self._waiting: list[tuple[FloatArray, FloatArray]] = []
+        self._points = 0
+        self.count = 0
+        self._failures: list[Failure] = []
+
+    def add(self, block: Evaluations) -> None:
+        """Append the next block."""
+        if block.fields.size and self._compact is None:
+            self._add(block.fields)
+        elif block.fields.size:
+            solved = block.points[block.ok]
+            self._waiting.append((solved, block.fields.reshape(len(solved), -1, block.fields.shape[1])))
+            if sum(len(points) for points, _ in self._waiting) >= TOGETHER:
+                self._form()
+        self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
+        self._points += len(block.points)
+        self.count += 1
+        self._blocks.append(replace(block, fields=np.zeros((0, 0))))
+
+    def _form(self) -> None:
+        """Add what waits, in one product: the sum is read and written once for all of it."""
+        if self._compact is not None and self._waiting:
+            points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+            self._add(self._compact.total(points, rows))
+            self._waiting.clear()
+
+    def _add(self, part: FloatArray) -> None:
+        self._fields = part if self._fields.size == 0 else self._fields + part
+
+    def result(self) -> Evaluations:
+        """Return everything added so far as one."""
+        self._form()
+
+        def joined(pick: Callable[[Evaluations], FloatArray | None]) -> Iterator[FloatArray]:
+            for block in self._blocks:
+                part = pick(block)
+                if part is not None:
+                    yield part
+
+        tangents = list(joined(lambda b: b.tangents))
+        return Evaluations(
+            np.concatenate(list(joined(lambda b: b.points))),
+            np.concatenate(list(joined(lambda b: b.outputs))),
+            np.concatenate(tangents) if tangents else None,
+            tuple(self._failures),
+            np.concatenate(list(joined(lambda b: b.seconds))),
+            np.concatenate([b.work for b in self._blocks]),
+            np.concatenate(list(joined(lambda b: b.residuals))),
+            np.concatenate([b.converged for b in self._blocks]),
+            np.concatenate([b.stability for b in self._blocks]),
+            self._fields,
+        )

@@ -1,0 +1,208 @@
+"""Evaluations and solves of a model by one group of ranks, which keeps what it has solved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Reference, Solution
+from uq.evaluation.evaluate import BlockSolver, Evaluations, Request, merge
+
+if TYPE_CHECKING:
+    from uq.evaluation.checkpoint import Checkpoint
+
+BLOCKS = 16  # that a request is cut into: an interruption costs at most one of them
+LEAST = 4  # points of a block, unless a request has fewer
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What decides on a block: of a start, its point, since its state is rounded where ranks share a model."""
+
+    label: str
+    points: FloatArray
+    tangents: bool
+    iterations: int | None
+    start: FloatArray
+
+
+@dataclass(frozen=True)
+class KeptEvaluate:
+    """Evaluation of a model in one group of ranks; blocks that are on disk are read. Collective over the group.
+
+    Parameters
+    ----------
+    model
+        The model of the group.
+    group
+        Its communicator.
+    checkpoint
+        Where finished blocks are kept and found.
+    label
+        What the model is of beside the study.
+    progress
+        Told the numbers of points that were done and that failed since it was last told.
+
+    Attributes
+    ----------
+    keys
+        Names of the blocks so far.
+    """
+
+    model: ForwardModel
+    group: Any
+    checkpoint: Checkpoint
+    label: str
+    progress: Callable[[int, int], None]
+    keys: list[str] = field(default_factory=list)
+
+    def on(self, model: int) -> KeptEvaluate:
+        """Return itself: it has one model."""
+        return self
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.model.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.model.displacements
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request, without sums of fields."""
+        solver: BlockSolver | None = None
+        found = []
+        for block in request.blocks(max(1, min(BLOCKS, len(request.points) // LEAST))):
+            key = self.checkpoint.key(self._asked(block))
+            self.keys.append(key)
+            kept = self.group.bcast(self._read(key) if self.group.rank == 0 else None)
+            if kept is None:
+                solver = solver or BlockSolver(self.model, request)
+                kept = solver(block.points, self.progress)
+                if self.group.rank == 0:
+                    self.checkpoint.save(key, kept)
+            else:
+                self.progress(len(kept.points), len(kept.failures))
+            found.append(kept)
+        return merge(found, request.fields)
+
+    def _asked(self, block: Request) -> _Asked:
+        start = np.asarray(getattr(block.start, "point", np.zeros(0)), dtype=float)
+        return _Asked(self.label, block.points, block.tangents, block.iterations, start)
+
+    def _read(self, key: str) -> Evaluations | None:
+        return self.checkpoint.load(key) if self.checkpoint.has(key) else None
+
+    def forget(self) -> None:
+        """Remove the blocks: what follows from them is kept."""
+        if self.group.rank == 0:
+            self.checkpoint.drop(self.keys)
+        self.keys.clear()
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What decides on a solve."""
+
+    label: str
+    parameters: FloatArray
+
+
+@dataclass(frozen=True)
+class KeptModel:
+    """A model in one group of ranks whose states are kept: one that is on disk is where the solver starts, and ends.
+
+    The state meets the tolerance as it is, so that a solution found again is the same. Collective over the group.
+
+    Parameters
+    ----------
+    model, group, checkpoint, label
+        As of `KeptEvaluate`.
+
+    Attributes
+    ----------
+    keys
+        Names of the solves so far.
+    """
+
+    model: ForwardModel
+    group: Any
+    checkpoint: Checkpoint
+    label: str
+    keys: list[str] = field(default_factory=list)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.model.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.model.outputs
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self.model.displacements
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self.model.differentiable
+
+    def solve(
+        self,
+        parameters: FloatArray,
+        start: FloatArray | None = None,
+        reference: Reference | None = None,
+        iterations: int | None = None,
+    ) -> Solution:
+        """Return the solution at parameters (d,), from its state if that is kept; errors as of the model."""
+        key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
+        self.keys.append(key)
+        state = None
+        if self.group.rank == 0 and self.checkpoint.has(key):
+            state = self.checkpoint.load(key).fields
+        state = self.group.bcast(state)
+        if state is not None:
+            return self.model.solve(parameters, self.model.scatter(state)[0], reference, iterations)
+        solution = self.model.solve(parameters, start, reference, iterations)
+        whole = self.model.gather(np.asarray(solution.state)[None])
+        if self.group.rank == 0 and whole is not None:
+            work = solution.work.as_array()[None]
+            good, none = np.ones(1, dtype=bool), np.zeros(1)
+            outputs = np.asarray(solution.outputs)[None]
+            known = np.array([solution.stability], dtype=np.int8)
+            block = Evaluations(np.asarray(parameters)[None], outputs, None, (), none, work, none, good, known, whole)
+            self.checkpoint.save(key, block)
+        return solution
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """As of the model."""
+        return self.model.gather(rows)
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """As of the model."""
+        return self.model.scatter(rows)
+
+    def forget(self) -> None:
+        """Remove the states: what follows from them is kept."""
+        if self.group.rank == 0:
+            self.checkpoint.drop(self.keys)
+        self.keys.clear()

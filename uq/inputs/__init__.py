@@ -1,0 +1,1 @@
+"""Random parameters: distributions, their joint law, designs and quadrature."""

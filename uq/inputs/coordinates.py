@@ -1,0 +1,57 @@
+"""The coordinates in which outputs are taken for polynomials: the parameters, or logarithms of some, standardised.
+
+Polynomials of a log-normal ω are not even dense in the functions of ω with a variance (O. G. Ernst, A. Mugler, H.-J.
+Starkloff, E. Ullmann, ESAIM: M2AN 46 (2012) 317–339), and moments of those that are fitted are made where no sample is.
+In ln ω they are Hermite's, and converge. Which distributions have polynomials of the logarithm their blocks say
+(`uq.inputs.distributions`).
+
+With x_i = ω_i or ln ω_i, t = (x − E x)/std x has mean 0 and variance 1, and derivatives along t follow by the chain
+rule: ∂ψ/∂t_i = (∂ω_i/∂t_i) ∂ψ/∂ω_i, with the `steps` ∂ω_i/∂t_i = std x_i, times ω_i where x_i is its logarithm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The map between d parameters ω and their standardised coordinates t.
+
+    Attributes
+    ----------
+    logarithmic
+        Which x (d,) are the logarithm of the parameter.
+    centre, scale
+        Expected values and standard deviations (d,) of x.
+    """
+
+    logarithmic: NDArray[np.bool_]
+    centre: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def linear(cls, centre: FloatArray, scale: FloatArray) -> Coordinates:
+        """Return those without logarithms."""
+        return cls(np.zeros(len(centre), dtype=bool), centre, scale)
+
+    def of(self, points: FloatArray) -> FloatArray:
+        """Return t (…, d) at points (…, d)."""
+        x = np.asarray(points, dtype=float)
+        if self.logarithmic.any():
+            x = np.where(self.logarithmic, np.log(np.where(self.logarithmic, x, 1.0)), x)
+        return np.asarray((x - self.centre) / self.scale)
+
+    def points(self, t: FloatArray) -> FloatArray:
+        """Return ω (…, d) at coordinates t (…, d)."""
+        x = self.centre + self.scale * t
+        return np.asarray(np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x))
+
+    def steps(self, points: FloatArray) -> FloatArray:
+        """Return ∂ω/∂t (…, d) at points (…, d)."""
+        return np.asarray(self.scale * np.where(self.logarithmic, points, 1.0))

@@ -1,0 +1,214 @@
+"""The random parameters of a study: marginal distributions, independent or joined by a Gaussian copula."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from uq.inputs.coordinates import Coordinates
+from uq.inputs.distributions import Distribution
+from uq.inputs.sampling import sobol_points
+
+CORNERS = 12  # parameters up to which all corners of a box are looked at
+FARTHEST = 6.0  # standard deviations: beyond are 2e-9
+POINTS = 2**16
+
+
+class Restriction(Protocol):
+    """A part of the space of the parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that it depends on."""
+
+    def admissible(self, values: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
+        """Return which of these parameters, arrays (n,) by name, are in it (n,)."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """d random parameters.
+
+    Parameters
+    ----------
+    marginals
+        Distribution of each parameter by its name; the order is that of the parameter vectors.
+    correlations
+        Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
+        mapped through the marginals. Pairs that are left out are uncorrelated.
+
+    admissible
+        Where there is a model: the distribution is restricted to it where that is asked for (`admitted`), points are
+        not.
+
+    Raises
+    ------
+    ValueError
+        If the correlations are of unknown names or do not form a positive definite matrix.
+    """
+
+    marginals: dict[str, Distribution]
+    correlations: tuple[tuple[str, str, float], ...] = ()
+    admissible: Restriction | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        for a, b, rho in self.correlations:
+            for name in (a, b):
+                if name not in self.marginals:
+                    message = f"correlation of '{name}', expected one of: {', '.join(self.names)}"
+                    raise ValueError(message)
+            if a == b or not -1 < rho < 1:
+                message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
+                raise ValueError(message)
+        if not self.correlations:
+            return
+        smallest = np.linalg.eigvalsh(self._copula).min()
+        if smallest <= 0:
+            message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
+            raise ValueError(message)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.marginals)
+
+    @property
+    def independent(self) -> bool:
+        """Whether no two parameters are correlated."""
+        return not any(rho for *_, rho in self.correlations)
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """Expected values (d,)."""
+        return np.array([m.moments[0] for m in self.marginals.values()])
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviations (d,)."""
+        return np.array([m.moments[1] for m in self.marginals.values()])
+
+    @cached_property
+    def _columns(self) -> dict[Distribution, list[int]]:
+        """Positions of the parameters of each distribution."""
+        columns: dict[Distribution, list[int]] = {}
+        for i, marginal in enumerate(self.marginals.values()):
+            columns.setdefault(marginal, []).append(i)
+        return columns
+
+    @cached_property
+    def _copula(self) -> FloatArray:
+        """Correlation matrix (d, d) of the underlying normal variables."""
+        matrix = np.eye(len(self.marginals))
+        names = list(self.marginals)
+        for a, b, rho in self.correlations:
+            i, j = names.index(a), names.index(b)
+            matrix[i, j] = matrix[j, i] = rho
+        return matrix
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """What outputs are taken for polynomials of."""
+        centre, scale = np.array([m.of_coordinate for m in self.marginals.values()]).reshape(-1, 2).T
+        return Coordinates(np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale)
+
+    @cached_property
+    def correlation(self) -> FloatArray:
+        """Correlation (d, d) of the coordinates, by Gauss–Hermite quadrature for correlated pairs."""
+        correlation = np.eye(len(self.marginals))
+        nodes, weights = np.polynomial.hermite_e.hermegauss(64)  # type: ignore[no-untyped-call]
+        weights = weights / weights.sum()
+        marginals, d = list(self.marginals.values()), len(self.marginals)
+
+        def coordinate(i: int, normals: FloatArray) -> FloatArray:
+            points = np.ones((normals.size, d))
+            points[:, i] = marginals[i].from_normal(normals.ravel())[0]
+            return self.coordinates.of(points)[:, i].reshape(normals.shape)
+
+        for a, b, rho in self.correlations:
+            i, j = self.names.index(a), self.names.index(b)
+            second = rho * nodes[:, None] + np.sqrt(1 - rho**2) * nodes[None, :]
+            x, y = coordinate(i, nodes), coordinate(j, second)
+            correlation[i, j] = correlation[j, i] = float(np.einsum("i,j,i,ij->", weights, weights, x, y))
+        return correlation
+
+    def points(self, uniforms: FloatArray) -> FloatArray:
+        """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
+        if not self.correlations:
+            points = np.empty_like(uniforms)
+            for marginal, columns in self._columns.items():  # many parameters have few distributions
+                points[:, columns] = marginal.quantile(uniforms[:, columns])
+            return points
+        from scipy.special import ndtri
+
+        return self.from_normals(ndtri(uniforms))[0]
+
+    def from_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map independent standard normal coordinates x (n, d) to the parameters ω (n, d).
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            ω, and the derivatives ∂ω_i/∂x_j (n, d, d).
+        """
+        factor = np.linalg.cholesky(self._copula)
+        columns = zip(self.marginals.values(), (normals @ factor.T).T, strict=True)
+        values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
+        return np.column_stack(values), np.column_stack(slopes)[:, :, None] * factor
+
+    def within(self, admissible: Restriction) -> Inputs:
+        """Return the same parameters, restricted."""
+        return replace(self, admissible=admissible)
+
+    def allowed(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Return at which points (n, d) there is a model, (n,)."""
+        if self.admissible is None:
+            return np.ones(len(points), dtype=bool)
+        return np.broadcast_to(self.admissible.admissible(dict(zip(self.names, points.T, strict=True))), len(points))
+
+    @cached_property
+    def admitted(self) -> float:
+        """Probability of parameters for which there is a model."""
+        return self.admitted_at(1.0)
+
+    def admitted_at(self, width: float) -> float:
+        """Return that probability where the standard normal coordinates are wider by a factor.
+
+        It is 1 where no corner of the box of these coordinates is beyond what is admissible: the moduli of materials
+        are linear in each constant, and least at a corner. Else it is the share of scrambled Sobol' points.
+        """
+        if self.admissible is None or not self.admissible.names:
+            return 1.0
+        names = [name for name in self.names if name in self.admissible.names]
+        pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)
+        few = Inputs({name: self.marginals[name] for name in names}, pairs)
+        if len(names) <= CORNERS:
+            z = width * np.array([-FARTHEST, FARTHEST])
+            supports = [marginal.support for marginal in few.marginals.values()]
+            if None not in supports and self._admits_corners(names, supports):  # a larger box, which takes no quantiles
+                return 1.0
+            if self._admits_corners(names, [marginal.from_normal(z)[0] for marginal in few.marginals.values()]):
+                return 1.0
+        from scipy.special import ndtri
+
+        points = few.from_normals(width * ndtri(sobol_points(0, 0, 0, POINTS, len(names))))[0]
+        return float(self.admissible.admissible(dict(zip(names, points.T, strict=True))).mean())
+
+    def _admits_corners(self, names: Sequence[str], ends: Sequence[Any]) -> bool:
+        """Whether there is a model at every corner of a box with these two ends along each of the named parameters."""
+        assert self.admissible is not None
+        corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
+        return bool(self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all())
+
+
+@runtime_checkable
+class Restricted(Protocol):
+    """A method that some parameters do not allow."""
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters do not allow it, or nothing."""

@@ -1,0 +1,1 @@
+"""What a study can do with random parameters: one method in each file."""

@@ -1,0 +1,337 @@
+"""Polynomial chaos for outputs and for the whole displacement field: moments, Sobol' indices, and a function to keep.
+
+The expansion in orthonormal polynomials is fitted to values and gradients (`uq.surrogates.regression`), or projected by
+Gauss quadrature. Moments and Sobol' indices are sums of squares of its coefficients. Which functions it has, and when
+there are samples enough, is decided by the leave-one-out error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from forward.model import FloatArray
+from uq.estimators.doubts import of_centre, of_field, of_indices
+from uq.estimators.indices import coefficient_moments, shares
+from uq.estimators.moments import Quantiles, Z, quantiles, student
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.findings import add
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.methods.stopping import Amount
+from uq.surrogates.basis import gauss, orthonormal
+from uq.surrogates.field_regression import FIELD_DICTIONARY, Projections, solved
+from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from uq.surrogates.regression import (
+    DICTIONARY,
+    FULL,
+    ROWS_PER_TERM,
+    TRUSTED,
+    Data,
+    Regression,
+    candidates_of,
+    fit_best,
+    rows_of,
+    whole,
+)
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Probability = Annotated[float, Field(gt=0, lt=1)]
+LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
+GROWTH = 1.5  # of the design, from one look at the tolerance to the next
+DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
+QUARTERS = 4
+BINS = 80
+
+
+class Chaos(Amount):
+    """Polynomial chaos, by regression on values and gradients or by Gauss quadrature.
+
+    Parameters
+    ----------
+    samples, budget_seconds
+        As of `Amount`; there is one solve more, at the mean parameters.
+    tolerance
+        Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
+    max_order
+        Largest order that is tried; the order of the projection.
+    gradients
+        Whether derivatives are fitted too, where the model has them.
+    fit
+        "regression" on a scrambled Sobol' design, or "projection" by a tensor product of Gauss rules with
+        ``max_order + 2`` points for each parameter, on values only: one more than orthogonality needs, so that there
+        is something left to measure the error by.
+    seed
+        Seed of the design; sample z of a seed is the same in every study.
+    quantiles
+        Probabilities of the quantiles of the outputs; without any there are no densities either.
+    fields
+        Whether the displacement field is expanded too, node by node.
+    """
+
+    kind: Literal["chaos"] = "chaos"
+    max_order: Annotated[int, Field(ge=1, le=20)] = 6
+    gradients: bool = True
+    fit: Literal["regression", "projection"] = "regression"
+    seed: Annotated[int, Field(ge=0)] = 0
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
+    fields: bool = True
+
+    def check_amount(self) -> None:
+        """Raise a ValueError where no amount is given, or where one is that a projection cannot heed."""
+        if self.fit == "regression":
+            super().check_amount()
+        elif self.asked:
+            message = (
+                "gives samples, tolerance or budget_seconds, expected none: a projection takes (max_order + 2)^d points"
+            )
+            raise ValueError(message)
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
+        if self.fit == "projection":
+            return int(1 + (self.max_order + 2) ** dimension)
+        return 1 + (self.samples or LARGEST)
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters cannot be expanded in, or nothing."""
+        return objection(inputs, self.kind)
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Solve at the points of the design, fit and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            Estimates by output, Sobol' indices, the expansion itself (`load` makes it callable) and, with `fields`,
+            moments and coefficients by node and component; see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, or at too many samples for an expansion of order 1.
+        ValueError
+            If the parameters are correlated.
+        """
+        return expansion_dataset(self, evaluate, self.expand(inputs, evaluate))
+
+    def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
+        """Solve at the points of the design and fit; errors as of `run`."""
+        refusal = self.objection(inputs)
+        if refusal is not None:
+            raise ValueError(refusal)
+        evaluate = Recorder(evaluate)
+        centre = linearise(inputs, evaluate)
+        projection = self.fit == "projection"
+        gradients = self.gradients and evaluate.differentiable and not projection
+        limit = self.planned(len(inputs.names)) - 1
+        grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
+        expand_fields = self.fields and centre.state.size > 0
+        if projection:
+            bases = whole(inputs, self.max_order)
+        else:
+            dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
+            bases = candidates_of(inputs, self.max_order, limit * rows_of(inputs, gradients=gradients), dictionary)
+        largest = orthonormal(inputs, bases.all)
+        fields = None
+        if expand_fields:
+            fields = Projections(largest, centre.state, gradients, grid, weights)
+        rounds: list[Evaluations] = []
+        count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
+        while True:
+            points = (
+                grid
+                if grid is not None
+                else inputs.points(sobol_points(self.seed, 0, count, target, len(inputs.names)))
+            )
+            rounds.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
+            count = target
+            evaluations = merge(rounds)
+            data = Data.of(evaluations, inputs, weights)
+            fitted = fit_best(bases, largest, data)
+            reached = float(fitted.relative.max())
+            paid = count + self.affordable(evaluate.solves, evaluate.seconds)
+            target = int(min(limit, np.ceil(GROWTH * count), paid))
+            if self.met(reached) or target <= count:
+                break
+        error = f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
+        stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
+        return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
+
+
+def objection(inputs: Inputs, kind: str) -> str | None:
+    """Say why a method of this kind cannot expand in these parameters, or nothing."""
+    if not inputs.independent:
+        return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
+    return None
+
+
+def _first(inputs: Inputs, *, gradients: bool) -> int:
+    """Samples before a tolerance is first looked at: enough for all products of two parameters, or for all slopes."""
+    d = len(inputs.names)
+    terms = (d + 1) * (d + 2) // 2 if d <= FULL else 2 * (d + 1)
+    return max(4, -(-ROWS_PER_TERM * terms // rows_of(inputs, gradients=gradients)))
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """An expansion with the evaluations that it was made from, and why they were enough."""
+
+    centre: Linearisation
+    evaluations: Evaluations
+    regression: Regression
+    stopped: str
+
+
+# --- what follows from an expansion --------------------------------------------------------------------------------
+
+
+class Report(Protocol):
+    """Settings of a method that reports an expansion."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the points at which the expansion is drawn for quantiles and densities."""
+
+    @property
+    def quantiles(self) -> tuple[float, ...]:
+        """Probabilities of the quantiles."""
+
+    @property
+    def fields(self) -> bool:
+        """Whether the displacement field is reported."""
+
+
+def expansion_dataset(
+    method: Report, evaluate: Evaluate, expanded: Expanded, further: Mapping[str, FloatArray] | None = None
+) -> xr.Dataset:
+    """Return the results of an expansion; `further` errors (m,) of "mean" and "std" are known from elsewhere."""
+    centre, evaluations, regression = expanded.centre, expanded.evaluations, expanded.regression
+    inputs, basis, data, fit = regression.inputs, regression.basis, regression.data, regression.fit
+    supports = [m.support for m in inputs.marginals.values()]
+    estimates = regression.estimates()
+    for name, error in (further or {}).items():
+        estimates[f"{name}_error"] = np.hypot(estimates[f"{name}_error"], error)
+    lower, upper = (
+        np.array([edge if s is None else s[side] for s, edge in zip(supports, edges, strict=True)])
+        for side, edges in enumerate((data.points.min(axis=0), data.points.max(axis=0)))
+    )
+    by_output, by_pair = ("output",), ("output", "parameter")
+    dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
+    dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
+        {
+            **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
+            "loo_error": (by_output, fit.relative),
+            "points": (("sample", "parameter"), evaluations.points),
+            "values": (("sample", "output"), evaluations.outputs),
+            "ok": (("sample",), evaluations.ok),
+            "order": ((), fit.chosen.order),
+            "q": ((), fit.chosen.q),
+            "multi_index": (("term", "parameter"), basis.indices),
+            "coefficients": (("term", "output"), fit.coefficients),
+            "coordinate_logarithmic": (("parameter",), basis.coordinates.logarithmic.astype(np.int64)),
+            "coordinate_mean": (("parameter",), basis.coordinates.centre),
+            "coordinate_std": (("parameter",), basis.coordinates.scale),
+            "recurrence_alpha": (("parameter", "degree"), basis.alpha),
+            "recurrence_beta": (("parameter", "degree"), basis.beta),
+            "range_lower": (("parameter",), lower),
+            "range_upper": (("parameter",), upper),
+        }
+    )
+    if method.quantiles:
+        dataset = dataset.assign(_distribution(method, regression))
+    add(dataset, *regression.doubts(evaluate.outputs))
+    missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
+    add(dataset, *of_centre(evaluate.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
+    if evaluations.fields.size and method.fields:
+        fields, rest = _field_estimates(evaluations, centre, evaluate.displacements, regression, estimates)
+        dataset = dataset.assign(fields)
+        add(dataset, *of_field(rest, TRUSTED))
+    dataset.attrs["stopped"] = expanded.stopped
+    failed = int((~evaluations.ok).sum())
+    if failed:
+        dataset.attrs["note"] = (
+            f"{failed} of {len(evaluations.ok)} samples have no answer; the expansion is fitted to the others and "
+            "continues them to where the model has no answer"
+        )
+    return dataset
+
+
+def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
+
+    Where the moments are those of the samples, so are the quantiles; densities are of the expansion with errors at
+    samples that it has not seen, drawn independently.
+    """
+    inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
+    uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
+    drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
+    central = np.quantile(drawn, method.quantiles, axis=0)
+    # No quantile moves by more than the function does. Quarters of the points are Sobol' points too.
+    quarters = [np.quantile(part, method.quantiles, axis=0) for part in np.split(drawn, QUARTERS)]
+    factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
+    error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
+    found = Quantiles(central, central - Z * error, central + Z * error, error)
+    if regression.controlled.any():
+        rough = regression.controlled
+        if np.ptp(data.weights) == 0:
+            of_samples = quantiles(data.values, method.quantiles)
+            found = Quantiles(*(np.where(rough, *pair) for pair in zip(of_samples, found, strict=True)))
+        which = np.random.default_rng(method.seed).choice(
+            len(data.values), len(drawn), p=data.weights / data.weights.sum()
+        )
+        drawn = np.where(rough, drawn + fit.unseen[which], drawn)
+    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
+    return {
+        **found.variables,
+        "density": (("output", "bin"), np.array([density for density, _ in counts])),
+        "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
+    }
+
+
+def _field_estimates(
+    evaluations: Evaluations,
+    centre: Linearisation,
+    count: int,
+    regression: Regression,
+    estimates: dict[str, FloatArray],
+) -> tuple[dict[str, tuple[tuple[str, ...], FloatArray]], float]:
+    """Coefficients, mean and standard deviation of the displacements, and what the fit leaves of them.
+
+    Their errors are those of the outputs in proportion to the residuals, which come from the same rows. Standard
+    deviations have the variance that is left as a further error: residuals, as much larger where the fit has not seen
+    the sample as those of the outputs are.
+
+    Returns
+    -------
+    dict, float
+        The variables, and the rest over the standard deviation of the whole field.
+    """
+    basis, fit = regression.basis, regression.fit
+    projections = evaluations.fields[fit.chosen.which][:, :count]
+    coefficients = solved(fit, projections)
+    squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
+    coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
+    moments = coefficient_moments(coefficients.T, basis.indices)
+    fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
+    rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
+    seen = shares(fit.loo**2, fit.squares / rows)
+    left = max(1.0, float(seen.max(initial=0.0))) * squares / rows
+    for name in ("mean", "std"):
+        share = np.sqrt(shares(estimates[f"{name}_error"] ** 2, fit.squares).max())
+        error = share * np.sqrt(squares)
+        if name == "std":
+            error = np.hypot(error, shares(left, 2 * moments["std"]))
+        fields[f"{name}_error"] = error.reshape(-1, 3)
+    variables = {
+        **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
+        "field_coefficients": (("term", "node", "component"), coefficients.reshape(len(coefficients), -1, 3)),
+    }
+    variance = float((moments["std"] ** 2).sum())
+    return variables, float(np.sqrt(left.sum() / (variance + left.sum()))) if left.sum() > 0 else 0.0

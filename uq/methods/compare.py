@@ -1,0 +1,637 @@
+"""Error against cost: methods at growing budgets, each with independent repeats, against a reference.
+
+A repeat r of a method with n samples gives an estimate e_rn and the standard error that it claims. Over R repeats the
+root mean square of e_rn − e*, with the reference e*, is what the method really errs, whatever it claims; the share of
+repeats whose claimed 95 % interval holds e* says whether its claims are honest. Plain Monte Carlo needs (s/RMSE)²
+samples for the same error, where s² is the variance of one sample: σ² of the output for the mean.
+
+Points that several methods or budgets ask for are solved once, and charged to each as if it had solved them itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
+
+import numpy as np
+from pydantic import Field, ValidationError, model_serializer, model_validator
+
+from forward.model import Finding, FloatArray, SolveError
+from forward.settings import Settings
+from uq.estimators.moments import ESTIMATES, half_width, ratio
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.findings import add, findings
+from uq.inputs.random_parameters import Inputs, Restricted
+from uq.inputs.sampling import random_points
+from uq.methods.chaos import Chaos
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.multilevel_chaos import MultilevelChaos
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Methods that estimate moments from samples.
+Sampling = MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | Chaos | MultilevelChaos
+ESTIMATED = ("mean", "std")
+TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # of results, what no restart gives again
+RESOLVED = 2.0  # an error is measured where it is so many times the reference's own
+ROUNDING = 16 * np.finfo(float).eps  # relative error of a reference that claims less
+UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
+TIGHT, TEXTBOOK, REFINED = 1, 2, 3  # numbers of the models beside the study's own
+TIGHTER = 1e-3  # tolerances of the solver that makes the reference, relative to those of the study
+
+
+class Known(Settings):
+    """Mean and standard deviation of an output with their standard errors, in the unit of the output."""
+
+    mean: float
+    std: Annotated[float, Field(gt=0)]
+    mean_error: Annotated[float, Field(ge=0)] = 0.0
+    std_error: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Given(Settings):
+    """A reference that is known: the moments of every output, by its name."""
+
+    kind: Literal["given"] = "given"
+    values: dict[str, Known]
+
+
+class Entry(Settings):
+    """A method to be compared: its block, with `budgets` in the place of `samples`, and a `name` if it needs one.
+
+    Parameters
+    ----------
+    name
+        Name in results; the kind of the method by default.
+    budgets
+        Numbers of samples, each of which the method must admit.
+    sampling
+        The method with the first budget; its keys stand beside `name` and `budgets`.
+    """
+
+    name: str = ""
+    budgets: tuple[int, ...]
+    sampling: Annotated[Sampling, Field(discriminator="kind")]
+
+    @property
+    def label(self) -> str:
+        """The name in results."""
+        return self.name or self.sampling.kind
+
+    def at(self, budget: int, seed: int = 0) -> Sampling:
+        """Return the method with so many samples, for its moments only."""
+        kept = {"samples": budget, "seed": seed, **_MOMENTS_ONLY}
+        return type(self.sampling).model_validate(self.sampling.model_dump() | kept)
+
+    def shortage(self, dimension: int) -> str | None:
+        """Say that there are too few samples for what is fitted to them, or nothing."""
+        if not isinstance(self.sampling, MultilevelChaos):
+            return None
+        return self.sampling.model_copy(update={"samples": min(self.budgets)}).shortage(dimension)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        """Put the keys of the method apart."""
+        if not isinstance(value, dict):
+            return value
+        expected = "expected different numbers of samples, such as [16, 32, 64]"
+        if "budgets" not in value:
+            message = f"gives no budgets, {expected}"
+            raise ValueError(message)
+        budgets = value["budgets"]
+        whole = isinstance(budgets, tuple) and all(isinstance(n, int) and n >= 2 for n in budgets)
+        if not (whole and budgets and len(set(budgets)) == len(budgets)):
+            message = f"budgets = {list(budgets) if isinstance(budgets, tuple) else budgets}, {expected}"
+            raise ValueError(message)
+        refused = [name for name in _NOT_ITS_OWN if name in value]
+        if refused:
+            message = f"gives {' and '.join(refused)}, expected none: a comparison says it for all methods"
+            raise ValueError(message)
+        own = {name: value[name] for name in ("name", "budgets") if name in value}
+        rest = {name: item for name, item in value.items() if name not in own}
+        return {**own, "sampling": {**rest, "samples": budgets[0]}}
+
+    @model_validator(mode="after")
+    def _check_budgets(self) -> Entry:
+        for budget in self.budgets:
+            try:
+                self.at(budget)
+            except ValidationError as error:
+                reason = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+                message = f"budget {budget}: {reason}"
+                raise ValueError(message) from None
+        return self
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> Any:
+        """Put the keys of each method beside those of the entry, as files have them."""
+        reference = handler(core)
+        entry = handler.resolve_ref_schema(reference)
+        own = {name: entry["properties"][name] for name in ("name", "budgets")}
+        methods = [handler.resolve_ref_schema(m) for m in entry["properties"]["sampling"]["oneOf"]]
+        entry.clear()
+        entry["oneOf"] = [
+            method
+            | {
+                "properties": {k: v for k, v in method["properties"].items() if k not in _NOT_ITS_OWN} | own,
+                "required": ["kind", "budgets"],
+            }
+            for method in methods
+        ]
+        return reference
+
+    @model_serializer(mode="wrap")
+    def _joined(self, handler: Any) -> dict[str, Any]:
+        block: dict[str, Any] = handler(self)
+        sampling = {name: item for name, item in block.pop("sampling").items() if name not in _NOT_ITS_OWN}
+        return {"name": block["name"], **sampling, "budgets": block["budgets"]}
+
+
+_NOT_ITS_OWN = ("samples", "tolerance", "budget_seconds", "seed", "quantiles", "fields")
+_MOMENTS_ONLY = {"fields": False, "quantiles": ()}
+
+
+class Compare(Settings):
+    """Error against run time: methods at growing budgets, repeated, against a reference.
+
+    Parameters
+    ----------
+    methods
+        Blocks of methods with `budgets`, a list of numbers of samples, in the place of `samples`.
+    reference
+        What estimates are compared with: a block of a method, which is solved to tighter tolerances, or values of
+        ``kind = "given"``.
+    repeats
+        Independent repeats R of every method. Errors are known to 1/√(2R), 16 % for 20.
+    seed
+        Repeat r has the same points in every study of that seed.
+    textbook
+        Draws that are also solved by the textbook (Newton's method from zero with a new factor for every step): what
+        plain Monte Carlo would cost so, and what the solver's tolerance leaves. 0 for none.
+    mesh_error
+        Whether the body is also solved at the mean parameters with twice the cells in each direction: the difference
+        says where the error of the mesh takes over.
+    """
+
+    kind: Literal["compare"] = "compare"
+    methods: tuple[Entry, ...]
+    reference: Annotated[Given | Sampling, Field(discriminator="kind")] = Chaos(samples=256, max_order=8)
+    repeats: Annotated[int, Field(ge=2)] = 20
+    seed: Annotated[int, Field(ge=0)] = 0
+    textbook: Annotated[int, Field(ge=0)] = 8
+    mesh_error: bool = False
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Compare:
+        if not self.methods:
+            message = "gives no methods, expected at least one"
+            raise ValueError(message)
+        names = [entry.label for entry in self.methods]
+        for name in dict.fromkeys(names):
+            if names.count(name) > 1:
+                message = f"{names.count(name)} methods are called '{name}', expected different names"
+                raise ValueError(message)
+        return self
+
+    @property
+    def open_ended(self) -> bool:
+        """Methods that ask for the same points share them: fewer solves than planned may be enough."""
+        return True
+
+    def planned(self, dimension: int) -> int:
+        """Largest number of different solves with that many parameters."""
+        shared: dict[tuple[object, ...], int] = {}
+        apart = 0
+        for entry in self.methods:
+            stream, top = _stream(entry.sampling), max(entry.budgets)
+            if stream is None:
+                apart += sum(entry.at(budget).planned(dimension) - 1 for budget in entry.budgets)
+            else:
+                shared[stream] = max(shared.get(stream, 0), top)
+                apart += entry.at(top).planned(dimension) - 1 - top
+        reference = 0 if isinstance(self.reference, Given) else self.reference.planned(dimension)
+        others = 2 * self.textbook + int(self.mesh_error)
+        return 1 + reference + others + self.repeats * (sum(shared.values()) + apart)
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why one of the methods cannot take these parameters, or nothing."""
+        methods = [self.reference, *(entry.sampling for entry in self.methods)]
+        objections = (method.objection(inputs) for method in methods if isinstance(method, Restricted))
+        return next((objection for objection in objections if objection), None)
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Run all methods at all budgets, repeat by repeat, and compare.
+
+        Returns
+        -------
+        xarray.Dataset
+            The reference (`mean`, `mean_error`, …) by output; all estimates by row (a method at a budget) and repeat;
+            what they err and cost by row; see docs/results.md. All but `TIMES` is the same after a restart.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, or the reference none.
+        ValueError
+            If a method cannot take the parameters or needs derivatives that the model does not have, or if a given
+            reference leaves an output out.
+        """
+        objection = self.objection(inputs)
+        if objection is not None:
+            raise ValueError(objection)
+        memory = _Memory(evaluate)
+        centre = linearise(inputs, memory)
+        floors = self._floors(inputs, evaluate, memory, centre)
+        reference = self._find_reference(inputs, evaluate)
+        rows = [(entry, budget) for entry in self.methods for budget in sorted(entry.budgets)]
+        trials: list[list[_Trial]] = [[] for _ in rows]
+        for r in range(self.repeats):
+            # The largest budget first: it asks for the points of the others, in one request.
+            for i, (entry, budget) in reversed(list(enumerate(rows))):
+                trials[i].append(_try(entry.at(budget, _seed(self.seed, r)), inputs, memory))
+        dataset = local_dataset(inputs, evaluate, centre, fields=False)
+        dataset = dataset.assign(_compared(rows, trials, reference, floors))
+        names = list(dict.fromkeys(dataset["row_method"].to_numpy().tolist()))
+        dataset = dataset.assign_coords(estimator=names)
+        budgets = f"{len(self.methods)} methods at {len(rows)} budgets"
+        dataset.attrs["stopped"] = f"{budgets} in all, {self.repeats} repeats of each, as asked"
+        add(dataset, *_doubts(rows, trials))
+        lost = sum(trial.reason is not None for row in trials for trial in row)
+        if lost:
+            reason = next(trial.reason for row in trials for trial in row if trial.reason is not None)
+            dataset.attrs["note"] = f"{lost} repeats gave no estimate and are left out: {reason}"
+        return dataset
+
+    def _find_reference(self, inputs: Inputs, evaluate: Evaluate) -> dict[str, FloatArray]:
+        """Return the estimates of the reference by output."""
+        if not isinstance(self.reference, Given):
+            found = self.reference.model_copy(update=_MOMENTS_ONLY).run(inputs, evaluate.on(TIGHT))
+            return {name: found[name].to_numpy() for name in ESTIMATES}
+        missing = [name for name in evaluate.outputs if name not in self.reference.values]
+        if missing:
+            message = f"the reference gives no values of {', '.join(missing)}, expected those of every output"
+            raise ValueError(message)
+        values = [self.reference.values[name] for name in evaluate.outputs]
+        return {name: np.array([getattr(known, name) for known in values]) for name in ESTIMATES}
+
+    def _floors(
+        self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation
+    ) -> dict[str, tuple[tuple[str, ...], Any]]:
+        """Measure what the solver and the mesh leave, and what a plain solve costs, by the textbook and here."""
+        m = len(evaluate.outputs)
+        solver, mesh = np.full(m, np.nan), np.full(m, np.nan)
+        plain = textbook = np.nan
+        if self.textbook:
+            cubes = random_points(_seed(self.seed, 0), 0, self.textbook, len(inputs.names))
+            ours = memory(Request(inputs.points(cubes), start=centre.prediction))
+            theirs = evaluate.on(TEXTBOOK)(Request(ours.points))
+            both = ours.ok & theirs.ok
+            if both.any():
+                solver = np.sqrt(((ours.outputs - theirs.outputs)[both] ** 2).mean(axis=0))
+                # The median: the first solve with a reference pays for its factor.
+                plain, textbook = (float(np.median(found.seconds[both])) for found in (ours, theirs))
+        if self.mesh_error:
+            finer = evaluate.on(REFINED)(Request(inputs.mean[None, :]))
+            mesh = np.abs(finer.outputs[0] - centre.outputs)
+        return {
+            "solver_error": (("output",), solver),
+            "mesh_error": (("output",), mesh),
+            "plain_seconds": ((), plain),
+            "textbook_seconds": ((), textbook),
+        }
+
+
+def _seed(seed: int, repeat: int) -> int:
+    """Seed of a repeat: the same for all methods, which may so share their points."""
+    return int(np.random.SeedSequence([seed, repeat]).generate_state(1)[0])
+
+
+def _stream(method: Sampling) -> tuple[object, ...] | None:
+    """Name the points that a method takes the first of, for all methods that take them; nothing where it is unknown."""
+    match method:
+        case QuasiMonteCarlo():
+            return "sobol", method.scrambles
+        case MonteCarlo():
+            return ("random",)
+        case Chaos():
+            return "design", method.gradients
+        case MultilevelChaos():
+            return None  # every level draws afresh
+        case _:
+            assert_never(method)
+
+
+# --- one run of a method ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What one run of a method gave, and what it is charged.
+
+    Attributes
+    ----------
+    estimates
+        `ESTIMATES` by output (m,); NaN where there are none.
+    half_width
+        Standard errors on either side of a claimed 95 % interval.
+    solves
+        Points that were asked for.
+    seconds, own_seconds
+        Processor time (s) of their solves, and of everything else that the method did.
+    reason
+        Why there is no estimate.
+    doubts
+        What the method found out against its own numbers.
+    """
+
+    estimates: dict[str, FloatArray]
+    half_width: float
+    solves: int
+    seconds: float
+    own_seconds: float
+    reason: str | None = None
+    doubts: tuple[Finding, ...] = ()
+
+
+def _try(method: Sampling, inputs: Inputs, memory: _Memory) -> _Trial:
+    recorder = Recorder(memory)
+    begin, before = time.process_time(), memory.clock.seconds
+    try:
+        found = method.run(inputs, recorder)
+    except SolveError as error:
+        nothing = np.full(len(memory.outputs), np.nan)
+        return _Trial(dict.fromkeys(ESTIMATES, nothing), 0.0, recorder.solves, recorder.seconds, 0.0, str(error))
+    own = time.process_time() - begin - (memory.clock.seconds - before)
+    estimates = {name: found[name].to_numpy() for name in ESTIMATES}
+    doubts = tuple(one for one in findings(found) if one.severity != "note")
+    return _Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0), doubts=doubts)
+
+
+def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]]) -> Iterator[Finding]:
+    """Find the methods that found out something against their own numbers, at which budgets and how often."""
+    for (entry, budget), row in zip(rows, trials, strict=True):
+        told = [trial.doubts[0] for trial in row if trial.doubts]
+        if told:
+            who = f"{entry.label} with {budget} samples, {len(told)} of {len(row)} repeats"
+            yield Finding("warning", f"{who}: {told[0].text}")
+
+
+@dataclass
+class _Clock:
+    """Processor time (s) that evaluations took on this rank."""
+
+    seconds: float = 0.0
+
+
+class _Memory:
+    """An evaluation that solves each point once, and hands out what it found, seconds and all, as often as asked.
+
+    Sums of fields over several points are not remembered.
+    """
+
+    def __init__(self, evaluate: Evaluate, clock: _Clock | None = None) -> None:
+        self._evaluate = evaluate
+        self._others: dict[int, _Memory] = {}
+        self._known: dict[tuple[bytes, bytes], Evaluations] = {}
+        self.clock = clock or _Clock()
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self._evaluate.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self._evaluate.outputs
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether solutions have derivatives."""
+        return self._evaluate.differentiable
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements at the head of a state."""
+        return self._evaluate.displacements
+
+    def on(self, model: int) -> _Memory:
+        """Return the evaluation of another of the models, with a memory of its own."""
+        if model not in self._others:
+            self._others[model] = _Memory(self._evaluate.on(model), self.clock)
+        return self._others[model]
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request, solving those that are new."""
+        begin = time.process_time()
+        try:
+            if request.fields is not None and len(request.points) > 1:
+                return self._evaluate(request)
+            return self._remembered(request)
+        finally:
+            self.clock.seconds += time.process_time() - begin
+
+    def _remembered(self, request: Request) -> Evaluations:
+        from uq.evaluation.checkpoint import digest
+
+        asked = digest(replace(request, points=request.points[:0]))
+        keys = [(asked, point.tobytes()) for point in request.points]
+        new = {key: i for i, key in enumerate(keys) if key not in self._known}
+        if new:
+            found = self._evaluate(replace(request, points=request.points[list(new.values())]))
+            self._known |= dict(zip(new, _one_by_one(found), strict=True))
+        return merge([self._known[key] for key in keys])
+
+
+def _one_by_one(found: Evaluations) -> list[Evaluations]:
+    """Cut evaluations of n points into n; fields stay where there is one point only."""
+    n = len(found.points)
+    if n == 1:
+        return [found]
+    failures = {failure.index: replace(failure, index=0) for failure in found.failures}
+    columns = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "fields"}
+    arrays = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    return [
+        replace(
+            found,
+            failures=(failures[i],) if i in failures else (),
+            fields=np.zeros((0, 0)),
+            **{name: column[i : i + 1] for name, column in arrays.items()},
+        )
+        for i in range(n)
+    ]
+
+
+# --- comparison ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Score:
+    """What repeats err, by row and output (n, m).
+
+    Attributes
+    ----------
+    rmse, rmse_error
+        Root mean square error, and its standard error.
+    claimed
+        Root mean square of the standard errors that were claimed.
+    resolved
+        Whether the reference is good enough to measure this error.
+    coverage
+        Share of the claimed 95 % intervals that hold the reference, NaN where the error is not resolved.
+    understated
+        Whether so few would hold it once in a thousand times if the claims were honest.
+    """
+
+    rmse: FloatArray
+    rmse_error: FloatArray
+    claimed: FloatArray
+    resolved: FloatArray
+    coverage: FloatArray
+    understated: FloatArray
+
+
+def _score(errors: FloatArray, claims: FloatArray, halves: FloatArray, floor: FloatArray) -> _Score:
+    """Compare errors with claims (n, R, m).
+
+    Parameters
+    ----------
+    errors, claims
+        Estimates minus reference, and claimed standard errors; NaN where a repeat gave none.
+    halves
+        Claimed standard errors on either side of a 95 % interval (n, R).
+    floor
+        Standard error of the reference (m,).
+    """
+    from scipy.stats import binom
+
+    there = np.isfinite(errors)
+    R = np.maximum(there.sum(axis=1), 1)
+    squares = np.where(there, errors, 0.0) ** 2
+    mean = np.where(there.any(axis=1), squares.sum(axis=1) / R, np.nan)
+    spread = np.where(there, squares - mean[:, None], 0.0)
+    scatter = np.sqrt((spread**2).sum(axis=1) / np.maximum(R - 1, 1) / R)
+    rmse = np.sqrt(mean)
+    resolved = rmse > RESOLVED * floor
+    # The reference errs too: where that matters at all, intervals are as much wider.
+    within = there & (np.abs(errors) <= np.hypot(halves[..., None] * claims, 1.96 * floor))
+    hits = within.sum(axis=1)
+    return _Score(
+        rmse,
+        ratio(scatter, 2 * rmse),
+        np.sqrt((np.where(there, claims, 0.0) ** 2).sum(axis=1) / R),
+        resolved,
+        np.where(resolved, hits / R, np.nan),
+        resolved & (binom.cdf(hits, R, 0.95) < UNLIKELY),
+    )
+
+
+def _rate(solves: FloatArray, errors: FloatArray) -> tuple[float, float]:
+    """Slope of ln RMSE over ln solves (n,) of errors (n, R), with its error by the jackknife over the repeats.
+
+    Budgets of one repeat share points, so that their errors are not independent; the repeats are.
+    """
+    squares = errors[:, np.isfinite(errors).all(axis=0)] ** 2
+    n, R = squares.shape
+    if n < 2 or R < 3:
+        return np.nan, np.nan
+    total = squares.sum(axis=1)
+    without = (total[:, None] - squares) / (R - 1)
+    mean_squares = np.column_stack([total / R, without])
+    if not (mean_squares > 0).all():
+        return np.nan, np.nan
+    centred = np.log(solves) - np.log(solves).mean()
+    slopes = centred @ np.log(mean_squares) / 2 / (centred @ centred)
+    return float(slopes[0]), float(np.sqrt((R - 1) / R * ((slopes[1:] - slopes[1:].mean()) ** 2).sum()))
+
+
+def _compared(
+    rows: Sequence[tuple[Entry, int]],
+    trials: Sequence[Sequence[_Trial]],
+    reference: dict[str, FloatArray],
+    floors: dict[str, tuple[tuple[str, ...], Any]],
+) -> dict[str, tuple[tuple[str, ...], Any]]:
+    """Return reference, estimates, errors and costs as labelled arrays."""
+
+    def each(pick: Callable[[_Trial], Any]) -> FloatArray:
+        return np.array([[pick(trial) for trial in row] for row in trials], dtype=float)
+
+    names = [entry.label for entry, _ in rows]
+    solves = np.median(each(lambda t: t.solves), axis=1)
+    own = np.median(each(lambda t: t.own_seconds), axis=1)
+    seconds = np.median(each(lambda t: t.seconds + t.own_seconds), axis=1)
+    halves = each(lambda t: t.half_width)
+    plain = [i for i, (entry, _) in enumerate(rows) if type(entry.sampling) is MonteCarlo]
+    # What plain Monte Carlo costs by the textbook follows from its solves.
+    textbook = float(floors["textbook_seconds"][1])
+    derived = plain if np.isfinite(textbook) else []
+    shown = [*range(len(rows)), *derived]
+    labels = [*names, *(f"{names[i]}, textbook solver" for i in derived)]
+    data: dict[str, tuple[tuple[str, ...], Any]] = {
+        "row_method": (("row",), labels),
+        "budget": (("row",), np.array([budget for _, budget in rows])[shown]),
+        "derived": (("row",), np.arange(len(shown)) >= len(rows)),
+        "solves": (("row",), solves[shown].astype(np.int64)),
+        "cpu_seconds": (("row",), np.concatenate([seconds, solves[derived] * textbook])),
+        "own_seconds": (("row",), np.concatenate([own, np.zeros(len(derived))])),
+        **floors,
+    }
+    rounding = ROUNDING * np.maximum(np.abs(reference["mean"]), reference["std"])
+    by_output, by_row, by_repeat = ("output",), ("row", "output"), ("row", "repeat", "output")
+    for name in ESTIMATED:
+        value, error = reference[name], reference[f"{name}_error"]
+        estimates, claims = (
+            np.array([[trial.estimates[key] for trial in row] for row in trials]) for key in (name, f"{name}_error")
+        )
+        errors = estimates - value
+        score = _score(errors, claims, halves, np.maximum(error, rounding))
+        slopes = []
+        for method in dict.fromkeys(labels):
+            of_method = [shown[i] for i, label in enumerate(labels) if label == method]
+            used = [[i for i in of_method if good[i]] for good in score.resolved.T]
+            slopes.append([_rate(solves[i], errors[i, :, k]) for k, i in enumerate(used)])
+        single = reference["std"]
+        if name == "std":
+            # The error of a standard deviation depends on the fourth moment, which plain Monte Carlo estimates.
+            last = plain[-1] if plain else 0
+            single = score.claimed[last] * np.sqrt(rows[last][1]) if plain else np.full(value.shape, np.nan)
+        rates = np.array(slopes)
+        data |= {
+            name: (by_output, value),
+            f"{name}_error": (by_output, error),
+            f"{name}_estimate": (by_repeat, estimates[shown]),
+            f"{name}_estimate_error": (by_repeat, claims[shown]),
+            **{f"{name}_{f.name}": (by_row, getattr(score, f.name)[shown]) for f in fields(score)},
+            f"{name}_single": (by_output, single),
+            f"{name}_rate": (("estimator", "output"), rates[..., 0]),
+            f"{name}_rate_error": (("estimator", "output"), rates[..., 1]),
+        }
+    return data
+
+
+def plain_samples(dataset: xr.Dataset, estimated: str) -> xr.DataArray:
+    """Return how many samples of plain Monte Carlo err as much, by row and output, for the mean or the std.
+
+    This is a lower bound where the error is not resolved.
+    """
+    return (dataset[f"{estimated}_rmse"] / dataset[f"{estimated}_single"]) ** -2
+
+
+def gains(dataset: xr.Dataset, estimated: str) -> dict[str, xr.DataArray]:
+    """Return what plain Monte Carlo costs at equal error over what a method costs, by row and output.
+
+    By number of "solves", by processor time ("cpu"), and by processor time where plain Monte Carlo solves by the
+    textbook ("textbook"); the last two are NaN where nothing was solved by the textbook.
+    """
+    plain, seconds = plain_samples(dataset, estimated), dataset["cpu_seconds"]
+    return {
+        "solves": plain / dataset["solves"],
+        "cpu": plain * dataset["plain_seconds"] / seconds,
+        "textbook": plain * dataset["textbook_seconds"] / seconds,
+    }

@@ -1,0 +1,403 @@
+"""Global sensitivity from derivatives: bounds on total Sobol' indices and the active subspace, from the same tangents.
+
+With ν_i = E[(∂ψ/∂ω_i)²], the derivative-based measure of a parameter, and the Poincaré constant C_i of its
+distribution, the smallest with Var g(ω_i) ≤ C_i E[g'(ω_i)²] for every g, the total index is at most
+
+    S_Ti ≤ C_i ν_i / Var ψ
+
+(I. M. Sobol', S. Kucherenko, Math. Comput. Simul. 79 (2009) 3009–3017; M. Lamboni, B. Iooss, A.-L. Popelin, F. Gamboa,
+Math. Comput. Simul. 87 (2013) 45–54). C is σ² for a normal and (b − a)²/π² for a uniform distribution. For a gamma
+distribution of shape k and scale θ it is θ²(k + 1)²/k where k > 1 (g = (1 − x/(k + 1)) exp(x/(k + 1)) with x = ω/θ
+attains it) and 4θ² otherwise.
+
+The same holds of ln ω with its own constant, S_Ti ≤ C_i' E[(ω_i ∂ψ/∂ω_i)²]/Var ψ: s² for a log-normal parameter, of
+which the logarithm has the standard deviation s and which has no C; ln²(b/a)/π² for a log-uniform one; 1/(k − 1) for a
+gamma distribution with k > 2 (g = 1/ω attains it). Where polynomials are of the logarithm (`uq.inputs.coordinates`)
+both bounds are computed, and the smaller one is taken.
+
+The active subspace (P. G. Constantine, Active Subspaces, SIAM (2015)) are the leading eigenvectors of E[∇ψ∇ψᵀ] in
+standardised coordinates (`uq.inputs.coordinates`): the directions along which ψ changes most.
+
+Points are independent scrambles of Sobol' points, and errors come from drawing whole scrambles again
+(`uq.estimators.indices`).
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from forward.model import FloatArray, ModelError, SolveError
+from uq.estimators.doubts import of_indices, of_tails
+from uq.estimators.indices import bootstrap, bootstrap_error, shares
+from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.findings import add
+from uq.inputs.distributions import (
+    Beta,
+    Distribution,
+    Gamma,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Triangular,
+    TruncatedNormal,
+    Uniform,
+)
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
+from uq.methods.stopping import Amount
+from uq.surrogates.basis import gauss, hyperbolic, orthonormal
+from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from uq.surrogates.regression import FULL, Regression
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SETTLED = 1e-5  # relative change of a Poincaré constant from one degree to twice that, at which it is taken as known
+DEGREES = (8, 16, 32, 64)
+ORDER = 6  # largest of the expansion that total indices come from
+RANGE = (0.025, 0.975)
+
+
+class DerivativeBased(Amount):
+    """Derivative-based sensitivity: bounds on total Sobol' indices and the active subspace, from tangents.
+
+    Parameters
+    ----------
+    samples
+        Number of solves, `scrambles` times a power of two; with a tolerance or a budget, the largest number.
+    tolerance
+        Stop when the standard error of every bound is below it.
+    budget_seconds
+        As of `Amount`.
+    scrambles
+        Number of independent scrambles: their scatter is the error. Means over scrambles of squared derivatives are
+        skewed: of 256 solves of a function of a normal and a uniform parameter, 95 % intervals covered 90 to 91 % with
+        16 scrambles, 92 to 94 % with 32 and 94 % with 64, while the standard error was right.
+    seed
+        Point z of scramble r of a seed is the same in every study with as many parameters.
+    quantiles
+        Probabilities of the quantiles of the outputs.
+    fields
+        Whether the derivatives of the displacement field at the mean parameters are kept.
+    indices
+        Whether total indices are estimated too, from an expansion of the same samples; up to 8 parameters they are
+        unless this is false.
+    """
+
+    kind: Literal["derivative-based"] = "derivative-based"
+    scrambles: Annotated[int, Field(ge=4)] = 32
+    seed: Annotated[int, Field(ge=0)] = 0
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
+    fields: bool = True
+    indices: bool | None = None
+
+    def check_amount(self) -> None:
+        """Raise a ValueError where no amount is given, or not one of whole scrambles."""
+        super().check_amount()
+        check_scrambles(self.samples, self.scrambles)
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves, the largest where a tolerance may end the study earlier."""
+        return 1 + (self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles))
+
+    @staticmethod
+    def objection(inputs: Inputs) -> str | None:
+        """Say why the bounds do not hold for these parameters, or nothing."""
+        if not inputs.independent:
+            return (
+                "bounds on Sobol' indices need independent parameters, expected no correlations for "
+                "method.kind = 'derivative-based'"
+            )
+        return None
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Solve at Sobol' points with tangents, and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            Measures, bounds, and the active subspace by output with standard errors; total indices from an expansion
+            fitted to the same samples; moments; see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, or in fewer than two scrambles.
+        ValueError
+            If the parameters are correlated, or the model has no derivatives.
+        """
+        objection = self.objection(inputs)
+        if objection is not None:
+            raise ValueError(objection)
+        if not evaluate.differentiable:
+            message = "the model has no derivatives, expected one that has for method.kind = 'derivative-based'"
+            raise ModelError(message)
+        evaluate = Recorder(evaluate)
+        centre = linearise(inputs, evaluate)
+        R = self.scrambles
+        last = (self.planned(len(inputs.names)) - 1) // R
+        samples = _Samples(self, inputs, evaluate, centre)
+        samples.extend(min(last, power_of_two(FIRST_ROUND // R)) if self.open_ended else last)
+        while True:
+            found = samples.measures()
+            reached = float(found["total_bound_error"].max())
+            more = R * samples.each
+            if self.met(reached) or samples.each >= last or more > self.affordable(evaluate.solves, evaluate.seconds):
+                break
+            samples.extend(2 * samples.each)
+        dataset = samples.dataset(found)
+        amount = f"{R * samples.each} samples ({R} scrambles of {samples.each} Sobol' points)"
+        error = f"errors of the bounds up to {reached:.2g}"
+        dataset.attrs["stopped"] = self.why_stopped(reached, error, samples.each, last, amount)
+        return dataset
+
+
+# --- Poincaré constants --------------------------------------------------------------------------------------------
+
+
+def poincare(marginal: Distribution, *, logarithm: bool) -> float:
+    """Return the Poincaré constant of a distribution in the square of its unit, or of its logarithm; inf for none.
+
+    Where there is no closed form it is 1/λ with the smallest positive eigenvalue of −(p f')' = λ p f with f' = 0 at the
+    ends (O. Roustant, F. Barthe, B. Iooss, Electron. J. Stat. 11 (2017) 3081–3119), by Galerkin's method in the
+    orthonormal polynomials of the distribution, of which the mass matrix is one. Where that does not settle, Cheeger's
+    upper bound 4 sup (min(F, 1 − F)/p)² of it is taken (S. Bobkov, C. Houdré, Ann. Probab. 25 (1997) 184–205).
+    """
+    if logarithm and not marginal.logarithmic:
+        return np.inf
+    match marginal:
+        case Normal():
+            return float(marginal.std**2)
+        case LogNormal():
+            return float(marginal.of_coordinate[1] ** 2) if logarithm else np.inf
+        case Uniform() if not logarithm:
+            return float(((marginal.upper - marginal.lower) / np.pi) ** 2)
+        case LogUniform() if logarithm:
+            return float((np.log(marginal.upper / marginal.lower) / np.pi) ** 2)
+        case Gamma():
+            k, theta = marginal.shape, marginal.scale
+            if logarithm:
+                return 1 / (k - 1)  # k > 2
+            return float(theta**2 * ((k + 1) ** 2 / k if k > 1 else 4))
+        case Uniform() | LogUniform() | Triangular() | Beta() | TruncatedNormal():
+            return _by_galerkin(marginal, logarithm=logarithm)
+        case _:
+            assert_never(marginal)
+
+
+def _by_galerkin(marginal: Distribution, *, logarithm: bool) -> float:
+    before = np.inf
+    for degree in DEGREES:
+        constant = _by_polynomials(marginal, degree, logarithm=logarithm)
+        if abs(constant - before) <= SETTLED * constant:
+            return constant
+        before = constant
+    p = np.concatenate([np.geomspace(1e-12, 0.5, 2000), 1 - np.geomspace(0.5, 1e-12, 2000)])
+    values = marginal.quantile(p)
+    density = marginal.density(values) * (values if logarithm else 1.0)
+    return float(4 * (np.minimum(p, 1 - p)[density > 0] / density[density > 0]).max() ** 2)
+
+
+def _by_polynomials(marginal: Distribution, degree: int, *, logarithm: bool) -> float:
+    """Largest ratio of Var f and E[f'²] over polynomials f of a degree in the coordinate, by ω or by ln ω."""
+    alone = Inputs({"": marginal})
+    if marginal.closed:
+        points, weights = gauss(alone, degree + 1)
+    else:
+        origin, offsets, weights = marginal.rule
+        points = (origin + offsets)[:, None]
+    basis = orthonormal(alone, hyperbolic(1, degree, 1.0))
+    slopes = basis.derivatives(points)[:, 0, 1:] / basis.coordinates.steps(points)
+    if logarithm:
+        slopes = slopes * points
+    stiffness = slopes.T @ (weights[:, None] * slopes)
+    return float(1 / np.linalg.eigvalsh(stiffness)[0])
+
+
+# --- estimates -----------------------------------------------------------------------------------------------------
+
+
+class _Samples:
+    """Scrambles of the same number of points, with values and tangents there.
+
+    Attributes
+    ----------
+    each
+        Number n of points of each scramble.
+    points, outputs, tangents, ok
+        (R, n, d), (R, n, m), (R, n, m, d) and (R, n).
+    """
+
+    def __init__(self, method: DerivativeBased, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
+        self._method, self._inputs, self._evaluate, self._centre = method, inputs, evaluate, centre
+        # By ω and by ln ω (2, d).
+        self._constants = np.array(
+            [[poincare(m, logarithm=logarithm) for m in inputs.marginals.values()] for logarithm in (False, True)]
+        )
+        R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
+        self.each = 0
+        self.points = np.empty((R, 0, d))
+        self.outputs = np.empty((R, 0, m))
+        self.tangents = np.empty((R, 0, m, d))
+        self.ok = np.empty((R, 0), dtype=bool)
+        self._reasons: set[str] = set()
+
+    def extend(self, each: int) -> None:
+        """Go on to `each` points in every scramble."""
+        R, d = self.points.shape[0], self.points.shape[2]
+        cubes = [sobol_points(self._method.seed, r, self.each, each, d) for r in range(R)]
+        points = self._inputs.points(np.concatenate(cubes))
+        found: Evaluations = self._evaluate(Request(points, tangents=True, start=self._centre.prediction))
+        assert found.tangents is not None
+        self.each = each
+        self._reasons |= {failure.reason for failure in found.failures}
+        for name, new in (
+            ("points", points),
+            ("outputs", found.outputs),
+            ("tangents", found.tangents),
+            ("ok", found.ok),
+        ):
+            kept = getattr(self, name)
+            setattr(self, name, np.concatenate([kept, new.reshape(R, -1, *kept.shape[2:])], axis=1))
+
+    def _sums(self, each: int) -> tuple[FloatArray, FloatArray]:
+        """Sums (R', J, m) of what is averaged, over the scrambles that have answers, and their numbers (R',)."""
+        ok = self.ok[:, :each]
+        some = ok.any(axis=1)
+        if some.sum() < 2:
+            reasons = "; ".join(sorted(self._reasons)[:3])
+            message = f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}"
+            raise SolveError(message)
+        ok = ok[some]
+        centre, points = self._centre, self.points[some, :each]
+        deviation = np.where(ok[..., None], self.outputs[some, :each] - centre.middle, 0.0)
+        tangents = np.where(ok[..., None, None], self.tangents[some, :each], 0.0)
+        scaled = tangents * centre.coordinates.steps(points)[:, :, None, :]
+        d = scaled.shape[-1]
+        first, second = deviation, deviation**2
+        if ok.all():
+            # The tangent at the mean parameters is a control variate of both, as in `uq.estimators.moments`.
+            prediction = centre.coordinates.of(points) @ centre.output_slopes.T
+            variance = (centre.output_slopes**2).sum(axis=1)
+            first, second = deviation - prediction, second - prediction**2 + variance
+        parts = [
+            first[..., None],
+            second[..., None],
+            tangents**2,
+            (tangents * points[:, :, None, :]) ** 2,
+            (scaled[..., :, None] * scaled[..., None, :]).reshape(*deviation.shape, d * d),
+        ]
+        return np.swapaxes(np.concatenate(parts, axis=-1).sum(axis=1), 1, 2), ok.sum(axis=1).astype(float)
+
+    def _from_means(self, means: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Measures and bounds (…, m, d) and matrices (…, m, d, d) from means (J, …, m)."""
+        d = self._constants.shape[1]
+        rows = np.moveaxis(means, 0, -1)
+        variance = rows[..., 1] - rows[..., 0] ** 2
+        by_parameter, by_logarithm = (
+            np.where(np.isfinite(constants), constants, 0.0) * measures + np.where(np.isfinite(constants), 0.0, np.inf)
+            for constants, measures in zip(
+                self._constants, (rows[..., 2 : 2 + d], rows[..., 2 + d : 2 + 2 * d]), strict=True
+            )
+        )
+        bounds = shares(np.minimum(by_parameter, by_logarithm), variance[..., None])
+        return rows[..., 2 : 2 + d], bounds, rows[..., 2 + 2 * d :].reshape(*variance.shape, d, d)
+
+    def measures(self) -> dict[str, FloatArray]:
+        """Measures, bounds and the active subspace by output, with errors."""
+        sums, counts = self._sums(self.each)
+        R = len(counts)
+        dgsm, bounds, matrix = self._from_means(sums.sum(axis=0) / counts.sum())
+        drawn = self._from_means(bootstrap(sums, counts, self._method.seed))
+        values, directions = _descending(matrix)
+        leading = _signed(directions[..., 0])
+        drawn_values, drawn_directions = _descending(drawn[2])
+        turned = drawn_directions[..., 0]
+        turned = turned * np.where((turned * leading).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        lower, upper = np.quantile(drawn_values, RANGE, axis=0)
+        return {
+            "dgsm": dgsm,
+            "dgsm_error": bootstrap_error(drawn[0], R, axis=0),
+            "total_bound": bounds,
+            "total_bound_error": bootstrap_error(drawn[1], R, axis=0),
+            "active_direction": leading,
+            "active_direction_error": bootstrap_error(turned, R, axis=0),
+            "active_eigenvalue": values,
+            "active_eigenvalue_lower": lower,
+            "active_eigenvalue_upper": upper,
+        }
+
+    def _moments(self, each: int) -> Estimates:
+        sums, counts = self._sums(each)
+        means = sums / counts[:, None, None]
+        return estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.middle)
+
+    def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
+        """Flatten (R, n, …) to (n R, …), the first points of all scrambles first: a shorter study is the beginning."""
+        return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
+
+    def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
+        """Return all estimates as labelled arrays."""
+        method, inputs = self._method, self._inputs
+        points, values, ok = (self._in_order(a) for a in (self.points, self.outputs, self.ok))
+        scramble = np.tile(np.arange(method.scrambles), self.each)
+        of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], method.quantiles)
+        rounds = [1 << k for k in range(self.each.bit_length()) if self.ok[:, : 1 << k].any(axis=1).sum() > 1]
+        moments = {method.scrambles * each: self._moments(each) for each in rounds}
+        last = moments[method.scrambles * self.each]
+        local = self._centre.output_slopes**2
+        logarithmic = inputs.coordinates.logarithmic
+        dataset = local_dataset(inputs, self._evaluate, self._centre, fields=method.fields)
+        dataset = dataset.assign_coords(quantile=list(method.quantiles), round=list(moments)).assign(
+            {
+                **{name: (("output",), getattr(last, name)) for name in ESTIMATES},
+                **of_quantiles.variables,
+                "points": (("sample", "parameter"), points),
+                "values": (("sample", "output"), values),
+                "ok": (("sample",), ok),
+                "scramble": (("sample",), scramble),
+                **{
+                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for e in moments.values()]))
+                    for name in ("mean", "mean_error")
+                },
+                "poincare": (("parameter",), np.where(logarithmic, self._constants[1], self._constants[0])),
+                "local_share": (("output", "parameter"), shares(local, local.sum(axis=1, keepdims=True))),
+                **{
+                    name: (("output", "direction" if "eigenvalue" in name else "parameter"), value)
+                    for name, value in found.items()
+                },
+            }
+        )
+        wanted = len(inputs.names) <= FULL if method.indices is None else method.indices
+        if wanted:
+            with suppress(SolveError):  # of too few samples for an expansion: the bounds stand alone
+                regression = Regression.of(inputs, points[ok], values[ok], self._in_order(self.tangents)[ok], ORDER)
+                estimates = regression.estimates()
+                for name in ("sobol_first", "sobol_total"):
+                    for end in ("", "_error"):
+                        dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
+                dataset["loo_error"] = (("output",), regression.fit.relative)
+                add(dataset, *of_indices(dataset))
+        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
+        if not ok.all():
+            dataset.attrs["note"] = failure_note(ok, "all estimates", None)
+        return dataset
+
+
+def _descending(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (…, d) of symmetric matrices (…, d, d), the largest first, and eigenvectors in columns."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.maximum(values[..., ::-1], 0.0), vectors[..., ::-1]
+
+
+def _signed(directions: FloatArray) -> FloatArray:
+    """Turn unit vectors (…, d) so that their largest component is positive."""
+    largest = np.take_along_axis(directions, np.abs(directions).argmax(axis=-1)[..., None], axis=-1)
+    return np.asarray(directions * np.where(largest < 0, -1.0, 1.0))

@@ -1,0 +1,438 @@
+"""Randomised quasi-Monte Carlo: independent scrambles of Sobol' points, with control variates.
+
+The mean over one scramble is unbiased, since each of its points is uniform by itself; the scrambles are independent, so
+their scatter gives an honest standard error without any assumption on the smoothness that makes it small
+(A. B. Owen, SIAM J. Numer. Anal. 34 (1997) 1884–1910; C. Lemieux, Monte Carlo and Quasi-Monte Carlo Sampling (2009)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import comb
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from uq.estimators.doubts import influences, of_control, of_tails
+from uq.estimators.moments import (
+    ESTIMATES,
+    Coefficient,
+    Estimates,
+    estimate,
+    estimate_from_replicates,
+    monomials,
+    quantiles_from_replicates,
+    ratio,
+)
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
+from uq.findings import add
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
+from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
+from uq.surrogates.field_regression import Deviations, fit_deviations
+from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond
+from uq.surrogates.taylor import Control, expansion, held_expansion, quadratic, tangent
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Pair = tuple[FloatArray, FloatArray]
+ORDER = 6  # largest of the expansions that are tried as control
+FIT = 2**32 - 1  # number of the scramble that the control is fitted to, which none of the samples belong to
+
+
+class QuasiMonteCarlo(MonteCarlo):
+    """Quasi-Monte Carlo: independent scrambles of Sobol' points, with a polynomial as control variate.
+
+    Errors are one standard error from the scatter of the scrambles, without the factor of Student's distribution: a
+    95 % interval is ± 2.13 of them for 16 scrambles. Those of the standard deviation cover 90 % with 4 points in each
+    scramble, whose means are skewed, and 93 to 95 % from 16 points on.
+
+    Parameters
+    ----------
+    samples
+        Number of samples in all, `scrambles` times a power of two; with a tolerance, the largest number.
+    tolerance
+        As of `MonteCarlo`: the number of points is doubled until it is met, and all earlier points are kept. The error
+        that is compared with it is itself uncertain (by 18 % for 16 scrambles).
+    seed
+        Point z of scramble r of a seed is the same in every study with as many parameters.
+    scrambles
+        Number of independent scrambles R.
+    control
+        Control variate: "none", the "tangent" at the mean parameters, the "quadratic" Taylor polynomial there, which
+        takes two more solves, with tangents, for each parameter, or "chaos", an expansion fitted to values and
+        gradients at samples of its own: its errors cost efficiency and bias nothing. It needs independent parameters,
+        and with `fields` it is where the solver starts from too.
+    control_samples
+        Number of samples that the expansion is fitted to; if nothing is said, twice what order 3 needs (order 2 above
+        eight parameters). Order and terms are chosen as `Chaos` does. Where parameters have tails and the expansion
+        goes wrong beyond the reach of these samples, which the others tell, it is held at its values there, and the
+        displacement field has no control.
+    coefficient
+        "one", or "optimal": estimated by regression over the scrambles, of which there must be 4; it has a bias of
+        order 1/R, a fraction of its error (seen with 4 points per scramble, for the standard deviation).
+    quantiles, fields
+        As of `MonteCarlo`. With `fields`, one scramble is evaluated after the other, so that no more groups of ranks
+        than points in a scramble have work.
+    """
+
+    kind: Literal["quasi-monte-carlo"] = "quasi-monte-carlo"  # type: ignore[assignment]
+    scrambles: Annotated[int, Field(ge=2)] = 16
+    control: Literal["none", "tangent", "quadratic", "chaos"] = "tangent"
+    control_samples: Annotated[int, Field(ge=2)] | None = None
+    coefficient: Coefficient = "one"
+
+    @model_validator(mode="after")
+    def _check_scrambles(self) -> QuasiMonteCarlo:
+        R = self.scrambles
+        check_scrambles(self.samples, R)
+        if self.coefficient == "optimal" and R < 4:
+            message = f"scrambles = {R}, expected at least 4 for coefficient = 'optimal', which is fitted to them"
+            raise ValueError(message)
+        if self.control_samples is not None and self.control != "chaos":
+            message = f"control_samples = {self.control_samples}, expected none for control = '{self.control}'"
+            raise ValueError(message)
+        return self
+
+    @property
+    def limit(self) -> int:
+        """Number of samples, the largest where a tolerance may end the study earlier."""
+        return self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles)
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
+        return 1 + self.limit + self._fitted(dimension)
+
+    def _fitted(self, dimension: int) -> int:
+        """Number of solves that the control takes besides the one at the mean parameters."""
+        if self.control == "quadratic":
+            return 2 * dimension
+        if self.control == "chaos":
+            terms = comb(dimension + 3, 3) if dimension <= FULL else comb(dimension + 2, 2)
+            return self.control_samples or max(4, -(-ROWS_PER_TERM * terms // (1 + dimension)))
+        return 0
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters do not allow the control, or nothing."""
+        if self.control == "chaos" and not inputs.independent:
+            return (
+                "polynomial chaos needs independent parameters, expected no correlations for method.control = 'chaos'"
+            )
+        return None
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Sample and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            As of `MonteCarlo`, with the scramble of each sample (`scramble`), what a sample is worth
+            (`variance_ratio`, `std_variance_ratio`) and the estimates from the first points of all scrambles
+            (`running_mean`, `running_mean_error`); see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, at one of the points that the quadratic control needs,
+            or in fewer than two scrambles (four with the optimal coefficient), or at too many samples of the fit.
+        ValueError
+            If the model has no derivatives, which controls need, or the chaos control has correlated parameters.
+        """
+        objection = self.objection(inputs)
+        if objection is not None:
+            raise ValueError(objection)
+        if self.control != "none" and not evaluate.differentiable:
+            message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
+            raise ModelError(message)
+        evaluate = Recorder(evaluate)
+        centre = linearise(inputs, evaluate)
+        control = None
+        if self.control == "tangent":
+            control = tangent(inputs, centre)
+        elif self.control == "quadratic":
+            control = quadratic(inputs, evaluate, centre, fields=self.fields)
+        fitted = held = None
+        start: Start | None = centre.prediction
+        if self.control == "chaos":
+            fitted = self._expand(inputs, evaluate, centre)
+            control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
+        samples = _Samples(self, inputs, evaluate, centre, control, held, start)
+        last = self.limit // self.scrambles
+        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
+        samples.extend(first)
+        scalars = samples.scalars(first)
+        while not self.met(float(scalars.relative_error.max())) and samples.each < last:
+            if self.scrambles * samples.each > self.affordable(evaluate.solves, evaluate.seconds):
+                break
+            samples.extend(2 * samples.each)
+            scalars = samples.scalars(samples.each)
+        return self._dataset(inputs, evaluate, centre, fitted, samples, scalars)
+
+    def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
+        """Fit the expansion to a scramble of its own: given the fit, the samples are as random as ever."""
+        d = len(inputs.names)
+        points = inputs.points(sobol_points(self.seed, FIT, 0, self._fitted(d), d))
+        try:
+            return fit_deviations(inputs, evaluate, centre, points, ORDER, fields=self.fields)
+        except SolveError as error:
+            message = f"control = 'chaos': {error.reason}"
+            raise SolveError(message, error.history) from None
+
+    def _dataset(
+        self,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        centre: Linearisation,
+        fitted: Deviations | None,
+        samples: _Samples,
+        scalars: Estimates,
+    ) -> xr.Dataset:
+        values, ok, scramble = samples.in_order(samples.outputs), samples.in_order(samples.ok), samples.scramble
+        of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
+        # What plain Monte Carlo would claim from as many independent samples.
+        plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
+        running = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
+        by_output = ("output",)
+        dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
+        dataset = dataset.assign_coords(quantile=list(self.quantiles), round=[self.scrambles * n for n, _ in running])
+        dataset = dataset.assign(
+            {
+                **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
+                **of_quantiles.variables,
+                "points": (("sample", "parameter"), samples.in_order(samples.points)),
+                "values": (("sample", "output"), values),
+                "ok": (("sample",), ok),
+                "scramble": (("sample",), scramble),
+                **{
+                    f"running_{name}": (("round", "output"), np.array([getattr(e, name) for _, e in running]))
+                    for name in ("mean", "mean_error")
+                },
+                "variance_ratio": (by_output, ratio(plain.mean_error**2, scalars.mean_error**2, empty=1.0)),
+                "std_variance_ratio": (by_output, ratio(plain.std_error**2, scalars.std_error**2, empty=1.0)),
+            }
+        )
+        if self.control != "none":
+            dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
+            add(dataset, *of_control(evaluate.outputs, self.control, scalars))
+        if fitted is not None:
+            dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
+        add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, samples.influences(scalars)))
+        field = samples.field()
+        if field is not None:
+            dataset = dataset.assign(by_node(field, evaluate.displacements))
+        amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
+        reached = float(scalars.relative_error.max())
+        error = f"relative error {reached:.3g}"
+        dataset.attrs["stopped"] = self.why_stopped(reached, error, ok.size, self.limit, amount)
+        notes = []
+        if fitted is not None and not fitted.ok.all():
+            notes.append(f"{int((~fitted.ok).sum())} of {fitted.ok.size} samples for the chaos control have no answer")
+        if not ok.all():
+            followed = None if self.control == "none" else f"the {self.control} control"
+            which = "all estimates" if self.control == "none" else "quantiles"
+            notes.append(failure_note(ok, which, followed))
+        if notes:
+            dataset.attrs["note"] = "; ".join(notes)
+        return dataset
+
+
+def _products(deviation: FloatArray, controls: tuple[FloatArray, FloatArray] | None) -> FloatArray:
+    """Return what is averaged over a scramble (2 or 4, …): the deviation, its square, and their controls."""
+    return np.array([deviation, deviation**2, *(controls or ())])
+
+
+@dataclass(frozen=True)
+class _FieldProducts:
+    """Sum of the products of the state's deviation and of its control."""
+
+    state: FloatArray
+    control: Control | None
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        state = model.scatter(self.state[None, :])[0]
+        control = self.control
+        coefficients = None if control is None else model.scatter(control.state)
+
+        def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
+            controls = None
+            if control is not None and coefficients is not None:
+                controls = control.predict(control.features(parameters), coefficients)
+            return _products(solution.state - state, controls)
+
+        return rows
+
+
+class _Samples:
+    """All scrambles, each of the same number of points, and the sums of the fields over each of them.
+
+    The sums are kept for every scramble, since a longer study goes on with them: 4 R fields on rank 0, 512 bytes for
+    each unknown with 16 scrambles, which is less than the factor of the stiffness that every model keeps.
+
+    Attributes
+    ----------
+    each
+        Number n of points of each scramble.
+    points, outputs, ok
+        (R, n, d), (R, n, m) and (R, n).
+    """
+
+    def __init__(
+        self,
+        method: QuasiMonteCarlo,
+        inputs: Inputs,
+        evaluate: Evaluate,
+        centre: Linearisation,
+        control: Control | None,
+        held: Control | None,
+        start: Start | None,
+    ) -> None:
+        self._method, self._inputs, self._evaluate = method, inputs, evaluate
+        self._centre, self._control, self._held, self._start = centre, control, held, start
+        R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
+        self._field_control = control if control is not None and len(control.state) else None
+        self.each = 0
+        self.points = np.empty((R, 0, d))
+        self.outputs = np.empty((R, 0, m))
+        self.ok = np.empty((R, 0), dtype=bool)
+        self._sums: list[FloatArray | None] = [None] * R
+        self._reasons: set[str] = set()
+
+    @property
+    def rounds(self) -> list[int]:
+        """Powers of two up to the number of points of each scramble."""
+        return [1 << k for k in range(self.each.bit_length())]
+
+    @property
+    def scramble(self) -> NDArray[np.int64]:
+        """Scramble (R n,) of each sample in the order of results."""
+        return np.tile(np.arange(self._method.scrambles), self.each)
+
+    def in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
+        """Flatten (R, n, …) to (R n, …), the first points of all scrambles first: a shorter study is the beginning."""
+        return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
+
+    def extend(self, each: int) -> None:
+        """Go on to `each` points in every scramble."""
+        method, centre = self._method, self._centre
+        d, new = len(self._inputs.names), each - self.each
+        R = method.scrambles
+        cubes = [sobol_points(method.seed, r, self.each, each, d) for r in range(R)]
+        points = self._inputs.points(np.concatenate(cubes)).reshape(R, new, d)
+        outputs, ok = np.empty((R, new, self.outputs.shape[2])), np.empty((R, new), dtype=bool)
+        if method.fields and centre.state.size:
+            wanted = _FieldProducts(centre.state, self._field_control)
+            for r in range(R):
+                found = self._ask(Request(points[r], fields=wanted, start=self._start))
+                outputs[r], ok[r] = found.outputs, found.ok
+                if found.fields.size:
+                    kept = self._sums[r]
+                    self._sums[r] = found.fields if kept is None else kept + found.fields
+        else:
+            found = self._ask(Request(points.reshape(-1, d), start=self._start))
+            outputs, ok = found.outputs.reshape(outputs.shape), found.ok.reshape(ok.shape)
+        self.each = each
+        self.points = np.concatenate([self.points, points], axis=1)
+        self.outputs = np.concatenate([self.outputs, outputs], axis=1)
+        self.ok = np.concatenate([self.ok, ok], axis=1)
+
+    def _ask(self, request: Request) -> Evaluations:
+        found = self._evaluate(request)
+        self._reasons |= {failure.reason for failure in found.failures}
+        return found
+
+    def usable(self, each: int) -> bool:
+        """Whether enough scrambles have an answer among their first `each` points."""
+        needed = 4 if self._method.coefficient == "optimal" else 2
+        return int(self.ok[:, :each].any(axis=1).sum()) >= needed
+
+    def scalars(self, each: int) -> Estimates:
+        """Estimate the moments of the outputs from the first `each` points of every scramble that has answers there."""
+        if not self.usable(each):
+            answers = int(self.ok[:, :each].any(axis=1).sum())
+            reasons = "; ".join(sorted(self._reasons)[:3])
+            message = f"{answers} of {self._method.scrambles} scrambles have an answer, expected more: {reasons}"
+            raise SolveError(message)
+        centre = self._centre
+        ok = self.ok[:, :each]
+        some = ok.any(axis=1)
+        deviations = np.where(ok[..., None], self.outputs[:, :each] - centre.outputs, 0.0)
+        controls, expected = self._controls(each) or (None, None)
+        products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
+        means = products[:, some] / ok.sum(axis=1)[some, None]
+        found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
+        unseen = np.where(found.second_coefficient == 0, 0.0, self._unseen(each))
+        return replace(found, std_error=np.hypot(found.std_error, unseen))
+
+    def _unseen(self, each: int) -> FloatArray:
+        """Error (m,) of the standard deviation from where a polynomial controls what no sample has seen.
+
+        With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
+        about 2λ√b σ, with λ in proportion to that at the samples, which have 1 − b of the variance. A tangent does not
+        grow faster than what it stands for.
+        """
+        control = self._control
+        controls = self._controls(each)
+        if control is None or controls is None or self._method.control == "tangent":
+            return np.zeros(self.outputs.shape[2])
+        ok = self.ok[:, :each]
+        outside = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
+        left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
+        return np.asarray(left.std(axis=0) * np.sqrt(outside) / np.maximum(1 - outside, 1 / ok.sum()))
+
+    def _controls(self, each: int) -> tuple[Pair, Pair] | None:
+        """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
+        if self._control is None:
+            return None
+        controls, expected = self._of(self._control, each)
+        held = self._which_held(each)
+        if self._held is not None and held.any():
+            (C, D), (C_mean, D_mean) = self._of(self._held, each)
+            controls = np.where(held, C, controls[0]), np.where(held, D, controls[1])
+            expected = np.where(held, C_mean, expected[0]), np.where(held, D_mean, expected[1])
+        return controls, expected
+
+    def _of(self, control: Control, each: int) -> tuple[Pair, Pair]:
+        """Return the same of one control."""
+        controls = control.predict(control.features(self.points[:, :each]), control.outputs)
+        return controls, control.expected(control.outputs)
+
+    def _which_held(self, each: int) -> NDArray[np.bool_]:
+        """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own."""
+        if self._control is None or self._held is None:
+            return np.zeros(self.outputs.shape[2], dtype=bool)
+        ok = self.ok[:, :each]
+        deviations = self.outputs[:, :each][ok] - self._centre.outputs
+        whole, held = (
+            ((deviations - control.predict(control.features(self.points[:, :each][ok]), control.outputs)[0]) ** 2)
+            for control in (self._control, self._held)
+        )
+        return np.asarray(whole.sum(axis=0) > held.sum(axis=0))
+
+    def influences(self, found: Estimates) -> FloatArray | None:
+        """By how much each sample (n, m) that has an answer moves the variance, with controls."""
+        known = self._controls(self.each)
+        if known is None:
+            return None
+        ok = self.in_order(self.ok)
+        C, D = (self.in_order(control)[ok] for control in known[0])
+        first = self.in_order(self.outputs)[ok] - self._centre.outputs
+        return influences(first - found.coefficient * C, first**2 - found.second_coefficient * D)
+
+    def field(self) -> Estimates | None:
+        """Estimate the moments of the state, where its sums were kept."""
+        counts = self.ok.sum(axis=1)
+        means = [total / n for total, n in zip(self._sums, counts, strict=True) if total is not None]
+        if not means:
+            return None
+        expected = None if self._field_control is None else self._field_control.expected(self._field_control.state)
+        replicates = np.stack(means, axis=1)
+        if self._which_held(self.each).any():
+            # What is known of the field is where the samples of the expansion are not: it controls nothing.
+            replicates, expected = replicates[:2], None
+        return estimate_from_replicates(replicates, self._centre.state, expected, self._method.coefficient)

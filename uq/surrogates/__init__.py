@@ -1,0 +1,1 @@
+"""Functions that stand for a model: expansions in polynomials, regressions, Taylor's."""

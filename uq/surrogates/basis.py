@@ -1,0 +1,231 @@
+"""Orthonormal polynomials of independent random parameters, and their derivatives.
+
+They are polynomials of standardised coordinates t, of the parameters or of logarithms (`uq.inputs.coordinates`), so
+that a derivative along t is one "per standard deviation". The orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} =
+(t − α_k) p_k − √β_k p_{k−1} (W. Gautschi, Orthogonal Polynomials (2004), section 1.3); p_0 = 1 and p_1 = t. Basis
+functions are products ψ_a(t) = Π_i p_{a_i}(t_i) over a set of multi-indices a.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations, permutations
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from uq.inputs.coordinates import Coordinates
+from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+
+IntArray = NDArray[np.int64]
+Real = TypeVar("Real", float, FloatArray)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """P orthonormal functions of d parameters.
+
+    Attributes
+    ----------
+    coordinates
+        What they are polynomials of.
+    alpha, beta
+        Recurrence coefficients (d, N + 1) of the standardised coordinates, for degrees up to N.
+    indices
+        Multi-indices (P, d): degree of each function in each parameter.
+    """
+
+    coordinates: Coordinates
+    alpha: FloatArray
+    beta: FloatArray
+    indices: IntArray
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return ψ (n, P) at points (n, d)."""
+        tables, _ = self._tables(points, derivatives=False)
+        return _products(tables, self.indices)
+
+    def at(self, point: FloatArray) -> FloatArray:
+        """Return ψ (P,) at one point (d,), without the overhead of arrays."""
+        result = np.ones(len(self.indices))
+        t = self.coordinates.of(point).tolist()
+        for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
+            table, _ = _recur(t[i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
+            result *= np.array(table)[self.indices[:, i]]
+        return result
+
+    def derivatives(self, points: FloatArray) -> FloatArray:
+        """Return ∂ψ/∂t_i (n, d, P) at points (n, d): the derivatives per standard deviation of the coordinates."""
+        return self.rows(points, gradients=True)[:, 1:]
+
+    def rows(self, points: FloatArray, *, gradients: bool) -> FloatArray:
+        """Return what a sample gives a regression (n, 1 + d, P): values and derivatives, or values (n, 1, P) alone."""
+        tables, slopes = self._tables(points, derivatives=gradients)
+        result = np.zeros((len(points), 1 + len(slopes), len(self.indices)))
+        result[:, 0] = _products(tables, self.indices)
+        for i, table in enumerate(slopes):
+            varying = np.flatnonzero(self.indices[:, i])
+            result[:, 1 + i, varying] = _products([*tables[:i], table, *tables[i + 1 :]], self.indices[varying])
+        return result
+
+    def of_one(self, i: int, t: FloatArray) -> FloatArray:
+        """Return the factor p_{a_i}(t) (n, P) that each function has of coordinate i, at values (n,) of it."""
+        degree = int(self.indices[:, i].max(initial=0))
+        table, _ = _recur(t, self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
+        return np.column_stack(table)[:, self.indices[:, i]]
+
+    def subset(self, which: IntArray) -> Basis:
+        """Return the basis of some of the functions, by their numbers."""
+        return replace(self, indices=self.indices[which])
+
+    def _tables(self, points: FloatArray, *, derivatives: bool) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return p_k(t_i) and p_k'(t_i), each a list over i of (n, N + 1)."""
+        t = self.coordinates.of(points)
+        values, slopes = [], []
+        for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
+            columns = _recur(t[:, i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=derivatives)
+            values.append(np.column_stack(columns[0]))
+            if derivatives:
+                slopes.append(np.column_stack(columns[1]))
+        return values, slopes
+
+
+def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
+    """Return the products (n, P) of the columns of d tables (n, N + 1) that multi-indices (P, d) name.
+
+    Columns 0 are one, and most indices of many parameters are zero.
+    """
+    result = np.ones((len(tables[0]), len(indices)))
+    for table, degrees in zip(tables, indices.T, strict=True):
+        varying = np.flatnonzero(degrees)
+        if varying.size == degrees.size:
+            result *= table[:, degrees]
+        elif varying.size:
+            result[:, varying] *= table[:, degrees[varying]]
+    return result
+
+
+def _recur(t: Real, alpha: list[float], beta: list[float], degree: int, *, derivatives: bool) -> tuple[list[Real], ...]:
+    """Return p_k(t) and (or nothing) p_k'(t) for k up to a degree, for numbers t or arrays of them."""
+    p, dp = [0 * t + 1], [0 * t]
+    for k in range(degree):
+        root, step = math.sqrt(beta[k + 1]), t - alpha[k]
+        back = math.sqrt(beta[k]) / root if k else 0.0
+        p.append(step * p[k] / root - (back * p[k - 1] if k else 0.0))
+        if derivatives:
+            dp.append((p[k] + step * dp[k]) / root - (back * dp[k - 1] if k else 0.0))
+    return p, dp
+
+
+def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
+    """Return the orthonormal polynomials of independent parameters with these multi-indices (P, d)."""
+    degree = int(indices.max(initial=1))
+    pairs = [recurrence(marginal, degree) for marginal in inputs.marginals.values()]
+    alpha, beta = (np.array(column) for column in zip(*pairs, strict=True))
+    return Basis(inputs.coordinates, alpha, beta, indices)
+
+
+@cache
+def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Return α and β (degree + 1,) of the standardised coordinate, with β_0 = 1; not to be written to.
+
+    Where they have no closed form they come from the Stieltjes procedure with the rule of the distribution.
+    """
+    match marginal:
+        case LogNormal():
+            marginal = Normal(mean=0.0, std=1.0)
+        case LogUniform():
+            marginal = Uniform(lower=0.0, upper=1.0)
+        case _:
+            pass
+    if marginal.closed and not marginal.logarithmic:
+        alpha, beta = marginal.recurrence(degree)
+        return alpha, beta
+    origin, offsets, weights = marginal.rule
+    x = np.log(origin + offsets) if marginal.logarithmic else offsets
+    t = x - weights @ x
+    t = t / np.sqrt(weights @ t**2)
+    alpha, beta = np.zeros(degree + 1), np.ones(degree + 1)
+    before, p = np.zeros_like(t), np.ones_like(t)
+    for k in range(degree + 1):
+        alpha[k] = weights @ (t * p**2)
+        p_next = (t - alpha[k]) * p - (np.sqrt(beta[k]) * before if k else 0.0)
+        if k < degree:
+            beta[k + 1] = weights @ p_next**2
+            before, p = p, p_next / np.sqrt(beta[k + 1])
+    return alpha, beta
+
+
+def gauss_rule(marginal: Distribution, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return points (count,) of the standardised coordinate and weights of the Gauss rule of a distribution.
+
+    The points are eigenvalues of the Jacobi matrix (G. H. Golub, J. H. Welsch, Math. Comp. 23 (1969) 221–230), the
+    weights 1/Σ p_k², which has small ones to all digits, other than the components of its eigenvectors.
+    """
+    from scipy.linalg import eigvalsh_tridiagonal
+
+    alpha, beta = recurrence(marginal, count - 1)
+    t = eigvalsh_tridiagonal(alpha, np.sqrt(beta[1:]))
+    values, _ = _recur(t, alpha.tolist(), beta.tolist(), count - 1, derivatives=False)
+    weights = 1 / (np.array(values) ** 2).sum(axis=0)
+    return t, weights / weights.sum()
+
+
+def gauss(inputs: Inputs, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the points (countᵈ, d) and weights of the tensor product of Gauss rules with `count` points each."""
+    nodes, weights = zip(*(gauss_rule(marginal, count) for marginal in inputs.marginals.values()), strict=True)
+    grid = inputs.coordinates.points(np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(nodes)))
+    products = np.ones(1)
+    for w in weights:
+        products = np.outer(products, w).ravel()
+    return grid, products
+
+
+def hyperbolic(dimension: int, order: int, q: float) -> IntArray:
+    """Return the multi-indices a (P, d) with (Σ a_i^q)^(1/q) ≤ order, by degree.
+
+    q = 1 is the full basis of that total degree; smaller q drop products of many parameters
+    (G. Blatman, B. Sudret, J. Comput. Phys. 230 (2011) 2345–2367).
+    """
+    blocks = [np.zeros((1, dimension), dtype=np.int64)]
+    for pattern in _patterns(dimension, order, q):
+        places = np.array(list(combinations(range(dimension), len(pattern))))
+        for degrees in sorted(set(permutations(pattern))):
+            block = np.zeros((len(places), dimension), dtype=np.int64)
+            np.put_along_axis(block, places, np.array(degrees)[None, :], axis=1)
+            blocks.append(block)
+    return by_degree(np.concatenate(blocks))
+
+
+def hyperbolic_count(dimension: int, order: int, q: float) -> int:
+    """Return the number of rows of `hyperbolic`, without making them."""
+    return 1 + sum(
+        math.comb(dimension, len(pattern))
+        * math.factorial(len(pattern))
+        // math.prod(math.factorial(pattern.count(degree)) for degree in set(pattern))
+        for pattern in _patterns(dimension, order, q)
+    )
+
+
+def _patterns(dimension: int, order: int, q: float) -> Iterator[tuple[int, ...]]:
+    """Yield the degrees other than zero that the indices of `hyperbolic` have, in falling order."""
+    budget = order**q * (1 + 1e-12)
+    longer: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+    while longer:
+        pattern, spent = longer.pop()
+        if pattern:
+            yield pattern
+        if len(pattern) < dimension:
+            largest = pattern[-1] if pattern else order
+            longer += [((*pattern, k), spent + k**q) for k in range(1, largest + 1) if spent + k**q <= budget]
+
+
+def by_degree(indices: IntArray) -> IntArray:
+    """Sort multi-indices (P, d) by total degree, and those of one degree by the first parameters."""
+    return np.asarray(indices[np.lexsort((*(-indices.T[::-1]), indices.sum(axis=1)))])

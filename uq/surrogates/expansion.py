@@ -1,0 +1,125 @@
+"""The expansion of a finished study as a function of its parameters."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.model import FloatArray
+from uq.inputs.coordinates import Coordinates
+from uq.surrogates.basis import Basis
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class OutsideRangeWarning(UserWarning):
+    """Points where an expansion was not fitted."""
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """A polynomial that stands for a model, for any number of points at once.
+
+    Attributes
+    ----------
+    parameters, output_names
+        Names of the d parameters and of the m outputs.
+    basis
+        The P functions.
+    coefficients
+        (P, m).
+    lower, upper
+        Range (d,) of the parameters: their support, or that of the samples where a distribution has tails.
+    fields
+        Coefficients (P, nodes, 3) of the displacement field, in m, where it was expanded.
+    """
+
+    parameters: tuple[str, ...]
+    output_names: tuple[str, ...]
+    basis: Basis
+    coefficients: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    fields: FloatArray | None = None
+    _told: list[str] = field(default_factory=list, repr=False, compare=False)
+
+    def outputs(self, points: FloatArray) -> FloatArray:
+        """Return the outputs (n, m) at points (n, d)."""
+        return self.basis.values(self._checked(points)) @ self.coefficients
+
+    def tangents(self, points: FloatArray) -> FloatArray:
+        """Return the derivatives dψ/dω (n, m, d) at points (n, d)."""
+        points = self._checked(points)
+        slopes = self.basis.derivatives(points) @ self.coefficients
+        return np.asarray(np.swapaxes(slopes, 1, 2) / self.basis.coordinates.steps(points)[:, None, :])
+
+    def displacements(self, points: FloatArray) -> FloatArray:
+        """Return the displacement fields (n, nodes, 3) at points (n, d), in m.
+
+        Raises
+        ------
+        ValueError
+            If the field was not expanded.
+        """
+        if self.fields is None:
+            message = "the field was not expanded, expected a study with method.fields = true"
+            raise ValueError(message)
+        return np.asarray(np.tensordot(self.basis.values(self._checked(points)), self.fields, axes=1))
+
+    def _checked(self, points: FloatArray) -> FloatArray:
+        points = np.asarray(points, dtype=float)
+        if points.ndim != 2 or points.shape[1] != len(self.parameters):
+            message = f"points of shape {points.shape}, expected (n, {len(self.parameters)})"
+            raise ValueError(message)
+        slack = 1e-12 * (self.upper - self.lower)
+        outside = ((points < self.lower - slack) | (points > self.upper + slack)).any(axis=0)
+        if outside.any() and not self._told:
+            names = [name for name, out in zip(self.parameters, outside, strict=True) if out]
+            self._told.extend(names)
+            message = f"points outside the range where the expansion was fitted, in: {', '.join(names)}"
+            warnings.warn(message, OutsideRangeWarning, stacklevel=3)
+        return points
+
+
+def load(source: str | Path | xr.Dataset) -> Expansion:
+    """Make the expansion of a finished study callable.
+
+    Parameters
+    ----------
+    source
+        The results directory, its results.nc, or the dataset.
+
+    Raises
+    ------
+    ValueError
+        If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
+    """
+    import xarray as xr
+
+    if isinstance(source, str | Path):
+        path = Path(source)
+        source = xr.load_dataset(path / "results.nc" if path.is_dir() else path, engine="h5netcdf")
+    if "multi_index" not in source:
+        message = "these results hold no expansion, expected those of method.kind = 'chaos'"
+        raise ValueError(message)
+    arrays = {str(name): variable.to_numpy() for name, variable in source.data_vars.items()}
+    basis = Basis(
+        Coordinates(arrays["coordinate_logarithmic"].astype(bool), arrays["coordinate_mean"], arrays["coordinate_std"]),
+        arrays["recurrence_alpha"],
+        arrays["recurrence_beta"],
+        arrays["multi_index"],
+    )
+    return Expansion(
+        tuple(map(str, source["parameter"].values)),
+        tuple(map(str, source["output"].values)),
+        basis,
+        arrays["coefficients"],
+        arrays["range_lower"],
+        arrays["range_upper"],
+        arrays.get("field_coefficients"),
+    )

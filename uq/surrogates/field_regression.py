@@ -1,0 +1,171 @@
+"""Regression of whole states: the coefficients of a field from sums over the samples, and states predicted by them.
+
+The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
+of the largest basis that may be chosen. These rows are summed where blocks are added, from the d + 1 fields of a sample
+that the blocks carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray, ForwardModel, Reference, Solution
+from uq.evaluation.evaluate import Evaluate, Request
+from uq.inputs.random_parameters import Inputs
+from uq.surrogates.basis import Basis, orthonormal
+from uq.surrogates.linearisation import Linearisation
+from uq.surrogates.regression import Data, Fit, candidates_of, fit_best, rows_of
+
+FIELD_DICTIONARY = 500  # functions to select from, at most: a field in memory for each
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
+
+    A compact sum: blocks carry y_z, the deviation and its slopes.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    state
+        State (U,) at the mean parameters.
+    gradients
+        Whether derivatives give rows too.
+    points, weights
+        Points (n, d) whose weights (n,) are not one.
+    """
+
+    basis: Basis
+    state: FloatArray
+    gradients: bool
+    points: FloatArray | None
+    weights: FloatArray | None
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → y_z of one group's model."""
+        state = model.scatter(self.state[None, :])[0]
+
+        def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
+            deviation: FloatArray = (solution.state - state)[None, :]
+            if not self.gradients:
+                return deviation
+            directions = np.diag(self.basis.coordinates.steps(parameters))
+            return np.vstack([deviation, solution.state_tangent(directions)])
+
+        return rows
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return Σ A_zᵀ y_z and Σ |y_z|² (P + 1, U) from the rows y_z (n, 1 + d, U) or (n, 1, U)."""
+        left = self.basis.rows(points, gradients=self.gradients)
+        weighted = rows
+        if self.points is not None and self.weights is not None:
+            which = [int(np.flatnonzero((self.points == point).all(axis=1))[0]) for point in points]
+            weighted = self.weights[which][:, None, None] * rows
+        total = np.empty((left.shape[2] + 1, rows.shape[2]))
+        np.matmul(left.reshape(-1, left.shape[2]).T, weighted.reshape(-1, rows.shape[2]), out=total[:-1])
+        np.einsum("zru,zru->u", rows, weighted, out=total[-1])
+        return total
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Expansion of the deviations of outputs and state from those at the mean parameters.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    outputs, state
+        Coefficients (P, m) and (P, U); (P, 0) where the state was not wanted.
+    relative
+        Leave-one-out errors (m,) of the outputs over their standard deviation.
+    ok
+        Which samples (n,) had an answer and were fitted.
+    prediction
+        Of the state, from which the solver may start; nothing where the state was not wanted.
+    reach
+        Lowest and highest coordinates (2, d) of the samples that were fitted.
+    """
+
+    basis: Basis
+    outputs: FloatArray
+    state: FloatArray
+    relative: FloatArray
+    ok: NDArray[np.bool_]
+    prediction: StateExpansion | None
+    reach: FloatArray
+
+
+def fit_deviations(
+    inputs: Inputs, evaluate: Evaluate, centre: Linearisation, points: FloatArray, max_order: int, *, fields: bool
+) -> Deviations:
+    """Fit an expansion to values and gradients at points (n, d), outputs and whole state alike.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at too many of the points for an expansion of order 1.
+    """
+    candidates = candidates_of(inputs, max_order, len(points) * rows_of(inputs, gradients=True), FIELD_DICTIONARY)
+    largest = orthonormal(inputs, candidates.all)
+    wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
+    evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
+    data = Data.of(evaluations, inputs, None)
+    fit = fit_best(candidates, largest, data)
+    basis = largest.subset(fit.chosen.which)
+    outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
+    state, prediction = np.zeros((len(outputs), 0)), None
+    if wanted is not None:
+        state = solved(fit, evaluations.fields[fit.chosen.which])
+        prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
+    t = inputs.coordinates.of(data.points)
+    reach = np.array([t.min(axis=0), t.max(axis=0)])
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach)
+
+
+@dataclass(frozen=True)
+class StateExpansion:
+    """A prediction of the whole state by its expansion, with the factor at a point near all samples.
+
+    Attributes
+    ----------
+    basis
+        The P functions.
+    coefficients
+        (P, U), in canonical order.
+    point, state
+        Parameters (d,) of the factor, and the state (U,) there.
+    spread
+        Standard deviations (d,) of the parameters.
+    """
+
+    basis: Basis
+    coefficients: FloatArray
+    point: FloatArray
+    state: FloatArray
+    spread: FloatArray
+
+    @classmethod
+    def fitted(cls, basis: Basis, fit: Fit, fields: FloatArray, centre: Linearisation) -> StateExpansion:
+        """Solve the regression `fit` on the functions of `basis` for the state too, from the sums of `Projections`."""
+        coefficients = solved(fit, fields[fit.chosen.which])
+        coefficients[(basis.indices == 0).all(axis=1)] += centre.state
+        return cls(basis, coefficients, centre.point, centre.state, centre.spread)
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+        coefficients, state = model.scatter(self.coefficients), model.scatter(self.state[None, :])[0]
+        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state, self.spread)
+
+
+def solved(fit: Fit, projections: FloatArray) -> FloatArray:
+    """Coefficients (P, U) of the regression on what has these projections (P, U)."""
+    from scipy.linalg import cho_solve
+
+    return np.asarray(cho_solve((fit.triangle, False), projections))

@@ -1,0 +1,180 @@
+"""The model and its derivatives at the mean parameters: local sensitivities, control variates and predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from forward.settings import Settings
+from uq.evaluation.evaluate import Evaluate, Prediction, Request
+from uq.inputs.coordinates import Coordinates
+from uq.inputs.random_parameters import Inputs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+MANY = 256  # parameters above which the state has no slopes: each would be a field to keep and to send
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A model at one point, with its derivatives there.
+
+    Attributes
+    ----------
+    point
+        Parameters (d,).
+    outputs
+        ψ̄ (m,).
+    tangents
+        dψ/dω (m, d); NaN for a model without derivatives.
+    state
+        ū (U,) in canonical order.
+    slopes
+        dū/dω (d, U); empty (0, U) for a model without derivatives or of more than `MANY` parameters.
+    coordinates
+        What predictions are linear in.
+    spread
+        Standard deviations (d,) of the parameters.
+    """
+
+    point: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+    coordinates: Coordinates
+    spread: FloatArray
+
+    @property
+    def prediction(self) -> Prediction | None:
+        """The prediction of the state, linear where there are slopes; None for a model without derivatives."""
+        if self.state.size == 0 or np.isnan(self.tangents).all():
+            return None
+        return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread)
+
+    @property
+    def output_slopes(self) -> FloatArray:
+        """Derivatives dψ/dt (m, d) of the outputs along the coordinates."""
+        return self.tangents * self.coordinates.steps(self.point)
+
+    @property
+    def state_slopes(self) -> FloatArray:
+        """Derivatives dū/dt (d, U) of the state along the coordinates, or none (0, U)."""
+        if len(self.slopes) == 0:
+            return self.slopes
+        return self.slopes * self.coordinates.steps(self.point)[:, None]
+
+    @property
+    def middle(self) -> FloatArray:
+        """What the tangents predict for the outputs (m,) at the mean coordinates: the mean of their prediction.
+
+        The mean parameters are there, but where coordinates are logarithms. Without derivatives it is the outputs.
+        """
+        if np.isnan(self.tangents).all():
+            return self.outputs
+        return np.asarray(self.outputs - self.output_slopes @ self.coordinates.of(self.point))
+
+    @property
+    def state_middle(self) -> FloatArray:
+        """The same for the state (U,); the state itself where it has no slopes."""
+        if len(self.slopes) == 0:
+            return self.state
+        return np.asarray(self.state - self.coordinates.of(self.point) @ self.state_slopes)
+
+
+@dataclass(frozen=True)
+class _StateAndSlopes:
+    slopes: bool
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        if not self.slopes:
+            return lambda solution, _: solution.state[None, :]
+        directions = np.eye(len(model.parameters))
+        return lambda solution, _: np.vstack([solution.state, solution.state_tangent(directions)])
+
+
+def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = None) -> Linearisation:
+    """Solve at a point (d,), by default the mean parameters, with all derivatives (of the state, up to `MANY`).
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer there.
+    """
+    derivatives = evaluate.differentiable
+    slopes = derivatives and len(evaluate.parameters) <= MANY
+    centre = inputs.mean if point is None else point
+    found = evaluate(Request(centre[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
+    for failure in found.failures:
+        message = (
+            f"the model has no answer at {'the mean' if point is None else 'the given'} parameters: {failure.reason}"
+        )
+        raise SolveError(message, failure.history)
+    m, d = len(evaluate.outputs), len(evaluate.parameters)
+    tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
+    fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
+    return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates, inputs.std)
+
+
+class LocalSensitivity(Settings):
+    """Derivatives of all outputs and of the displacement field at the mean parameters: one solve and its tangents.
+
+    Results: `derivative` dψ/dω, `derivative_per_std` (times the standard deviation of the parameter),
+    `derivative_per_range` (times upper − lower, for bounded distributions), and `field_derivative` du/dω at every node.
+    """
+
+    kind: Literal["local-sensitivity"] = "local-sensitivity"
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves, whatever the number of parameters."""
+        return 1
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Linearise at the mean parameters.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer there.
+        """
+        if not evaluate.differentiable:
+            message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
+            raise ModelError(message)
+        return local_dataset(inputs, evaluate, linearise(inputs, evaluate), fields=True)
+
+
+def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> xr.Dataset:
+    """Return nominal values and local derivatives as labelled arrays."""
+    import xarray as xr
+
+    ranges = np.array([np.nan if m.support is None else m.support[1] - m.support[0] for m in inputs.marginals.values()])
+    data: dict[str, tuple[tuple[str, ...], FloatArray]] = {
+        "nominal": (("output",), centre.outputs),
+        "parameter_mean": (("parameter",), inputs.mean),
+        "parameter_std": (("parameter",), inputs.std),
+        "parameter_range": (("parameter",), ranges),
+    }
+    if evaluate.differentiable:
+        data |= {
+            "derivative": (("output", "parameter"), centre.tangents),
+            "derivative_per_std": (("output", "parameter"), centre.tangents * inputs.std),
+            "derivative_per_range": (("output", "parameter"), centre.tangents * ranges),
+        }
+    coordinates: dict[str, list[str]] = {
+        "output": list(evaluate.outputs),
+        "parameter": list(evaluate.parameters),
+    }
+    if fields and centre.state.size:
+        count = evaluate.displacements
+        coordinates["component"] = ["x", "y", "z"]
+        data["field_nominal"] = (("node", "component"), centre.state[:count].reshape(-1, 3))
+        if len(centre.slopes):
+            slopes = centre.slopes[:, :count]
+            shape = (len(slopes), -1, 3)
+            data["field_derivative"] = (("parameter", "node", "component"), slopes.reshape(shape))
+    return xr.Dataset(data, coords=coordinates)

@@ -1,0 +1,252 @@
+"""Polynomials that stand for a model and whose moments are known exactly: control variates.
+
+A control is C(ω) = Σ_k φ_k(ω) c_k, of features φ whose moments are known. E[C] = Σ E[φ_k] c_k is exact whatever the
+coefficients are, as long as they do not depend on the samples that are controlled: an error of theirs costs efficiency
+and never bias. So is E[C²] = Σ c_k E[φ_kφ_l] c_l. For the Taylor polynomials around the mean parameters, with the
+deviation δ = t − t̄ of the coordinates (`uq.inputs.coordinates`), φ = (δ_i; ½δ_i², δ_iδ_j for i < j) and c = (∂ψ/∂t_i;
+∂²ψ/∂t_i∂t_j).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
+from uq.evaluation.evaluate import Evaluate, Request
+from uq.inputs.coordinates import Coordinates
+from uq.inputs.distributions import Distribution
+from uq.inputs.quadrature import panels
+from uq.inputs.random_parameters import Inputs
+from uq.surrogates.basis import Basis, gauss_rule
+from uq.surrogates.field_regression import Deviations
+from uq.surrogates.linearisation import Linearisation
+
+STEP = 0.5  # of the difference quotients, in standard deviations: wide, to see the curvature where the samples lie
+MARGIN = 0.25  # of the reach of its samples, by which an expansion is followed beyond them on either side
+FAR = 9.0  # standard deviations beyond which a normal density is nothing
+EDGE = 1e-9  # probability of the quantile that takes the place of the end of an unbounded range
+
+
+class Features(Protocol):
+    """Functions φ of the parameters."""
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+
+
+@dataclass(frozen=True)
+class Monomials:
+    """The features of a Taylor polynomial: deviations δ from `point` (d,), and products of `pairs` (i, j), i ≤ j."""
+
+    coordinates: Coordinates
+    point: FloatArray
+    pairs: tuple[tuple[int, int], ...] = ()
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+        deviation = self.coordinates.of(points) - self.coordinates.of(self.point)
+        second = [(0.5 if i == j else 1.0) * deviation[:, i] * deviation[:, j] for i, j in self.pairs]
+        return np.column_stack([deviation, *second])
+
+
+@dataclass(frozen=True)
+class Control:
+    """A polynomial that stands for the deviations of the outputs and of the state from those at the mean parameters.
+
+    Attributes
+    ----------
+    polynomials
+        The k features.
+    outputs, state
+        Coefficients (k, m) and (k, U); no state (0, U) where the slopes of the state are not known.
+    features_mean
+        E[φ] (k,).
+    features_second
+        E[φφᵀ] (s, s) of the first s features, s = k, or d where the fourth moments of the inputs are not known: the
+        square of what these predict is the control of the second moment.
+    """
+
+    polynomials: Features
+    outputs: FloatArray
+    state: FloatArray
+    features_mean: FloatArray
+    features_second: FloatArray
+
+    def features(self, points: FloatArray) -> FloatArray:
+        """Return φ (…, k) at points (…, d)."""
+        return self.polynomials.values(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:-1], -1)
+
+    def predict(self, features: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the controls C and D (…, q) of the deviation and of its square, from φ (…, k) and c (k, q)."""
+        s = len(self.features_second)
+        whole = features @ coefficients
+        leading = whole if s == len(coefficients) else features[..., :s] @ coefficients[:s]
+        return whole, np.square(leading)
+
+    def expected(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return E[C] and E[D] (q,)."""
+        leading = coefficients[: len(self.features_second)]
+        return self.features_mean @ coefficients, (leading * (self.features_second @ leading)).sum(axis=0)
+
+
+def expansion(fitted: Deviations) -> Control:
+    """Return the control that an expansion in orthonormal polynomials is: E[φφᵀ] = 1, E[φ] is 1 for the constant."""
+    constant = (fitted.basis.indices == 0).all(axis=1)
+    return Control(fitted.basis, fitted.outputs, fitted.state, constant.astype(float), np.eye(constant.size))
+
+
+def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
+    """Return the outputs' control that the expansion is within the reach of its samples and `MARGIN`, held beyond.
+
+    There the expansion itself is a guess that no sample supports, while E[φφᵀ] counts it in full. None where all
+    parameters have ends, up to which samples reach.
+    """
+    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    if not tails.any():
+        return None
+    lower, upper = fitted.reach
+    more = MARGIN * (upper - lower)
+    held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
+    mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))
+    for i, marginal in enumerate(inputs.marginals.values()):
+        if tails[i]:
+            t, weights = _normal_rule(marginal, held.lower[i], held.upper[i])
+            table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
+        else:
+            t, weights = gauss_rule(marginal, int(fitted.basis.indices[:, i].max()) + 1)
+            table = fitted.basis.of_one(i, t)
+        mean *= weights @ table
+        second *= table.T @ (weights[:, None] * table)
+    return Control(held, fitted.outputs, fitted.state[:0], mean, second)
+
+
+@dataclass(frozen=True)
+class Held:
+    """Functions of the parameters that beyond a range (d,) of the coordinates keep the values at its edge."""
+
+    basis: Basis
+    lower: FloatArray
+    upper: FloatArray
+
+    def values(self, points: FloatArray) -> FloatArray:
+        """Return φ (n, k) at points (n, d)."""
+        coordinates = self.basis.coordinates
+        return self.basis.values(coordinates.points(np.clip(coordinates.of(points), self.lower, self.upper)))
+
+
+def _normal_rule(marginal: Distribution, lower: float, upper: float) -> tuple[FloatArray, FloatArray]:
+    """Coordinates t and weights of a rule for what has kinks at the coordinates lower and upper."""
+    from scipy.special import ndtri
+
+    alone = Inputs({"": marginal}).coordinates
+    p = marginal.cumulative(alone.points(np.array([[lower], [upper]]))[:, 0])
+    kinks = np.clip(ndtri(p), -FAR, FAR).tolist()
+    z, weights = panels(sorted({*np.linspace(-FAR, FAR, 7).tolist(), *kinks}))
+    weights = weights * np.exp(-(z**2) / 2)
+    return alone.of(marginal.from_normal(z)[0][:, None])[:, 0], weights / weights.sum()
+
+
+def tangent(inputs: Inputs, centre: Linearisation) -> Control:
+    """Return the Taylor polynomial of first degree: E[φ] = −t̄, and E[φφᵀ] the correlation of t, and t̄t̄ᵀ."""
+    middle = -inputs.coordinates.of(centre.point)
+    second = inputs.correlation + np.outer(middle, middle)
+    features = Monomials(inputs.coordinates, centre.point)
+    return Control(features, centre.output_slopes.T, centre.state_slopes, middle, second)
+
+
+def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> Control:
+    """Return the Taylor polynomial of second degree, by central differences of tangents: two solves for each parameter.
+
+    E[φ] follows from the correlation of the coordinates. E[φφᵀ] needs their moments up to the fourth, which are known
+    where the inputs are independent; with a copula the second moment is controlled by the square of the tangent alone.
+
+    Parameters
+    ----------
+    inputs, evaluate
+        Where, and of what.
+    centre
+        The linearisation at the mean parameters.
+    fields
+        Whether the coefficients of the state are wanted: d(d + 1)/2 fields.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at one of the displaced points.
+    """
+    d, coordinates = len(centre.point), inputs.coordinates
+    pairs = tuple((i, j) for i in range(d) for j in range(i, d))
+    middle, steps = coordinates.of(centre.point), _steps(inputs)
+    displaced = coordinates.points(middle + np.concatenate([np.diag(steps), -np.diag(steps)]))
+    wanted = _SecondDerivatives(coordinates, centre.point, pairs) if fields and centre.slopes.size else None
+    found = evaluate(Request(displaced, tangents=True, fields=wanted, start=centre.prediction))
+    for failure in found.failures:
+        message = (
+            f"the model has no answer near the mean parameters, which control = 'quadratic' needs: {failure.reason}"
+        )
+        raise SolveError(message, failure.history)
+    assert found.tangents is not None
+    # (2d, m, d): ∂ψ/∂t_j; (d, m, d): ∂/∂t_i of it
+    slopes = found.tangents * coordinates.steps(displaced)[:, None, :]
+    differences = (slopes[:d] - slopes[d:]) / (2 * steps[:, None, None])
+    hessian = np.array([(differences[i, :, j] + differences[j, :, i]) / 2 for i, j in pairs])
+    state = np.concatenate([centre.state_slopes, found.fields]) if wanted is not None else centre.slopes[:0]
+    exponents = np.concatenate([np.eye(d, dtype=int), [np.eye(d, dtype=int)[[i, j]].sum(axis=0) for i, j in pairs]])
+    factors = np.array([1.0] * d + [0.5 if i == j else 1.0 for i, j in pairs])
+    linear = tangent(inputs, centre)
+    first = linear.features_mean
+    mean = factors * np.append(first, [linear.features_second[i, j] for i, j in pairs])
+    second = linear.features_second if inputs.correlations else _second_moments(inputs, middle, exponents, factors)
+    outputs = np.concatenate([centre.output_slopes.T, hessian])
+    return Control(Monomials(coordinates, centre.point, pairs), outputs, state, mean, second)
+
+
+def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, factors: FloatArray) -> FloatArray:
+    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by Gauss rules that are exact for it."""
+    moments = []
+    for marginal, at in zip(inputs.marginals.values(), middle, strict=True):
+        t, weights = gauss_rule(marginal, 3)
+        moments.append([weights @ (t - at) ** k for k in range(5)])
+    total = exponents[:, None, :] + exponents[None, :, :]
+    products = np.prod(np.array(moments)[np.arange(len(middle)), total], axis=-1)
+    return np.asarray(factors[:, None] * factors[None, :] * products)
+
+
+def _steps(inputs: Inputs) -> FloatArray:
+    """Steps (d,) of the differences along the coordinates: no further than half the way to an end of the range."""
+    marginals = inputs.marginals.values()
+    supports = [marginal.support or (marginal.at(EDGE), marginal.at(1 - EDGE)) for marginal in marginals]
+    lower, upper = inputs.coordinates.of(np.array(supports).T)
+    middle = inputs.coordinates.of(inputs.mean)
+    return np.asarray(np.minimum(STEP, np.minimum(middle - lower, upper - middle) / 2))
+
+
+@dataclass(frozen=True)
+class _SecondDerivatives:
+    """Sums up to ∂²u/∂t_i∂t_j over points that are displaced from t̄ by ± h_i along one coordinate each."""
+
+    coordinates: Coordinates
+    point: FloatArray
+    pairs: tuple[tuple[int, int], ...]
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        here = self.coordinates.of(self.point)
+
+        def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
+            step = self.coordinates.of(parameters) - here
+            moved = int(np.abs(step).argmax())
+            directions = np.diag(self.coordinates.steps(parameters))
+            slopes = solution.state_tangent(directions) / (2 * step[moved])
+            total = np.zeros((len(self.pairs), slopes.shape[1]))
+            for k, (i, j) in enumerate(self.pairs):
+                if moved == i:
+                    total[k] += slopes[j] / 2
+                if moved == j:
+                    total[k] += slopes[i] / 2
+            return total
+
+        return rows

@@ -1,0 +1,50 @@
+"""Priors that reach where there is no material: what is refused, and what is said of the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from forward.hyperelastic import Mistake
+from forward.materials.admissible import Materials
+from forward.model import Finding
+from uq.inputs.random_parameters import Inputs
+
+LEAST = 0.5  # probability that constants must have to be of a material at all
+
+
+def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mistake]:
+    """Find distributions of constants of which most are of no material; they are judged together."""
+    if inputs.admitted >= LEAST:
+        return
+    middle = inputs.from_normals(np.zeros((1, len(inputs.names))))[0][0]
+    objection = materials.objection(dict(zip(inputs.names, map(float, middle), strict=True)))
+    said = f"; at the medians, {objection}" if objection is not None else ""
+    message = f"{100 * (1 - inputs.admitted):.3g} % of the values are impossible{said}"
+    yield ("parameters",), message, list(materials.names)
+
+
+def findings_of_materials(inputs: Inputs, where: str = "") -> Iterator[Finding]:
+    """Say how much of a prior is of no material, and that the rest takes its place."""
+    if inputs.admitted < 1:
+        text = (
+            f"{where}{_share(inputs)} of the prior is of materials that are not stable at rest (μ or κ is not "
+            "positive): it has no weight, and the prior is scaled up where there is a material."
+        )
+        yield Finding("note", text)
+
+
+def findings_of_draws(inputs: Inputs) -> Iterator[Finding]:
+    """Say how many of the samples will be of no material, and that they fail."""
+    if inputs.admitted < 1:
+        text = (
+            f"{_share(inputs)} of the samples are of materials that are not stable at rest (μ or κ is not positive): "
+            "they count as failed, and results are over the others. A bounded distribution leaves them out."
+        )
+        yield Finding("warning", text)
+
+
+def _share(inputs: Inputs) -> str:
+    share = 100 * (1 - inputs.admitted)
+    return f"{share:.2g} %" if share > 0.01 else "less than 0.01 %"

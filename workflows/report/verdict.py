@@ -1,0 +1,257 @@
+"""What a comparison of models, or an inversion, says in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.model import Finding, Severity
+from uq.findings import add
+from workflows.report.words import number, with_error
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from inverse.criticism.doubts import Doubt
+    from uq.evaluation.evaluate import Evaluations
+    from uq.inputs.distributions import Distribution
+    from uq.inputs.random_parameters import Inputs
+    from workflows.studies.inversion import Inversion
+
+DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
+SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
+GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
+
+
+def grade(log_bayes_factor: float) -> str:
+    """Return the word for ln B ≥ 0 (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995) 773–795)."""
+    return next((word for limit, word in GRADES if log_bayes_factor < limit), "very strong")
+
+
+def ranking(values: xr.DataArray) -> list[str]:
+    """Names of the models, the one with the largest value first."""
+    return [str(name) for name in values.model.values[np.argsort(-values.to_numpy(), kind="stable")]]
+
+
+def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
+    """Say in which way the residuals of a model are not what it says of them; nothing where they may be."""
+    of_model = dataset.sel(model=model)
+    asked = 2 * dataset.sizes["group"]
+    said = []
+    for name, words in (
+        ("misfit_probability", "are larger than the errors"),
+        ("correlation_probability", "follow one another along the tests, as errors would not"),
+    ):
+        chances = of_model[name]
+        bad = [
+            str(group) for group, p in zip(dataset.group.values, chances.values, strict=True) if p * asked < SUSPICIOUS
+        ]
+        if bad:
+            where = f" in {', '.join(bad)}" if dataset.sizes["group"] > 1 else ""
+            smallest = float(chances.min())
+            said.append(f"{words}{where} ({_chance(smallest)})")
+    return said
+
+
+def findings(dataset: xr.Dataset) -> list[Finding]:
+    """Say which model the data support, by how much, how sure that is and what it depends on."""
+    order = ranking(dataset["log_evidence"])
+    best = order[0]
+    P = float(dataset["probability"].sel(model=best))
+    said: list[Finding] = []
+    if len(order) > 1:
+        ln_B, error = bayes_factor(dataset, best, order[1])
+        support = (
+            f"{best} is the most probable of the candidates, with {number(100 * P, 4)} %; ln of the Bayes factor over "
+            f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B)}."
+        )
+    else:
+        support = f"{best} is the only candidate."
+    said.append(Finding("note", support))
+    wrong = conflicts(dataset, best)
+    if wrong:
+        said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
+    changed = []
+    for variant in dataset.variant.values[1:]:
+        other = ranking(dataset["variant_log_evidence"].sel(variant=variant))
+        if other[0] != best:
+            changed.append(f"{other[0]} with {variant}")
+        elif other != order:
+            said.append(
+                Finding("note", f"With {variant}, {best} stays first but the order changes: {', '.join(other)}.")
+            )
+    if changed:
+        said.append(Finding("warning", f"It depends: the most probable is {'; '.join(changed)}."))
+    predicts = ranking(dataset["score"])[0]
+    if predicts != best:
+        said.append(Finding("warning", f"Left-out data are predicted best by {predicts}."))
+    if "held_out_score" in dataset:
+        predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
+        if predicts != best:
+            said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
+    doubtful = _doubtful(dataset, order)
+    if doubtful:
+        text = f"Evidences not to be trusted: {', '.join(doubtful)}; more points may help (method.samples)."
+        said.append(Finding("warning", text))
+    return said
+
+
+def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
+    """Evidences that cannot be trusted, each with what its weights are worth."""
+    from inverse.criticism.weights import worth
+
+    found = []
+    for model in order:
+        for group in dataset.group.values:
+            one = dataset.sel(model=model, group=group)
+            if not bool(one["trusted"]):
+                where = f"{model} in {group}" if dataset.sizes["group"] > 1 else model
+                count = int(np.isfinite(one["point"].to_numpy()).any(axis=-1).sum())
+                found.append(f"{where} ({worth(float(one['tail']), float(one['effective']), count)})")
+    return found
+
+
+def doubts_of_selection(
+    dataset: xr.Dataset, candidates: Mapping[str, Inputs], noise: Distribution | None
+) -> list[Finding]:
+    """Say what is doubtful of the most probable candidate: its constants, its errors, and data that do not belong.
+
+    Parameters
+    ----------
+    dataset
+        What was found.
+    candidates
+        Their random constants, by name.
+    noise
+        Prior of the factor on the errors, if it was inferred.
+    """
+    from inverse.criticism import doubts as criticism
+    from inverse.criticism.weights import resampled
+
+    best = ranking(dataset["log_evidence"])[0]
+    inputs = candidates[best]
+    names = list(inputs.names)
+    said: list[Finding] = []
+    for group in map(str, dataset.group.values):
+        of = dataset.sel(model=best, group=group)
+        mode, mean = (of[f"constant_{name}"].sel(parameter=names).to_numpy() for name in ("mode", "mean"))
+        weights = of["point_weight"].to_numpy()
+        draws = of["point"].sel(parameter=names).transpose("point", "parameter").to_numpy()
+        draws = draws[resampled(weights, DRAWS, 0)]
+        found = criticism.at_an_end(inputs.marginals, mode, draws)
+        found += criticism.far_from_prior(inputs.marginals, mode, mean, 0.0, 0.0)
+        here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
+        rows = dataset.isel(output=here)
+        values, sigma, factor = rows["measured"].to_numpy(), rows["sigma"].to_numpy(), 1.0
+        if noise is not None:
+            factor = float(of["constant_mode"].sel(parameter="noise"))
+            found += criticism.noise_far(factor, noise.at(0.5), sigma, values)
+        residual = (rows["prediction_mean"].sel(model=best).to_numpy() - values) / (factor * sigma)
+        labels = [
+            f"{test} at {number(float(at), 4)}"
+            for test, at in zip(rows["output_test"].values, rows["output_at"].values, strict=True)
+        ]
+        found += criticism.strangers(residual, np.zeros(len(residual)), labels, heavy=False, remedy="")
+        where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
+        said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
+    return said
+
+
+NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md
+SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
+
+
+def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
+    """Look for all that makes the posteriors of an inversion doubtful; return the results with verdicts that say so."""
+    words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
+    said: list[Finding] = []
+    for k, name in enumerate(dataset.data_set.values):
+        if not bool(dataset["ok"][k]):
+            said.append(Finding("warning", f"{name} could not be inverted: {words[k]}"))
+            continue
+        doubts = doubts_of(dataset.isel(data_set=k), study, k)
+        words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
+        said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
+        said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
+    found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
+    add(found, *said)
+    return found
+
+
+def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
+    """Return the sentence and the number of a verdict, given what it was before anything was doubted."""
+    errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
+    warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
+    if trust == NEITHER:
+        return "; ".join([words, *errors, *warnings]), NEITHER
+    if errors:
+        return f"not to be trusted: {'; '.join([*errors, *warnings])}", NEITHER
+    if warnings:
+        return f"doubtful: {'; '.join(warnings)}; but for that: {words}", DOUBTFUL
+    return words, trust
+
+
+def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
+    """Say what is doubtful of one data set, by its number."""
+    from inverse.criticism import doubts as criticism
+    from uq.inputs.distributions import Normal
+
+    found: list[Doubt] = []
+    names = [str(name) for name in one.parameter.values]
+    mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
+    square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
+    d = len(names) - (study.method.noise is not None)
+    if study.field:
+        centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
+        priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
+    else:
+        priors = dict(study.inputs.marginals)
+        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d])
+    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees)
+    seen = np.isfinite(one["measured"].to_numpy())
+    residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
+    if study.method.noise is not None:
+        sigma, measured = one["sigma"].to_numpy()[seen], one["measured"].to_numpy()[seen]
+        found += criticism.noise_far(float(mode[-1]), study.method.noise.at(0.5), sigma, measured)
+    else:
+        found += criticism.too_large_errors(
+            *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
+        )
+    labels = study.measurements[number].observations.data_labels()
+    found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
+    if int(one["points_moved"]):
+        count, farthest = int(one["points_moved"]), float(one["largest_move"])
+        points = "1 point" if count == 1 else f"{count} points"
+        moved = f"{points} outside the body moved to its surface, by up to {farthest:.2g} m"
+        found.append(criticism.Doubt("note", moved, ""))
+    shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
+    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
+    why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
+    return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)
+
+
+def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
+    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail."""
+    every = list(evaluations)
+    lost = [failure for found in every for failure in found.failures if failure.inadmissible]
+    if not lost:
+        return []
+    solves = sum(len(found.points) for found in every)
+    text = (
+        f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
+        f"({lost[0].reason}): their likelihood is zero, and they count as answered."
+    )
+    return [Finding("note", text)]
+
+
+def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:
+    """Return ln of the Bayes factor of one model over another, and its standard error."""
+    values, errors = (dataset[name] for name in ("log_evidence", "log_evidence_error"))
+    difference = float(values.sel(model=one) - values.sel(model=other))
+    return difference, float(np.hypot(errors.sel(model=one), errors.sel(model=other)))
+
+
+def _chance(p: float) -> str:
+    return "p < 0.0003" if p < 3e-4 else f"p = {number(p, 2)}"

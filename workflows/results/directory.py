@@ -1,0 +1,379 @@
+"""The results directory: results.nc, summary.json and files for ParaView; each written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.machine import write_whole
+from uq.estimators.moments import ESTIMATES
+from uq.methods.compare import ESTIMATED, gains
+from workflows.results.norms import squares
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+ROUNDING = 2.0**-52
+STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file under another name and rename it into place."""
+    write_whole(path, text.encode())
+
+
+def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
+    """Write a netCDF-4 file, with groups, and rename it into place; equal datasets give equal bytes."""
+    import h5netcdf
+    import h5py
+    from xarray.backends import H5NetCDFStore
+
+    from uq.evaluation.checkpoint import image, in_memory
+
+    # HDF5 stamps groups with the time unless it is told not to; netCDF-4 needs the order of creation.
+    of_file, of_group = (h5py.h5p.create(kind) for kind in (h5py.h5p.FILE_CREATE, h5py.h5p.GROUP_CREATE))
+    order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
+    for creation in (of_file, of_group):
+        creation.set_obj_track_times(False)
+        creation.set_link_creation_order(order)
+        creation.set_attr_creation_order(order)
+    with in_memory(of_file) as file:
+        for name in groups or {}:
+            h5py.h5g.create(file.id, name.encode(), gcpl=of_group)
+        with h5netcdf.File(file, "a") as netcdf:
+            dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
+            for name, part in (groups or {}).items():
+                part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
+        write_whole(path, image(file))
+
+
+def read_dataset(directory: Path) -> xr.Dataset:
+    """Read the results of a study into memory.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the directory holds no results of a study.
+    """
+    import xarray as xr
+
+    path = directory / "results.nc"
+    again = "`tissuq run` with the same study and --out makes it again"
+    if not path.exists():
+        begun = "; the command that began this one continues it" if (directory / "study.toml").exists() else ""
+        message = f"{directory}: holds no results.nc, expected the directory of a finished study{begun}"
+        if read_summary(directory) is not None:
+            message = f"{directory}: results.nc is missing, although the study is finished; {again}"
+        raise FileNotFoundError(message)
+    try:
+        found = xr.load_dataset(path, engine="h5netcdf")
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:  # HDF5 says in many ways that a file is damaged
+        message = f"{path}: is damaged ({(str(error).splitlines() or [''])[0]}); {again}"
+        raise FileNotFoundError(message) from None
+    if "config" not in found.attrs:
+        message = f"{path}: holds no results of a study, expected a file that `tissuq run` has written"
+        raise FileNotFoundError(message)
+    return found
+
+
+def digest(directory: Path) -> str:
+    """Return the hash of the results of a study, as summary.json keeps it."""
+    return hashlib.sha256((directory / "results.nc").read_bytes()).hexdigest()
+
+
+def read_summary(directory: Path) -> dict[str, Any] | None:
+    """Read summary.json; nothing if there is none, or what stands there is not the summary of a finished study."""
+    try:
+        found = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError, RecursionError):
+        return None
+    whole = isinstance(found, dict) and {"study", "method", "status", "failed", "provenance"} <= found.keys()
+    return found if whole else None
+
+
+def summarise(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
+    if "alone_eigenvalue" in dataset:
+        from workflows.studies.inversion import summary as of_inversion
+
+        return of_inversion(dataset)
+    if "clean" in dataset:
+        return {"data": int(np.isfinite(dataset["values"]).sum())}
+    if "log_evidence" in dataset:
+        shown = ("log_evidence", "log_evidence_error", "probability")
+        trusted = dataset["trusted"].all("group")
+        return {
+            "models": {
+                str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
+                | {"trusted": bool(trusted.sel(model=model))}
+                for model in dataset.model.values
+            }
+        }
+    summary: dict[str, Any] = {}
+    outputs = [str(name) for name in dataset.output.values]
+    if "mean" in dataset:
+        mesh = ("bias_error", "total_error", "std_bias_error", "std_total_error")
+        others = ("variance_ratio", "std_variance_ratio", "loo_error", *mesh)
+        names = [name for name in (*ESTIMATES, *others) if name in dataset]
+        summary["outputs"] = {
+            output: {name: float(dataset[name].sel(output=output)) for name in names} for output in outputs
+        }
+    if "sobol_first" in dataset:
+        shares = {"first": "sobol_first", "total": "sobol_total"}
+        names_of = {f"{short}{end}": f"{name}{end}" for short, name in shares.items() for end in ("", "_error")}
+        summary["sobol"] = {
+            output: {
+                str(parameter): {
+                    short: _number(dataset[name].sel(output=output, parameter=parameter))
+                    for short, name in names_of.items()
+                }
+                for parameter in dataset.parameter.values
+            }
+            for output in outputs
+        }
+    if "total_bound" in dataset:
+        summary["bounds"] = {
+            output: {
+                str(parameter): {
+                    short: _number(dataset[name].sel(output=output, parameter=parameter))
+                    for short, name in (("total", "total_bound"), ("total_error", "total_bound_error"))
+                }
+                for parameter in dataset.parameter.values
+            }
+            for output in outputs
+        }
+    for key, variable in (
+        ("local", "derivative"),
+        ("local_per_std", "derivative_per_std"),
+        ("local_per_range", "derivative_per_range"),
+    ):
+        if variable in dataset:
+            summary[key] = {
+                output: {
+                    str(parameter): _number(dataset[variable].sel(output=output, parameter=parameter))
+                    for parameter in dataset.parameter.values
+                }
+                for output in outputs
+            }
+    if "row_method" in dataset:
+        summary["methods"] = _methods(dataset)
+    return summary
+
+
+def inverted(summary: Mapping[str, Any]) -> list[str]:
+    """Say in a line what was found for each data set, if data were inverted."""
+    lines = []
+    for name, found in summary.get("data_sets", {}).items():
+        if "failed" in found:
+            lines.append(f"{name}: failed: {found['failed']}")
+            continue
+        values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
+        lines.append(f"{name}: {', '.join(values)}")
+    if "data" in summary:
+        lines.append(f"{summary['data']} data made")
+    return lines
+
+
+def _methods(dataset: xr.Dataset) -> dict[str, list[dict[str, Any]]]:
+    """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
+    gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
+    methods: dict[str, list[dict[str, Any]]] = {}
+    for i, name in enumerate(dataset["row_method"].to_numpy().tolist()):
+        row = dataset.isel(row=i)
+        outputs = {
+            str(output): {
+                estimated: {
+                    "rmse": _number(of_output[f"{estimated}_rmse"]),
+                    "rmse_error": _number(of_output[f"{estimated}_rmse_error"]),
+                    "resolved": bool(of_output[f"{estimated}_resolved"]),
+                    "claimed": _number(of_output[f"{estimated}_claimed"]),
+                    "coverage": _number(of_output[f"{estimated}_coverage"]),
+                    "understated": bool(of_output[f"{estimated}_understated"]),
+                    **{
+                        f"gain_{key}": _number(g.isel(row=i).sel(output=output)) for key, g in gained[estimated].items()
+                    },
+                }
+                for estimated in ESTIMATED
+            }
+            for output in dataset.output.values
+            for of_output in [row.sel(output=output)]
+        }
+        methods.setdefault(name, []).append(
+            {
+                "cost": int(row["solves"]),
+                "cpu_seconds": float(row["cpu_seconds"]),
+                "error": next(iter(outputs.values()))["mean"]["rmse"],
+                "budget": int(row["budget"]),
+                "derived": bool(row["derived"]),
+                "outputs": outputs,
+            }
+        )
+    return methods
+
+
+def _number(value: Any) -> float | None:
+    """A number, or nothing where it is not finite: JSON has no NaN."""
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def with_random_fields(
+    dataset: xr.Dataset, factors: Mapping[str, NDArray[np.float64]], variance_kept: Mapping[str, float]
+) -> xr.Dataset:
+    """Add what random fields look like, realisation by realisation (n, nodes), where fields are kept at the nodes."""
+    if not factors:
+        return dataset
+    dataset = dataset.assign_coords(random_field=list(variance_kept))
+    dataset = dataset.assign(variance_kept=(("random_field",), list(variance_kept.values())))
+    if "node" in dataset.dims:
+        values = np.array([factors[name] for name in variance_kept])
+        dataset = dataset.assign(factor=(("random_field", "realisation", "node"), values))
+    return dataset
+
+
+def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.int64] | None) -> xr.Dataset:
+    """Add the regions of the cells, where there are some and the mesh is kept."""
+    if numbers is None or "cell" not in dataset.dims:
+        return dataset
+    return dataset.assign_coords(region=list(names)).assign(cell_region=(("cell",), numbers))
+
+
+def body_grid(dataset: xr.Dataset) -> Any:
+    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes.
+
+    What is not known is NaN, and left out where nothing is: VTK cannot read vectors again of which all lengths are
+    infinite or NaN.
+    """
+    import pyvista
+
+    cells = dataset["cell_nodes"].to_numpy()
+    sizes = np.full((len(cells), 1), cells.shape[1])
+    kinds = np.full(len(cells), dataset["cell_nodes"].attrs["vtk_cell_type"])
+    grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
+    for name, values in node_fields(dataset).items():
+        known = np.isfinite(values)
+        if known.any():
+            grid.point_data[name] = np.where(known, values, np.nan)
+    if "cell_region" in dataset:
+        grid.cell_data["region"] = dataset["cell_region"].to_numpy()
+    return grid
+
+
+def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
+    """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
+
+    Displacements are in one file, what data sets say of the interior in one for each.
+    """
+    if "cell_nodes" not in dataset:
+        return None
+    directory.mkdir(exist_ok=True)
+    parts = {"displacement": dataset}
+    if "data_set" in dataset.dims:
+        parts = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
+    for name, part in parts.items():
+        path = directory / f"{name}.vtu"
+        write_whole(path, _vtu(body_grid(part)))
+    return path
+
+
+def _vtu(grid: Any) -> bytes:
+    """Return a pyvista grid as a file for ParaView: VTK itself would leave half a file, and not say so."""
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(grid)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return bytes(writer.GetOutputString().encode())
+
+
+def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
+    """Return the fields (n_nodes, 3) and numbers (n_nodes,) of the results by a name that tells what they are."""
+    arrays = {}
+    for name, variable in dataset.data_vars.items():
+        if set(variable.dims) == {"node", "component"}:
+            arrays[str(name).removeprefix("field_")] = variable.to_numpy()
+        elif variable.dims in {("parameter", "node", "component"), ("parameter", "node")}:
+            short = str(name).removeprefix("field_").removeprefix("node_")
+            for parameter in dataset.parameter.values:
+                arrays[f"{short} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
+        elif variable.dims == ("random_field", "realisation", "node"):
+            for field in dataset.random_field.values:
+                for i, values in enumerate(variable.sel(random_field=field).to_numpy()):
+                    arrays[f"{name} {field} {i}"] = values
+        elif variable.dims == ("node",):
+            arrays[str(name)] = variable.to_numpy()
+        elif variable.dims[1:] == ("node",):
+            labels = variable[variable.dims[0]].values
+            arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
+    return arrays
+
+
+def with_norms(dataset: xr.Dataset) -> xr.Dataset:
+    """Add L² norms over the body of the derivatives of the displacement field, and their root mean squares.
+
+    The norm of u is √∫|u|² dX (m^{5/2}); √(∫|u|² dX/V) is the root mean square of |u| over the body (m).
+    """
+    if "field_derivative" not in dataset:
+        return dataset
+    slopes = dataset["field_derivative"].to_numpy()
+    total, volume = squares(dataset["node_position"].to_numpy(), dataset["cell_nodes"].to_numpy(), slopes)
+    norms, dims = np.sqrt(total), ("parameter",)
+    return dataset.assign(
+        field_derivative_norm=(dims, norms),
+        field_derivative_norm_per_range=(dims, norms * dataset["parameter_range"].to_numpy()),
+        field_derivative_rms=(dims, norms / np.sqrt(volume)),
+    )
+
+
+def above_rounding(dataset: xr.Dataset) -> xr.Dataset:
+    """Let no standard error be smaller than the rounding of what it is the error of.
+
+    A standard deviation is a difference of numbers as large as the mean, an index a ratio of sums that are as large.
+    """
+    found = {}
+    for label, errors in dataset.data_vars.items():
+        name = str(label).removesuffix("_error")
+        if name == label or name not in dataset or set(dataset[name].dims) != set(errors.dims):
+            continue
+        size: Any = np.abs(dataset[name])
+        if name.endswith("std") and (mean := f"{name.removesuffix('std')}mean") in dataset:
+            size = np.maximum(size, np.abs(dataset[mean]))
+        if "sobol" in name:
+            size = np.maximum(size, 1.0)
+        floor = (ROUNDING * size).transpose(*errors.dims).to_numpy()
+        values = errors.to_numpy()
+        found[name] = (errors.dims, np.where(values < floor, floor, values), errors.attrs)
+    return dataset.assign({f"{name}_error": variable for name, variable in found.items()})
+
+
+def blank_where_still(dataset: xr.Dataset) -> xr.Dataset:
+    """Leave out the indices of nodes that do not vary: there they are ratios of what rounding leaves."""
+    names = [str(name) for name in dataset.data_vars if str(name).startswith("node_sobol_")]
+    if not names or "field_std" not in dataset:
+        return dataset
+    size = np.sqrt((dataset["field_std"] ** 2).sum("component"))
+    return dataset.assign({name: dataset[name].where(size > STILL * size.max()) for name in names})
+
+
+def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any, vtk_cell_type: int) -> xr.Dataset:
+    """Add the mesh, where there are fields, and the units of the outputs."""
+    dataset = dataset.assign_coords(unit=("output", [units[str(name)] for name in dataset.output.values]))
+    if "node" in dataset.dims:
+        dataset = dataset.assign(
+            node_position=(("node", "axis"), nodes),
+            cell_nodes=(("cell", "corner"), cells, {"vtk_cell_type": vtk_cell_type}),
+        )
+        for name in dataset.data_vars:
+            if str(name).startswith("field_") and not any(word in str(name) for word in ("derivative", "sobol")):
+                dataset[name].attrs["units"] = "m"
+    return dataset

@@ -1,0 +1,1 @@
+"""A run: its plan, its ranks, its progress, its end."""

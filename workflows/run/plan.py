@@ -1,0 +1,332 @@
+"""What a study will cost, before anything is imported or computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.cost import (
+    ADDRESSES_OF_PROGRAM,
+    BYTES_OF_PROGRAM,
+    BYTES_PER_UNKNOWN,
+    COMPILATION,
+    REPORT,
+    START,
+    Times,
+    factor,
+    times,
+)
+from forward.fem.finer import finer
+from forward.hyperelastic import Hyperelastic
+from forward.machine import MIB, Headroom, compiled_forms, limits
+from forward.model import Finding
+from forward.terms.loads import Pressure
+from uq.methods.chaos import Chaos
+from uq.methods.compare import Compare
+from uq.methods.derivative_based import DerivativeBased
+from uq.methods.multilevel import MultilevelMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from workflows.config.study import Study, ranges
+
+if TYPE_CHECKING:
+    from forward.bodies.geometry import Body
+    from forward.fem.locking import Decision
+    from forward.specimen import Specimen
+    from workflows.config.study import AnyStudy
+    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.selection import Comparison
+
+
+def memory(study: AnyStudy) -> float:
+    """Predict the memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements.
+
+    A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen has one.
+    """
+    if isinstance(study, Study):
+        return sum(_of_body(one, 2) for one in study.models if isinstance(one, Hyperelastic))
+    from workflows.studies.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion | Synthesis):
+        return _of_specimen(study.model)
+    return sum(_of_specimen(one) for one in getattr(study, "specimens", {}).values())
+
+
+def _of_specimen(spec: Specimen) -> float:
+    return sum(_of_body(spec.loaded(case), 1) for case in spec.cases)
+
+
+def _of_body(spec: Hyperelastic, factors: int) -> float:
+    return BYTES_PER_UNKNOWN * spec.unknowns + factors * factor(spec.body, mixed=spec.mixed).bytes
+
+
+def shortage(study: AnyStudy, groups: int = 1) -> Finding | None:
+    """Say that the memory of this machine may not do for a study, by so many groups of ranks on it."""
+    need = memory(study)
+    if not need:
+        return None
+    for limit in sorted(limits(), key=lambda one: one.size):
+        wanted = need + of_program(limit)
+        wanted *= 1 if limit.of_each_process else groups
+        if wanted > limit.size:
+            text = f"memory may run out: about {wanted / MIB:,.0f} MiB are needed, {limit}"
+            return Finding("warning", text)
+    return None
+
+
+def of_program(limit: Headroom) -> float:
+    """Memory (bytes) of the program itself, as a limit counts it."""
+    return ADDRESSES_OF_PROGRAM if limit.of_addresses else BYTES_OF_PROGRAM
+
+
+SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
+
+
+def plan(study: AnyStudy, groups: int = 1) -> list[str]:
+    """Describe a study in lines: unknowns, solves, memory and predicted time."""
+    short = shortage(study, groups)
+    found = [*study.findings, *([] if short is None else [short])]
+    return [*_planned(study, groups), *(f"{one.severity:10}  {one.text}" for one in found)]
+
+
+def _planned(study: AnyStudy, groups: int) -> list[str]:
+    if not isinstance(study, Study):
+        return _of_other_kinds(study)
+    if study.body is None:
+        return _external(study)
+    method, model, body = study.method, study.body, study.body.body
+    sizes = [model.unknowns for model in study.meshes]
+    each = [_each(study, one) for one in study.meshes]
+    form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
+    up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
+    if isinstance(method, MultilevelMonteCarlo):
+        up_to, later = "", " for linearisations and pilots, which decide how many more"
+    names = [*study.parameters]
+    for field in model.fields:
+        paths = field.paths(body)
+        names.append(f"{paths[0]} to {len(paths) - 1}")
+    return [
+        f"method      {method.kind}",
+        *_found(body),
+        f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
+        _formulation(study.decision),
+        *(
+            f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
+            for k, (size, s) in enumerate(zip(sizes, each, strict=True))
+            if k
+        ),
+        f"parameters  {', '.join(names)}",
+        f"outputs     {', '.join(output.name for output in model.outputs)}",
+        f"solves      {up_to}{study.planned:,}{later}",
+        f"memory      about {(memory(study) + BYTES_OF_PROGRAM) / MIB:,.0f} MiB for each group of ranks",
+        *_told(parts(study), groups, up_to, later and ", then more"),
+    ]
+
+
+class Part(NamedTuple):
+    """What a part of a study takes: predicted processor time (s), what for, and whether groups of ranks share it."""
+
+    seconds: float
+    what: str
+    shared: bool = False
+
+
+def _times(spec: Hyperelastic) -> Times:
+    return times(spec.body, mixed=spec.mixed, symmetric=not any(isinstance(load, Pressure) for load in spec.loads))
+
+
+def _each(study: Study, spec: Hyperelastic) -> float:
+    """Seconds of a sample without derivatives."""
+    found = _times(spec)
+    return found.textbook if spec.solver.kind == "newton" else found.corrected
+
+
+def parts(study: Study) -> list[Part]:
+    """Predict what a study of a body takes, part by part.
+
+    Samples are the most that there may be; those that multilevel methods add after their pilots are not known.
+    """
+    method, dimension = study.method, len(study.inputs.names)
+    found = [_times(one) for one in study.meshes]
+    each = [_each(study, one) for one in study.meshes]
+    samples, textbook = study.planned - len(found), 0
+    seconds = samples * each[0]
+    if isinstance(method, MultilevelMonteCarlo):
+        seconds = method.pilot * (2 * sum(each) - each[-1])
+    elif isinstance(method, Compare):
+        textbook = method.textbook
+        seconds -= textbook * each[0]
+        if method.mesh_error:
+            other = study.models[-1]
+            assert isinstance(other, Hyperelastic)
+            seconds += _times(other).first - each[0]
+    seconds += textbook * found[0].textbook
+    seconds += _with_tangents(study, samples) * found[0].tangents_of_sample(dimension)
+    seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and study.meshes[0].solver.kind != "newton"
+    return [
+        Part(START, "start of the program"),
+        *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
+        Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
+        Part(sum(one.tangents(dimension) for one in found), "its tangents"),
+        *([Part(sum(one.reference(dimension) for one in found), "reference factor")] if corrected else []),
+        *([Part(seconds, f"{samples:,} further solves, {each[0]:.2g} s each", shared=True)] if samples > 0 else []),
+        Part(REPORT, "results and report"),
+    ]
+
+
+def _with_tangents(study: Study, samples: int) -> int:
+    """Number of samples whose derivatives are asked for, too."""
+    method = study.method
+    if isinstance(method, Chaos):
+        return samples if method.gradients and method.fit == "regression" else 0
+    if isinstance(method, QuasiMonteCarlo):
+        return max(0, samples - method.limit)  # those that its control variate is fitted to
+    return samples if isinstance(method, DerivativeBased) else 0
+
+
+def _compiled_before() -> bool:
+    """Whether forms were compiled on this machine; which, only a run can tell."""
+    return any(compiled_forms().glob("forms-*/*/"))
+
+
+def _told(found: Sequence[Part], groups: int, up_to: str, more: str) -> list[str]:
+    """Say what a study takes by the clock, if every group of ranks has a core, and of what that is the sum."""
+    by_clock = [part.seconds / (groups if part.shared else 1) for part in found]
+    cores = f"{groups} core{'s' if groups > 1 else ''}"
+    lines = [f"time        {up_to}about {_duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]
+    lines += [f"            {_duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
+    if _compiled_before():
+        lines.append(
+            f"            and {COMPILATION:.0f} s or more where the forms of this kind of body are not compiled yet"
+        )
+    return lines
+
+
+def _formulation(decision: Decision) -> str:
+    """Say which formulation is taken, and why."""
+    return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+
+
+def _found(body: Body) -> list[str]:
+    """Say what was found in the file of a mesh, a line each."""
+    return [f"{what:10}  {found}" for what, found in body.listed.items()] if isinstance(body, OwnMesh) else []
+
+
+def _external(study: Study) -> list[str]:
+    """Find the model, and describe a study of it: no one knows how long a solve takes."""
+    assert not isinstance(study.model, Hyperelastic)
+    model = study.model.build(None, study.inputs.names)
+    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
+    return [
+        f"method      {study.method.kind}",
+        f"model       {study.model.description}; {'with' if model.differentiable else 'without'} derivatives",
+        f"parameters  {', '.join(study.parameters)}",
+        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
+        f"solves      {up_to}{study.planned:,}",
+    ]
+
+
+def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
+    from workflows.studies.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study)
+    return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
+
+
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+
+
+def _inversion(study: Inversion) -> list[str]:
+    from workflows.studies.inversion import SOLVES_OF_FIELD
+
+    spec, sets = study.specimen, study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    cases = [_times(spec.loaded(case)) for case in spec.cases]
+    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
+    seconds += each * study.method.chain_solves(len(study.names), field=study.field)
+    checked = "not asked for: nothing will be said to be trusted"
+    if study.method.mesh_check:
+        try:
+            if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
+                unknowns, once = 8 * spec.unknowns, 8**2 * textbook
+            else:
+                fine = finer(spec)
+                unknowns = fine.unknowns
+                once = sum(_times(fine.loaded(case)).textbook for case in fine.cases)
+            seconds += once
+            checked = f"one solve of {unknowns:,} displacements, about {_duration(once)}"
+        except ValueError as error:
+            checked = f"not possible: {error}; nothing will be said to be trusted"
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        *_found(spec.body),
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        _formulation(study.model.decision(ranges(study.parameters))),
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
+        f"mesh check  {checked}",
+        f"time        about {_duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _moved(count: int, farthest: float) -> str:
+    are = "point outside the body is" if count == 1 else "points outside the body are"
+    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m"
+
+
+def _synthesis(study: Synthesis) -> list[str]:
+    spec, sets = study.specimen, len(study.method.fraction)
+    seconds = sets * sum(_times(spec.loaded(case)).textbook for case in spec.cases)
+    return [
+        f"method      {study.method.kind}",
+        *_found(spec.body),
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        _formulation(study.model.decision(ranges(study.parameters))),
+        f"data sets   {sets}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
+    ]
+
+
+def _comparison(study: Comparison) -> list[str]:
+    method = study.method
+    evidences = study.evidences
+    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
+    check = " and nested sampling, which takes minutes" if method.check else ""
+    data = study.groups.values()
+    tests = sum(len(study.tests(group)) for group in study.group_names)
+    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    kind = "stresses" if study.quantity == "stress" else "displacements"
+    count = (
+        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
+    )
+    return [
+        f"method      {method.kind}",
+        f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
+        f"data        {count}{groups}",
+        f"evidences   {evidences}{check}",
+        f"solves      about {study.planned:,}",
+        f"time        about {_duration(seconds)} on 1 core (rough)",
+    ]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 9.5:
+        return f"{seconds:.2g} s"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,804 @@
+"""The run of a study: the one place where model, method and MPI meet."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.external.own_modules import Loaded
+from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
+from forward.model import Stability
+from uq.estimators import branch
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
+from uq.findings import add, findings
+from uq.inputs.sampling import random_points
+from workflows.config.study import Study, StudyError, differences, document, dump
+from workflows.report import verdict, words
+from workflows.report.locking import measured
+from workflows.results.directory import (
+    above_rounding,
+    blank_where_still,
+    digest,
+    inverted,
+    label,
+    read_dataset,
+    read_summary,
+    summarise,
+    with_norms,
+    with_random_fields,
+    with_regions,
+    write_dataset,
+    write_fields,
+    write_text,
+)
+from workflows.run import own_code
+from workflows.run.plan import memory, of_program, shortage
+from workflows.run.progress import Progress
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from forward.fem.finer import FinerMesh
+    from forward.fem.model import HyperelasticModel
+    from forward.model import FloatArray, ForwardModel
+    from forward.specimen import SpecimenModel
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.inputs.random_parameters import Inputs
+    from workflows.config.study import AnyStudy
+    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.selection import Comparison
+
+DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
+REALISATIONS = 3  # of random fields, to look at
+_STOPPED = {"select": "all evidences found", "invert": "all data sets inverted", "synthesize": "all data made"}
+BATCH = "batch.csv"
+LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
+
+
+def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> int:
+    """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
+
+    Parameters
+    ----------
+    study
+        What to compute.
+    name
+        Name of the study in results.
+    directory
+        Where results go; made if it does not exist.
+    quiet
+        Print nothing but errors.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 3 finished but some solves failed or a number cannot be trusted (on rank 0; 0 on the
+        others).
+
+    Raises
+    ------
+    StudyError
+        If the directory holds another study or cannot be written, or if there is less work than groups of ranks.
+    ModelError
+        If the model cannot be made.
+    SolveError
+        If the study cannot be finished because the model has no answer.
+    StopError
+        If there is no memory, or no room on disk; what is finished is kept.
+
+    Notes
+    -----
+    Where it fails before anything is solved, the directory is left as it was.
+    """
+    try:
+        return _run(study, name, directory, quiet=quiet)
+    except Exception as error:
+        if isinstance(error, StopError) or not out_of_memory(error):
+            raise
+        reason = reason_to_stop(error, memory(study) + of_program(headroom()))
+        raise StopError(reason) from error
+
+
+def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
+    from mpi4py import MPI
+
+    world = MPI.COMM_WORLD
+    begin = time.monotonic()
+    loaded = Loaded() if own_code.python(study) is not None else None
+    finished = _agreed(world, lambda: _prepare(study, directory, world.size))
+    if finished is not None:
+        if world.rank == 0:
+            if not (directory / "report.html").exists():
+                _report(directory)
+            if not quiet:
+                sys.stdout.write(f"{directory}: finished before, nothing to do\n")
+        return int(finished)
+
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+
+    ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
+    _warn_of_memory(study, world, quiet=quiet)
+    planned = study.solves if hasattr(study, "solves") else study.planned
+    progress = Progress(planned, quiet=quiet or world.rank > 0, failures=not _explains(study))
+    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]), loaded)
+    try:
+        job = ensemble.together(lambda: _job(study, ensemble, name, directory, checkpoint))
+        if world.rank == 0:
+            own_code.keep(directory, study, loaded)
+        kept = checkpoint if job.costly else None
+        dataset = ensemble.run(
+            job.model,
+            job.task,
+            others=job.others,
+            checkpoint=kept,
+            progress=progress,
+            # A data set is a block: finished ones are kept, and shown, one by one.
+            blocks=study.parallel.blocks if job.counted else max(study.parallel.blocks, study.planned),
+            arrived=job.arrived,
+            counted=job.counted,
+        )
+    except BaseException:
+        if world.rank == 0:
+            _withdraw(directory)
+        raise
+    if dataset is None:
+        return DONE
+    progress.close()
+    dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+    add(dataset, *study.findings)
+    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
+    evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
+    own_code.keep(directory, study, loaded)
+    add(dataset, *(verdict.findings_of_solves(evaluations.values()) if _explains(study) else ()))
+    if isinstance(study, Study):
+        dataset = _with_stability(study, dataset, evaluations["/"])
+    summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
+    if isinstance(study, Study) and len(study.meshes) > 1:
+        summary["meshes"] = _meshes(study, job.recorders["/"])
+    _leave(directory, dataset, evaluations, summary, checkpoint, job)
+    if not quiet:
+        sys.stdout.write(_closing_words(directory, dataset, summary))
+    return exit_code(summary)
+
+
+def _with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+    """Add how the stability of each sample was looked at, and say where there is no answer."""
+    continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
+    add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
+    if not branch.counts([evaluations]):
+        return dataset
+    if "points" in dataset and dataset.points.dims == ("sample", "parameter"):
+        known = branch.by_sample(dataset.points.to_numpy(), evaluations)
+        meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
+        dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
+    return dataset
+
+
+def _warn_of_memory(study: AnyStudy, world: Any, *, quiet: bool) -> None:
+    """Say on the first rank that the memory of its machine may not do; collective."""
+    from mpi4py import MPI
+
+    here = world.Split_type(MPI.COMM_TYPE_SHARED)
+    short = shortage(study, max(1, here.size // study.parallel.ranks_per_model))
+    here.Free()
+    if short is not None and world.rank == 0 and not quiet:
+        sys.stderr.write(f"{short.severity}: {short.text}\n")
+
+
+def exit_code(summary: Mapping[str, Any]) -> int:
+    """Return the exit code of a finished study: 3 where solves failed, or where a number cannot be trusted."""
+    doubtful = any(one["severity"] == "error" for one in summary.get("findings", ()))
+    return PARTIAL if summary["failed"] or doubtful else DONE
+
+
+def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
+    """Return on all ranks what rank 0 finds, or raise there what it raises."""
+    refusal: Exception | None = None
+    found = None
+    if world.rank == 0:
+        try:
+            found = prepare()
+        except (StudyError, StopError) as error:
+            refusal = error
+    refusal, found = world.bcast((refusal, found))
+    if refusal is not None:
+        raise refusal
+    return found  # type: ignore[no-any-return]
+
+
+def _leave(
+    directory: Path,
+    dataset: xr.Dataset,
+    evaluations: dict[str, Evaluations],
+    summary: dict[str, Any],
+    checkpoint: Checkpoint,
+    job: _Job,
+) -> None:
+    """Write all results, in an order that a kill cannot spoil."""
+    write_dataset(directory / "results.nc", dataset, job.groups(dataset))
+    write_fields(directory / "fields", dataset)
+    for name, text in job.texts(dataset).items():
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        write_text(directory / name, text)
+    checkpoint.consolidate(evaluations)
+    # The summary says that the study is finished: only then may the blocks go.
+    summary["provenance"]["results_sha256"] = digest(directory)
+    write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+    checkpoint.clear()
+    _report(directory)
+
+
+def _report(directory: Path) -> None:
+    from workflows.report.page import write_report
+
+    write_report(directory)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What the ranks do for a study.
+
+    Attributes
+    ----------
+    model, others
+        Models number 0, and 1, 2, …
+    task
+        Runs the method on rank 0.
+    recorders
+        What was evaluated, by the name that it is kept under.
+    labelled
+        Adds to the results what the method does not know.
+    costly
+        Whether solves are worth a file: where they are not, an interrupted study begins again.
+    groups
+        Groups of results.nc beside its own variables.
+    texts
+        Further files of the directory, by name.
+    arrived
+        Told of each finished block of the first model, see `Ensemble.run`.
+    counted
+        Whether points of requests are solves; if not, they are counted where they are made.
+    """
+
+    model: ForwardModel
+    others: list[Callable[[], ForwardModel]]
+    task: Callable[[Evaluate], xr.Dataset]
+    recorders: dict[str, Recorder]
+    labelled: Callable[[xr.Dataset], xr.Dataset]
+    costly: bool = True
+    groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
+    texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
+    arrived: Callable[[Evaluations, bool], None] = field(default=lambda block, kept: None)
+    counted: bool = True
+
+
+def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> _Job:
+    if isinstance(study, Study):
+        return _sampling(study, ensemble)
+    from workflows.studies.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion):
+        return _inversion(study, ensemble, directory, checkpoint)
+    return _synthesis(study, ensemble, name) if isinstance(study, Synthesis) else _selection(study, ensemble)
+
+
+def _sampling(study: Study, ensemble: Ensemble) -> _Job:
+    """One model, and others that the method may want, at the points of a method; collective over the group."""
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        return study.method.run(inputs, recorders["/"])
+
+    others: list[Callable[[], ForwardModel]] = [
+        partial(other.build, ensemble.group, inputs.names) for other in study.models[1:]
+    ]
+    if study.body is None:
+        function = study.model.build(ensemble.group, inputs.names)
+        return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+
+    spec = study.body
+    model = spec.build(ensemble.group, inputs.names)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.layout.cells()
+    regions = model.region_of_cells()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    locking = measured(study, model) if ensemble.index == 0 else []
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = label(found, units, model.layout.coordinates, cells, kind)
+        add(found, *locking)
+        found = with_regions(found, spec.body.regions, regions)
+        return with_random_fields(found, factors, model.variance_kept)
+
+    return _Job(model, others, task, recorders, labelled)
+
+
+def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
+    """The candidates, each for each group of data; making them is collective over the group."""
+    from uq.evaluation.evaluate import SerialEvaluate
+    from workflows.studies.selection import groups
+
+    pairs = study.pairs
+    makers = [partial(study.build, *pair, ensemble.group) for pair in pairs]
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        def recorded(name: str, group: str) -> Evaluate:
+            recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
+            return recorders[f"{name}/{group}"]
+
+        def free(name: str, group: str) -> Evaluate:
+            # What nested sampling solves is too much, and too cheap, to keep.
+            return SerialEvaluate(study.build(name, group), ensemble.count)
+
+        return study.method.run(study.models, study.groups, recorded, free)
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = found.assign_attrs(quantity=study.quantity)
+        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
+        doubts = verdict.doubts_of_selection(found, candidates, study.method.noise.factor)
+        add(found, *verdict.findings(found), *doubts)
+        return found
+
+    return _Job(
+        makers[0](), list(makers[1:]), task, recorders, labelled, groups=partial(groups, study), costly=study.costly
+    )
+
+
+@dataclass(frozen=True)
+class _Specimen:
+    """What inversions of a specimen need of it; making it is collective over the group.
+
+    Attributes
+    ----------
+    model
+        The specimen.
+    vertices
+        Places (N, 3) of its vertices, cells, and VTK's number of their kind.
+    look
+        Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices.
+    mesh
+        The specimen on a finer mesh, or `why` there is none.
+    """
+
+    model: SpecimenModel
+    vertices: tuple[FloatArray, NDArray[np.int64], int]
+    look: Callable[[FloatArray], FloatArray]
+    mesh: FinerMesh | None
+    why: str
+
+    @classmethod
+    def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
+        model = study.specimen.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
+        vertices = (model.vertices.coordinates, *model.vertices.cells())
+
+        def look(points: FloatArray) -> FloatArray:
+            return study.stiffness(vertices[0], points) + model.log_fields(points)
+
+        mesh, why = _finer(model) if study.method.mesh_check else (None, "method.mesh_check = false")
+        return cls(model, vertices, look, mesh, why)
+
+
+def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> _Job:
+    """One data set, whose solves all groups share, or data sets side by side; collective over the group."""
+    if study.together:
+        return _inversion_by_all(study, ensemble)
+    from forward.model import SolveError
+    from inverse.fields.field_posterior import FieldPosterior
+    from inverse.methods.inversion import Finer, Inversions, Vertices, invert_by_group, invert_field
+    from uq.evaluation.evaluate import Request
+    from uq.evaluation.kept import KeptEvaluate, KeptModel
+    from workflows.studies import inversion
+
+    method, errors = study.method, study.data.errors
+    specimen = _Specimen.of(study, ensemble)
+    model, vertices = specimen.model, specimen.vertices
+    layout = study.variables
+    prior = study.model.fields[0].prior(study.model.body) if study.field else None
+    recorders: dict[str, Recorder] = {}
+
+    done: list[KeptEvaluate | KeptModel] = []
+    rows = inversion.Rows(study, vertices, lambda text: write_text(directory / BATCH, text))
+
+    def arrived(block: Evaluations, kept: bool) -> None:
+        solves = rows.add(block)
+        if kept:
+            ensemble.count(solves, 0)
+
+    def invert(parameters: FloatArray) -> FloatArray:
+        number = int(parameters[0])
+        if study.measurements[number] is None:
+            raise SolveError(study.data.sets[number].refused)
+        data = study.measurements[number].observations.components()
+        try:
+            observed = model.observing(data.places, data.axes, data.cases)
+        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
+            raise SolveError(str(error)) from None
+        finer = Finer(None if specimen.mesh is None else partial(specimen.mesh.outputs, observed), specimen.why)
+        if done:
+            done.pop().forget()  # what follows from these solves is kept by now
+        name = study.data.sets[number].name
+        if prior is None:
+            kept = KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count)
+            done.append(kept)
+            found = invert_by_group(study.inputs, observed, data, method, specimen.look, errors, finer, kept)
+            return layout.pack(found)
+        solved = KeptModel(observed, ensemble.group, checkpoint, name)
+        done.append(solved)
+        posterior = FieldPosterior(solved, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
+        offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
+        return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer))
+
+    def many(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        found = recorders["/"](Request(np.arange(len(study.data.sets), dtype=float)[:, None]))
+        reasons = {failure.index: failure.reason for failure in found.failures}
+        if len(reasons) == len(study.data.sets):
+            raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
+        return inversion.dataset(study, found.outputs, reasons, vertices)
+
+    return _Job(
+        Inversions(invert, ("data_set",), layout.names),
+        [],
+        many,
+        recorders,
+        lambda found: verdict.judged(found, study),
+        groups=partial(inversion.groups, study),
+        texts=lambda found: {BATCH: inversion.batch_table(found)},
+        arrived=arrived,
+        counted=False,
+    )
+
+
+def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
+    """One data set, whose solves all groups share; collective over the group."""
+    from forward.model import FunctionModel, SolveError
+    from inverse.methods.inversion import Finer, invert_by_all
+    from uq.evaluation.evaluate import Request
+    from workflows.studies import inversion
+
+    specimen = _Specimen.of(study, ensemble)
+    data = study.measurements[0].observations.components()
+    observed = specimen.model.observing(data.places, data.axes, data.cases)
+    recorders: dict[str, Recorder] = {}
+    others: list[Callable[[], ForwardModel]] = []
+    if specimen.mesh is not None:
+        outputs = partial(specimen.mesh.outputs, observed)
+        others = [lambda: FunctionModel(outputs, observed.parameters, observed.outputs)]
+
+    def on_finer_mesh(point: FloatArray) -> FloatArray:
+        found = recorders["/"].on(1)(Request(point[None]))
+        for failure in found.failures:
+            raise SolveError(failure.reason)
+        return np.asarray(found.outputs[0])
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        finer = Finer(on_finer_mesh if others else None, specimen.why)
+        errors = study.data.errors
+        found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
+        return inversion.dataset(study, study.variables.pack(found)[None], {}, specimen.vertices)
+
+    return _Job(
+        observed,
+        others,
+        task,
+        recorders,
+        lambda found: verdict.judged(found, study),
+        groups=partial(inversion.groups, study),
+        texts=lambda found: {BATCH: inversion.batch_table(found)},
+    )
+
+
+def _finer(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
+    """Return a specimen on a finer mesh, or why there is none."""
+    from forward.fem.finer import FinerMesh
+
+    try:
+        return FinerMesh(model), ""
+    except ValueError as error:  # a mesh that is not divided, or would be too large
+        return None, str(error)
+
+
+def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
+    """The specimen that is known; collective over the group."""
+    from workflows.studies import inversion
+
+    model = study.specimen.build(ensemble.group, study.inputs.names)
+    places, points = model.models[0].layout.coordinates, inversion.points_of(model)
+    factor = np.ones((len(study.method.fraction), 1))
+    if study.model.fields and ensemble.index == 0:
+        drawn = model.models[0].factors(study.method.truths(study.inputs)[:, model.positions[0]])
+        for one in (random for random in study.model.fields if random.of == "stiffness" and ensemble.group.rank == 0):
+            factor = factor * drawn[one.label]
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        return study.method.run(study.inputs, recorders["/"], model.cases, points)
+
+    def texts(found: xr.Dataset) -> dict[str, str]:
+        made = inversion.synthetic_files(study, name, found, (points, model.cases, model.axes, model.places))
+        return {f"data/{file}": text for file, text in made.items()}
+
+    labelled = partial(inversion.with_factor, study, places=places, fields=factor)
+    return _Job(model, [], task, recorders, labelled, texts=texts)
+
+
+def _identity(study: AnyStudy) -> dict[str, Any]:
+    """Return what decides on evaluations."""
+    blocks = {key: value for key, value in document(study).items() if key != "parallel"}
+    source = own_code.digest(study)
+    if source is not None:
+        blocks["source"] = source
+    if isinstance(study, Study) and study.body is not None:
+        blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
+    return blocks
+
+
+def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
+    """Check ranks and directory, and write study.toml; return the exit code of a study that is finished already."""
+    share = study.parallel.ranks_per_model
+    if ranks % share:
+        message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
+        raise StudyError(message)
+    groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
+    if groups > blocks and not isinstance(
+        study, Study
+    ):  # tasks that each take minutes: someone who waits is no mistake
+        _note(f"{groups} groups of ranks were started for {blocks} tasks: {groups - blocks} have nothing to do")
+    elif groups > blocks:
+        message = (
+            f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
+            f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
+        )
+        raise StudyError(message)
+    kept = directory / "study.toml"
+    try:
+        if kept.exists():
+            changes = differences(tomllib.loads(kept.read_text(encoding="utf-8")), document(study))
+            if changes:
+                message = f"{directory}: holds another study ({'; '.join(changes[:5])}); choose another --out"
+                raise StudyError(message)
+        elif directory.exists() and any(directory.iterdir()):
+            message = f"{directory}: is not empty and holds no study, expected a new directory or one of this study"
+            raise StudyError(message)
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.W_OK | os.X_OK):
+            message = f"{directory}: cannot be written: permission denied"
+            raise StudyError(message)
+        for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")]:
+            leftover.unlink()
+        if not kept.exists():
+            write_text(kept, dump(study))
+    except tomllib.TOMLDecodeError:
+        message = f"{kept}: is not a study, expected a directory of this study"
+        raise StudyError(message) from None
+    except OSError as error:
+        reason = reason_to_stop(error)
+        if reason is not None:
+            raise StopError(reason) from None
+        message = f"{directory}: cannot be written: {error.strerror}"
+        raise StudyError(message) from None
+    own_code.refuse_other(directory, study)
+    return _finished(directory)
+
+
+def _finished(directory: Path) -> int | None:
+    """Return the exit code of a study that is finished; None for any other, and where its results are lost."""
+    summary = read_summary(directory)
+    if summary is None:
+        return None
+    expected = summary["provenance"].get("results_sha256")  # earlier versions did not keep it
+    try:
+        if expected is None:
+            read_dataset(directory)
+        intact = expected is None or digest(directory) == expected
+    except FileNotFoundError:
+        intact = False
+    if not intact:
+        sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
+        return None
+    return exit_code(summary)
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(f"note: {text}\n")
+    sys.stderr.flush()
+
+
+def _withdraw(directory: Path) -> None:
+    """Remove what `_prepare` has made, if nothing else is there: the study, corrected, may go to the same place."""
+    made = ("study.toml", own_code.FILE)
+    if {path.name for path in directory.iterdir()} <= set(made):
+        for name in made:
+            (directory / name).unlink(missing_ok=True)
+        directory.rmdir()
+
+
+def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
+    """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
+
+    They are the first samples of Monte Carlo with the seed of the study.
+    """
+    if not study.model.coefficients:
+        return {}
+    seed = getattr(study.method, "seed", 0)
+    return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
+
+
+def _version() -> str:
+    try:
+        return version("tissuq")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _summary(
+    study: AnyStudy,
+    name: str,
+    dataset: xr.Dataset,
+    evaluations: dict[str, Evaluations],
+    ranks: int,
+    groups: int,
+    wall: float,
+) -> dict[str, Any]:
+    from forward.model import WORK
+
+    every = evaluations.values()
+    explains = _explains(study)
+    unlikely = sum(failure.inadmissible for found in every for failure in found.failures) if explains else 0
+    failed = sum(len(found.failures) for found in every) - unlikely
+    names = {label: _parameters(study, label) for label in evaluations}
+    source = own_code.digest(study)
+    stability = branch.counts(every)
+    return {
+        "study": name,
+        "method": study.method.kind,
+        "status": "partial" if failed else "complete",
+        "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
+        **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
+        "findings": [one._asdict() for one in findings(dataset)],
+        "evaluations": sum(len(found.points) for found in every),
+        "failed": failed,
+        **({"zero_likelihood": unlikely} if explains else {}),
+        "failures": [
+            {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
+            for label, point, reason in islice(
+                (
+                    (label, dict(zip(names[label], f.parameters, strict=True)), f.reason)
+                    for label, found in evaluations.items()
+                    for f in found.failures
+                    if not (explains and f.inadmissible)
+                ),
+                LISTED,
+            )
+        ],
+        **({"stability": stability} if stability else {}),
+        "wall_seconds": wall,
+        "cpu_seconds": float(sum(found.seconds.sum() for found in every)) * study.parallel.ranks_per_model,
+        "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
+        **summarise(dataset),
+        "provenance": {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seed": getattr(study.method, "seed", None),
+            "ranks": ranks,
+            "groups": groups,
+            "processor": platform.machine(),
+            "commit": _commit(),
+            **({} if source is None else {"source": source}),
+            "versions": {"python": platform.python_version(), **_versions()},
+        },
+    }
+
+
+def _explains(study: AnyStudy) -> bool:
+    """Whether data are explained: then parameters without a model have no likelihood, which is an answer too."""
+    return not isinstance(study, Study) and study.method.kind != "synthesize"
+
+
+def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
+    """What was solved on each mesh, and what it took."""
+    found = []
+    for number in sorted(set(recorder.models)):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
+        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
+        solves = sum(len(part.points) for part in parts)
+        found.append({"unknowns": study.meshes[number].unknowns, "solves": solves, "cpu_seconds": seconds})
+    return found
+
+
+def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
+    """Names of the parameters of a model by the name that its evaluations are kept under."""
+    if isinstance(study, Study):
+        return study.inputs.names
+    from workflows.studies.inversion import Inversion, Synthesis
+
+    if isinstance(study, Inversion | Synthesis):
+        return study.inputs.names if isinstance(study, Synthesis) or study.together else ("data_set",)
+    return tuple(study.candidates[label.partition("/")[0]].parameters)
+
+
+def _versions() -> dict[str, str]:
+    dolfinx = ("fenics-dolfinx", "dolfinx-solver-real")  # Debian's name and that of the wheel
+    names = ("tissuq", *dolfinx, "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
+    found = {}
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def _commit() -> str | None:
+    """Return the commit of the source tree, where there is one."""
+    import subprocess
+
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    lines = [
+        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
+        f"probability {found['probability']:.3g}"
+        for model, found in summary.get("models", {}).items()
+    ]
+    lines += inverted(summary)
+    for output, values in summary.get("outputs", {}).items():
+        unit = dataset.unit.sel(output=output).item()
+        lines.append(
+            f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
+            f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+        )
+        if "bias_error" in values:
+            lines[-1] += (
+                f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
+            )
+    first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
+        )
+    if not lines:
+        for output, slopes in summary.get("local_per_range", {}).items():
+            shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
+            lines.append(f"{output}: derivative × range of the parameter: {shown}")
+    from workflows.report.tables import solves
+
+    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
+    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
+    if "stability" in summary:
+        lines.append(words.stability(summary["stability"]))
+    if "note" in summary:
+        lines.append(summary["note"])
+    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
+    lines.append(f"report: {directory / 'report.html'}")
+    return "\n".join(lines) + "\n"
