@@ -1,0 +1,145 @@
+"""Kinds of blocks by their names: each is imported when it is asked for, also from outside the program.
+
+A kind is one of the program's own, or one that an installed package declares by an entry point of the group ``tissuq``
+(named ``FAMILY.KIND``, such as ``material.fung``), or a dotted path (``my_tissue.fung``) to a module beside the study
+or wherever else Python finds it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
+
+from forward.settings import UNKNOWN_KIND, Settings, nearest
+
+ENTRY_POINTS = "tissuq"
+
+
+class KindError(ValueError):
+    """There is no such kind, or what stands for it cannot be used; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """The kinds of one family of blocks.
+
+    Parameters
+    ----------
+    family
+        What they are, in a word, such as "material".
+    own
+        Those of the program: ``MODULE:NAME`` by kind.
+    expected
+        The class that every one must be a subclass of.
+    """
+
+    family: str
+    own: Mapping[str, str]
+    expected: type = Settings
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Kinds that have a name without dots: the program's own, and those of installed packages."""
+        return (*self.own, *(name for name in self._installed() if name not in self.own))
+
+    def __getitem__(self, kind: str) -> Any:
+        """Import what a kind stands for.
+
+        Raises
+        ------
+        KindError
+            If there is none.
+        """
+        if kind in self.own:
+            return self._imported(kind, *self.own[kind].split(":"))
+        if "." in kind:
+            module, _, name = kind.rpartition(".")
+            return self._imported(kind, module, name)
+        found = self._installed().get(kind)
+        if found is None:
+            raise KindError(f"unknown kind; {nearest(kind, self.names)}")
+        return self._imported(kind, found.module, found.attr)
+
+    def _installed(self) -> dict[str, importlib.metadata.EntryPoint]:
+        """Kinds that installed packages declare, by name."""
+        prefix = f"{self.family}."
+        points = importlib.metadata.entry_points(group=ENTRY_POINTS)
+        return {point.name.removeprefix(prefix): point for point in points if point.name.startswith(prefix)}
+
+    def _imported(self, kind: str, module: str, name: str) -> Any:
+        try:
+            loaded = importlib.import_module(module)
+        except ImportError as error:
+            if kind in self.own:
+                raise
+            raise KindError(f"the {self.family} '{kind}' cannot be imported: {error}") from error
+        try:
+            found = getattr(loaded, name)
+        except AttributeError:
+            known = tuple(word for word in dir(loaded) if not word.startswith("_"))
+            message = f"the module '{module}' has no {self.family} '{name}'; {nearest(name, known)}"
+            raise KindError(message) from None
+        if not (isinstance(found, type) and issubclass(found, self.expected)):
+            raise KindError(f"'{module}.{name}' is no {self.family}: expected a subclass of {self.expected.__name__}")
+        return found
+
+    def dotted(self, block: Any) -> str | None:
+        """Return the module that a block's kind comes from, where the kind is a dotted path."""
+        kind = block.get("kind") if isinstance(block, Mapping) else getattr(block, "kind", None)
+        return kind.rpartition(".")[0] if isinstance(kind, str) and "." in kind else None
+
+
+@dataclass(frozen=True)
+class OfKind:
+    """Annotation of a field that holds a block of one of these kinds: ``Annotated[Settings, OfKind(LOADS)]``.
+
+    Only the kind that is written is imported. Mistakes in the block have their places, as in unions of pydantic.
+
+    Parameters
+    ----------
+    kinds
+        The kinds.
+    default
+        The kind where none is written; None where it must be.
+    """
+
+    kinds: Kinds
+    default: str | None = None
+
+    def validate(self, value: Any) -> Any:
+        """Return the block that a table describes; blocks that were made before pass."""
+        if isinstance(value, self.kinds.expected):
+            return value
+        if not isinstance(value, Mapping):
+            raise PydanticCustomError("model_type", "expected a table, {{ key = value }}")
+        kind = value.get("kind", self.default)
+        if kind is None:
+            raise _mistake("missing", "missing", value)
+        if not isinstance(kind, str):
+            raise _mistake("no_word", "expected a word", kind)
+        try:
+            block = self.kinds[kind]
+        except KindError as error:
+            raise _mistake(UNKNOWN_KIND, str(error), kind, known=list(self.kinds.names)) from None
+        return block.model_validate({**value, "kind": kind})
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        """Check by `validate`; blocks write themselves as what they are."""
+        return core_schema.no_info_before_validator_function(self.validate, core_schema.any_schema())
+
+    def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        """Any of the program's own kinds, or a block of another kind, of which nothing is known."""
+        known = [handler(self.kinds[kind].__pydantic_core_schema__) for kind in self.kinds.own]
+        other = {"type": "object", "properties": {"kind": {"type": "string", "not": {"enum": [*self.kinds.own]}}}}
+        return {"anyOf": [*known, {**other, "required": ["kind"]}]}
+
+
+def _mistake(kind: str, message: str, given: Any, **context: Any) -> ValidationError:
+    error = PydanticCustomError(kind, "{message}", {"message": message, **context})
+    return ValidationError.from_exception_data("kind", [InitErrorDetails(type=error, loc=("kind",), input=given)])
