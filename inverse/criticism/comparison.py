@@ -32,6 +32,8 @@ from uq.inputs.random_parameters import Inputs
 if TYPE_CHECKING:
     import xarray as xr
 
+    from inverse.criticism.finer import Moved
+
 DRAWS = 4000  # of independent errors, for the correlation of neighbours
 QUANTILES = (0.05, 0.95)
 Pair = tuple[str, str]  # candidate and group
@@ -170,6 +172,7 @@ def comparison(
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
     checks: Mapping[Pair, tuple[float, float]],
     left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
+    meshes: Mapping[Pair, Moved],
 ) -> xr.Dataset:
     """Put everything that is known of the candidates into a dataset.
 
@@ -185,6 +188,8 @@ def comparison(
         ln Z and error by nested sampling, if it was asked for.
     left_out
         ln Z and error without each test, if they were asked for.
+    meshes
+        What a finer mesh would do, if that was looked at.
     """
     import xarray as xr
 
@@ -254,6 +259,8 @@ def comparison(
     parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
     variables["point_log_likelihood"] = _pointwise(names, groups, critics)
     variables |= _constants(names, list(groups), parameters, posteriors, stated)
+    if meshes:
+        variables |= _meshes(names, groups, parameters, posteriors, meshes, variables["constant_std"][1])
     coordinates = {"model": names, "group": list(groups), "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
@@ -359,6 +366,37 @@ def _pointwise(names: list[str], groups: Mapping[str, Data], critics: Mapping[Pa
             part[k, : found.shape[0], : found.shape[1]] = found
         parts.append(part)
     return ("model", "point", "output"), np.concatenate(parts, axis=2)
+
+
+def _meshes(
+    names: list[str],
+    groups: Mapping[str, Data],
+    parameters: list[str],
+    posteriors: Mapping[Pair, Posterior],
+    meshes: Mapping[Pair, Moved],
+    std: FloatArray,
+) -> dict[str, tuple[Any, Any]]:
+    """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations `std`."""
+    shape = (len(names), len(groups))
+    whys, added = np.full(shape, "", dtype=object), np.full(shape, np.nan)
+    shift, errors = np.full(std.shape, np.nan), []
+    for g, (group, data) in enumerate(groups.items()):
+        error = np.full((len(names), len(data.tests)), np.nan)
+        for k, name in enumerate(names):
+            found = meshes[name, group]
+            whys[k, g], added[k, g] = found.why, found.log_evidence
+            error[k, : len(found.error)] = found.error
+            columns = [parameters.index(p) for p in posteriors[name, group].inputs.names]
+            shift[k, g, columns] = found.parameters / std[k, g, columns]
+        errors.append(error)
+    dims = ("model", "group")
+    return {
+        "mesh_checked": (dims, whys == ""),
+        "mesh_why": (dims, whys.astype(str)),
+        "mesh_log_evidence": (dims, added),
+        "mesh_error": (("model", "output"), np.concatenate(errors, axis=1)),
+        "mesh_shift": ((*dims, "parameter"), shift),
+    }
 
 
 def quantiles(values: FloatArray, weights: FloatArray, levels: tuple[float, ...] = QUANTILES) -> FloatArray:

@@ -23,6 +23,7 @@ NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data from which on the model explains nothing
 STRANGE = 0.01  # probability that any datum of all is as far out as one that does not belong
 LISTED = 5
+MOVED = 1.0  # by which a finer mesh moves ln Z, "not worth more than a bare mention" (Kass and Raftery 1995)
 BIASED, WRONG = (
     0.5,
     2.0,
@@ -179,6 +180,9 @@ def strangers(
     return [Doubt("warning", text, f"{data} not belong to the others")]
 
 
+ADVICE = "take a finer one, or thinner cells at held faces (body.grading)"
+
+
 def mesh_too_coarse(
     looked: bool, why: str, error: FloatArray, shifts: Mapping[str, float], nodes: FloatArray
 ) -> list[Doubt]:
@@ -208,5 +212,31 @@ def mesh_too_coarse(
     if worst <= BIASED:
         return [Doubt("note", text, "")]
     severity: Severity = "error" if worst > WRONG else "warning"
-    advice = "The mesh is too coarse for the noise: take a finer one, or thinner cells at held faces (body.grading)"
-    return [Doubt(severity, f"{text}. {advice}", f"its mesh is too coarse: unknowns move by {worst:.2g} deviations")]
+    short = f"its mesh is too coarse: unknowns move by {worst:.2g} deviations"
+    return [Doubt(severity, f"{text}. The mesh is too coarse for the noise: {ADVICE}", short)]
+
+
+def meshes_too_coarse(log_evidence: Mapping[str, float], added: Mapping[str, float]) -> list[Doubt]:
+    """Doubt the meshes of candidates, by what finer ones do to their evidences.
+
+    Parameters
+    ----------
+    log_evidence
+        With the prior odds, by name.
+    added
+        What a finer mesh adds to that; NaN where it is not known, and then zero.
+    """
+    known = {name: change for name, change in added.items() if np.isfinite(change)}
+    if not known:
+        return []
+    there = {name: value + known.get(name, 0.0) for name, value in log_evidence.items()}
+    best, other = max(log_evidence, key=log_evidence.__getitem__), max(there, key=there.__getitem__)
+    listed = ", ".join(f"{name} {change:+.2g}" for name, change in known.items())
+    text = f"finer meshes move ln Z by: {listed}"
+    if best != other:
+        found = f"{text}. On these {other} is the most probable, and not {best}"
+        return [Doubt("error", f"{found}: the meshes are too coarse to tell; {ADVICE}", "meshes decide")]
+    if max(map(abs, known.values())) <= MOVED:
+        return [Doubt("note", f"{text}; {best} stays the most probable", "")]
+    text = f"{text}; {best} stays the most probable. An evidence that moves by more than {MOVED:g} is not to be trusted"
+    return [Doubt("warning", f"{text}: {ADVICE}", "meshes too coarse")]

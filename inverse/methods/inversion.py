@@ -27,7 +27,6 @@ from forward.model import (
     ForwardModel,
     FunctionModel,
     FunctionSolution,
-    ModelError,
     Reference,
     SolveError,
 )
@@ -47,6 +46,7 @@ from inverse.criticism.chains import (
     weigh_field,
 )
 from inverse.criticism.comparison import quantiles
+from inverse.criticism.finer import NOT_LOOKED, Finer, parameters_moved
 from inverse.criticism.predictive import ResidualTest, examine, spectrum_of
 from inverse.criticism.weights import FEWEST, resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
@@ -468,23 +468,6 @@ def _of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
     return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
 
 
-@dataclass(frozen=True)
-class Finer:
-    """Outputs (m,) on a finer mesh at parameters (d,) of the model, or why they are not known."""
-
-    outputs: Callable[[FloatArray], FloatArray] | None
-    why: str = ""
-
-    def gap(self, point: FloatArray, outputs: FloatArray) -> tuple[FloatArray | None, str]:
-        """Return what the finer mesh adds to outputs (m,), or why that is not known."""
-        if self.outputs is None:
-            return None, self.why
-        try:
-            return self.outputs(point) - outputs, ""
-        except (SolveError, ModelError, ValueError) as error:
-            return None, f"the solve on a finer mesh failed: {error}"
-
-
 def _of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArray) -> Record:
     return {
         "mesh_checked": np.array(float(gap is not None)),
@@ -546,9 +529,6 @@ class Nearby:
     def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
         """Return the function parameters (d,) → predicted state (U_local,), and its reference."""
         return lambda point: self.state + (point - self.point) @ self.slopes, Reference(self.point, self.state)
-
-
-NOT_LOOKED = Finer(None, "no finer mesh was given")
 
 
 def invert_by_group(
@@ -635,11 +615,8 @@ def _invert(
     gap, why = finer.gap(best[:d], at.outputs[0])
     shift = np.full(len(best), np.nan)
     if gap is not None:
-        # Where the residuals r + δ of the finer mesh have their mode, by the curvature at hand.
         A = spectrum.images.T @ spectrum.vectors
-        pull = A.T @ (root * gap / scale)
-        slopes = inputs.from_normals(gaussian.mode[None, :d])[1][0]
-        shift[:d] = -slopes @ np.linalg.solve(gaussian.hessian[:d, :d], pull) / moments["std"][:d]
+        shift[:d] = parameters_moved(posterior, gaussian, A, root * gap / scale) / moments["std"][:d]
     return {
         **_of_data(data, at.outputs[0], residual, scale / root, spectrum, cases),
         **_of_test(test),

@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray, SolveError
 from forward.settings import Settings
 from inverse.criticism.comparison import Assessment, Candidate, Data, comparison
+from inverse.criticism.finer import Finer, moved
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
@@ -126,6 +127,7 @@ class Select(Settings):
         groups: Mapping[str, Data],
         evaluate: Callable[[str, str], Evaluate],
         free: Callable[[str, str], Evaluate] | None = None,
+        finer: Callable[[str, str], Finer] | None = None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -139,6 +141,8 @@ class Select(Settings):
             The model of a candidate in a group; its first outputs are the data of the group, others are predicted.
         free
             The same without cost, for nested sampling.
+        finer
+            The same on a finer mesh; by default there are no meshes.
 
         Returns
         -------
@@ -180,7 +184,10 @@ class Select(Settings):
         left_out = (
             {test: self._without(test, groups, posteriors) for test in _testnames(groups)} if self.held_out else {}
         )
-        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out)
+        meshes = {}
+        if finer is not None:
+            meshes = {pair: moved(posteriors[pair], stated[pair].gaussian, finer(*pair)) for pair in pairs}
+        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out, meshes)
 
     def _without(
         self, test: str, groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
@@ -207,6 +214,20 @@ class Select(Settings):
     def _value(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[float, float]:
         found = self._assess(posterior, pair)[1].evidence
         return found.log_evidence, found.error
+
+
+class SelectSpecimens(Select):
+    """Bayesian model selection among models of a specimen.
+
+    Parameters
+    ----------
+    mesh_check
+        Solve once more for each candidate, at its mode on a finer mesh with thinner cells at the faces that are held:
+        what the error of the mesh does to the data, to the evidence and to the unknowns. Without it no evidence is
+        said to be trusted.
+    """
+
+    mesh_check: bool = True
 
 
 def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate) -> Posterior:

@@ -10,7 +10,7 @@ import numpy as np
 from inverse.criticism.weights import RULE
 from workflows.report import plots
 from workflows.report.tables import Table
-from workflows.report.verdict import bayes_factor, conflicts, grade, ranking
+from workflows.report.verdict import bayes_factor, by_probability, conflicts, grade, ranking
 from workflows.report.words import NONE, number, settings, unit_of, with_error, with_unit
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def context(dataset: xr.Dataset, study: Comparison) -> dict[str, Any]:
         "priors": priors(study),
         "evidences": evidences(dataset),
         "routes": routes(dataset),
+        "meshes": meshes(dataset) if "mesh_checked" in dataset else None,
         "variants": variants(dataset),
         "criticism": criticism(dataset),
         "held_out": held_out(dataset) if "held_out_score" in dataset else None,
@@ -61,7 +62,7 @@ def pictures(dataset: xr.Dataset) -> Iterator[tuple[str, list[tuple[Axes, str]]]
             for group, test in tests
         ]
         yield "Curves over the data", drawn
-    best = ranking(dataset["log_evidence"])[0]
+    best = by_probability(dataset, dataset["log_evidence"])[0]
     pairs = [(str(m), str(g)) for m in dataset.model.values for g in dataset.group.values]
     drawn = [
         (corner(dataset, *pair), f"{pair[0]}{f' ({pair[1]})' if several else ''}")
@@ -138,6 +139,22 @@ def routes(dataset: xr.Dataset) -> Table:
             )
     head = ("model", "group", "ln Z", "route", "because", "effective points", "k̂", "to be trusted")
     return Table(head, rows, text=frozenset({0, 1, 3, 4, 7}), long=frozenset({4}))
+
+
+def meshes(dataset: xr.Dataset) -> Table:
+    """What a finer mesh does to data, evidence and unknowns of each candidate."""
+    rows = []
+    for model in dataset.model.values:
+        one = dataset.sel(model=model).isel(group=0)
+        if not bool(one["mesh_checked"]):
+            rows.append((str(model), NONE, NONE, NONE, f"not checked: {one['mesh_why'].item()}"))
+            continue
+        error, shift = one["mesh_error"].to_numpy(), one["mesh_shift"].dropna("parameter")
+        listed = [f"{name} {float(shift.sel(parameter=name)):+.2g}" for name in shift.parameter.values]
+        size, most = (f"{value:.2g}" for value in (float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(abs(error)))))
+        rows.append((str(model), f"{float(one['mesh_log_evidence']):+.3g}", size, most, ", ".join(listed)))
+    head = ("model", "ln Z", "data, over the errors", "at most", "unknowns, in deviations of the posterior")
+    return Table(head, rows, text=frozenset({0, 4}), long=frozenset({4}))
 
 
 def variants(dataset: xr.Dataset) -> Table:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
+AGAINST = "against it: what was believed before the data decides"
 GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
 
 
@@ -33,6 +34,11 @@ def grade(log_bayes_factor: float) -> str:
 def ranking(values: xr.DataArray) -> list[str]:
     """Names of the models, the one with the largest value first."""
     return [str(name) for name in values.model.values[np.argsort(-values.to_numpy(), kind="stable")]]
+
+
+def by_probability(dataset: xr.Dataset, values: xr.DataArray) -> list[str]:
+    """Names of the models by ln Z `values` and what they were worth before the data, the most probable first."""
+    return ranking(values + np.log(dataset["prior_probability"]))
 
 
 def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
@@ -57,7 +63,7 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
 
 def findings(dataset: xr.Dataset) -> list[Finding]:
     """Say which model the data support, by how much, how sure that is and what it depends on."""
-    order = ranking(dataset["log_evidence"])
+    order = by_probability(dataset, dataset["log_evidence"])
     best = order[0]
     P = float(dataset["probability"].sel(model=best))
     said: list[Finding] = []
@@ -65,7 +71,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         ln_B, error = bayes_factor(dataset, best, order[1])
         support = (
             f"{best} is the most probable of the candidates, with {number(100 * P, 4)} %; ln of the Bayes factor over "
-            f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B)}."
+            f"{order[1]}: {with_error(ln_B, error)}, {grade(ln_B) if ln_B >= 0 else AGAINST}."
         )
     else:
         support = f"{best} is the only candidate."
@@ -75,7 +81,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         said.append(Finding("warning", f"Best of bad models: the residuals of {best} {'; and '.join(wrong)}."))
     changed = []
     for variant in dataset.variant.values[1:]:
-        other = ranking(dataset["variant_log_evidence"].sel(variant=variant))
+        other = by_probability(dataset, dataset["variant_log_evidence"].sel(variant=variant))
         if other[0] != best:
             changed.append(f"{other[0]} with {variant}")
         elif other != order:
@@ -130,7 +136,7 @@ def doubts_of_selection(
     from inverse.criticism import doubts as criticism
     from inverse.criticism.weights import resampled
 
-    best = ranking(dataset["log_evidence"])[0]
+    best = by_probability(dataset, dataset["log_evidence"])[0]
     inputs = candidates[best]
     names = list(inputs.names)
     said: list[Finding] = []
@@ -154,9 +160,40 @@ def doubts_of_selection(
             for test, at in zip(rows["output_test"].values, rows["output_at"].values, strict=True)
         ]
         found += criticism.strangers(residual, np.zeros(len(residual)), labels, heavy=False, remedy="")
+        if "mesh_checked" in dataset:
+            shifts = dict(zip(names, of["mesh_shift"].sel(parameter=names).to_numpy().tolist(), strict=True))
+            error, why = rows["mesh_error"].sel(model=best).to_numpy(), str(of["mesh_why"].item())
+            found += criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
         where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
         said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
-    return said
+    return said + _doubts_of_meshes(dataset, best)
+
+
+def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
+    """Say what finer meshes do to the evidences, and of which of the others that is not known."""
+    from inverse.criticism import doubts as criticism
+
+    if "mesh_checked" not in dataset:
+        return []
+    weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
+    values, added = weights.to_series().to_dict(), dataset["mesh_log_evidence"].sum("group", skipna=False)
+    said = [
+        Finding("warning", f"{model}: not checked for the mesh: {one['mesh_why'].item()}.")
+        for model in map(str, dataset.model.values)
+        for one in [dataset.isel(group=0).sel(model=model)]
+        if model != best and not bool(one["mesh_checked"])
+    ]
+    doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict())
+    return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
+
+
+def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
+    """Trust no evidence whose mesh was not looked at, or whose ln Z a finer one moves."""
+    from inverse.criticism.doubts import MOVED
+
+    if "mesh_checked" not in dataset:
+        return dataset
+    return dataset.assign(trusted=dataset["trusted"] & (np.abs(dataset["mesh_log_evidence"]) <= MOVED))
 
 
 NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md

@@ -257,19 +257,8 @@ def _inversion(study: Inversion) -> list[str]:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
         seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
-    checked = "not asked for: nothing will be said to be trusted"
-    if study.method.mesh_check:
-        try:
-            if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
-                unknowns, once = 8 * spec.unknowns, 8**2 * textbook
-            else:
-                fine = finer(spec)
-                unknowns = fine.unknowns
-                once = sum(_times(fine.loaded(case)).textbook for case in fine.cases)
-            seconds += once
-            checked = f"one solve of {unknowns:,} displacements, about {_duration(once)}"
-        except ValueError as error:
-            checked = f"not possible: {error}; nothing will be said to be trusted"
+    once, checked = _mesh_check(spec) if study.method.mesh_check else (0.0, NOT_ASKED)
+    seconds += once
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
@@ -282,6 +271,22 @@ def _inversion(study: Inversion) -> list[str]:
         f"time        about {_duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
+
+
+NOT_ASKED = "not asked for: nothing will be said to be trusted"
+
+
+def _mesh_check(spec: Specimen) -> tuple[float, str]:
+    """Predict the processor time (s) of a solve on a finer mesh, and say what is solved."""
+    try:
+        if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
+            unknowns, once = 8 * spec.unknowns, 8**2 * sum(_times(spec.loaded(case)).textbook for case in spec.cases)
+        else:
+            fine = finer(spec)
+            unknowns, once = fine.unknowns, sum(_times(fine.loaded(case)).textbook for case in fine.cases)
+    except ValueError as error:
+        return 0.0, f"not possible: {error}; nothing will be said to be trusted"
+    return once, f"one solve of {unknowns:,} displacements, about {_duration(once)}"
 
 
 def _moved(count: int, farthest: float) -> str:
@@ -306,6 +311,10 @@ def _comparison(study: Comparison) -> list[str]:
     method = study.method
     evidences = study.evidences
     seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
+    meshes = [_mesh_check(one) for one in getattr(study, "specimens", {}).values() if study.unchecked]
+    if not getattr(method, "mesh_check", True):
+        meshes = [(0.0, NOT_ASKED)]
+    seconds += sum(once for once, _ in meshes)
     check = " and nested sampling, which takes minutes" if method.check else ""
     data = study.groups.values()
     tests = sum(len(study.tests(group)) for group in study.group_names)
@@ -319,6 +328,7 @@ def _comparison(study: Comparison) -> list[str]:
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
         f"data        {count}{groups}",
         f"evidences   {evidences}{check}",
+        *(f"mesh check  {words}" for words in dict.fromkeys(words for _, words in meshes)),
         f"solves      about {study.planned:,}",
         f"time        about {_duration(seconds)} on 1 core (rough)",
     ]

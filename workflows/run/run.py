@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
     from forward.specimen import SpecimenModel
+    from inverse.criticism.finer import Finer
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
@@ -335,12 +336,15 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
 
 def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     """The candidates, each for each group of data; making them is collective over the group."""
+    from inverse.criticism.finer import Finer
     from uq.evaluation.evaluate import SerialEvaluate
     from workflows.studies.selection import groups
 
     pairs = study.pairs
-    makers = [partial(study.build, *pair, ensemble.group) for pair in pairs]
+    makers = [cache(partial(study.build, *pair, ensemble.group)) for pair in pairs]
     recorders: dict[str, Recorder] = {}
+    why = study.unchecked
+    checked = [number for number, (name, _) in enumerate(pairs) if not why.get(name, "none")]
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         def recorded(name: str, group: str) -> Evaluate:
@@ -351,18 +355,24 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
             # What nested sampling solves is too much, and too cheap, to keep.
             return SerialEvaluate(study.build(name, group), ensemble.count)
 
-        return study.method.run(study.models, study.groups, recorded, free)
+        def finer(name: str, group: str) -> Finer:
+            number = pairs.index((name, group))
+            if number not in checked:
+                return Finer(None, why[name])
+            return _by(recorders[f"{name}/{group}"].on(len(pairs) + checked.index(number)))
+
+        return study.method.run(study.models, study.groups, recorded, free, finer if why else None)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
         doubts = verdict.doubts_of_selection(found, candidates, study.method.noise.factor)
         add(found, *verdict.findings(found), *doubts)
-        return found
+        return verdict.trusted_on_meshes(found)
 
-    return _Job(
-        makers[0](), list(makers[1:]), task, recorders, labelled, groups=partial(groups, study), costly=study.costly
-    )
+    others: list[Callable[[], ForwardModel]] = [*makers[1:]]
+    others += [partial(_once_on_finer_mesh, makers[number]) for number in checked]
+    return _Job(makers[0](), others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)
 
 
 @dataclass(frozen=True)
@@ -404,8 +414,9 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
     if study.together:
         return _inversion_by_all(study, ensemble)
     from forward.model import SolveError
+    from inverse.criticism.finer import Finer
     from inverse.fields.field_posterior import FieldPosterior
-    from inverse.methods.inversion import Finer, Inversions, Vertices, invert_by_group, invert_field
+    from inverse.methods.inversion import Inversions, Vertices, invert_by_group, invert_field
     from uq.evaluation.evaluate import Request
     from uq.evaluation.kept import KeptEvaluate, KeptModel
     from workflows.studies import inversion
@@ -472,9 +483,8 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
 
 def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
     """One data set, whose solves all groups share; collective over the group."""
-    from forward.model import FunctionModel, SolveError
-    from inverse.methods.inversion import Finer, invert_by_all
-    from uq.evaluation.evaluate import Request
+    from inverse.criticism.finer import Finer
+    from inverse.methods.inversion import invert_by_all
     from workflows.studies import inversion
 
     specimen = _Specimen.of(study, ensemble)
@@ -483,18 +493,11 @@ def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
     recorders: dict[str, Recorder] = {}
     others: list[Callable[[], ForwardModel]] = []
     if specimen.mesh is not None:
-        outputs = partial(specimen.mesh.outputs, observed)
-        others = [lambda: FunctionModel(outputs, observed.parameters, observed.outputs)]
-
-    def on_finer_mesh(point: FloatArray) -> FloatArray:
-        found = recorders["/"].on(1)(Request(point[None]))
-        for failure in found.failures:
-            raise SolveError(failure.reason)
-        return np.asarray(found.outputs[0])
+        others = [partial(_on_finer_mesh, observed, partial(specimen.mesh.outputs, observed))]
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        finer = Finer(on_finer_mesh if others else None, specimen.why)
+        finer = _by(recorders["/"].on(1)) if others else Finer(None, specimen.why)
         errors = study.data.errors
         found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
         return inversion.dataset(study, study.variables.pack(found)[None], {}, specimen.vertices)
@@ -518,6 +521,44 @@ def _finer(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
         return FinerMesh(model), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
         return None, str(error)
+
+
+def _on_finer_mesh(observed: SpecimenModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
+    """Return a model of what is observed on a finer mesh; where that cannot be made, its solves fail."""
+    from forward.model import FunctionModel, SolveError
+
+    def solve(point: FloatArray) -> FloatArray:
+        try:
+            return outputs(point)
+        except ValueError as error:  # as on all ranks of the group
+            raise SolveError(str(error)) from None
+
+    return FunctionModel(solve, observed.parameters, observed.outputs)
+
+
+def _once_on_finer_mesh(make: Callable[[], ForwardModel]) -> ForwardModel:
+    """Return a model on a finer mesh of a specimen, which is made for each solve: there is one for each candidate."""
+    from forward.fem.finer import FinerMesh
+    from forward.specimen import SpecimenModel
+
+    specimen = make()
+    assert isinstance(specimen, SpecimenModel)
+    return _on_finer_mesh(specimen, lambda point: FinerMesh(specimen).outputs(specimen, point))
+
+
+def _by(evaluate: Evaluate) -> Finer:
+    """Let all groups of ranks solve on a finer mesh."""
+    from forward.model import SolveError
+    from inverse.criticism.finer import Finer
+    from uq.evaluation.evaluate import Request
+
+    def outputs(point: FloatArray) -> FloatArray:
+        found = evaluate(Request(point[None]))
+        for failure in found.failures:
+            raise SolveError(failure.reason)
+        return np.asarray(found.outputs[0])
+
+    return Finer(outputs)
 
 
 def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:

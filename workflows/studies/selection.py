@@ -346,6 +346,11 @@ class Comparison(Settings):
         of_all = (findings_of_materials(one.inputs, f"{name}: ") for name, one in self.models.items())
         return tuple(finding for found in of_all for finding in found)
 
+    @property
+    def unchecked(self) -> dict[str, str]:
+        """Why each candidate is not looked at on a finer mesh, empty where it is; none where there are no meshes."""
+        return {}
+
     def described(self, name: str) -> str:
         """What a candidate is, in words."""
         raise NotImplementedError

@@ -13,12 +13,13 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import AXES, Vector, tolerance
 from forward.fem.cost import times
+from forward.fem.finer import finer
 from forward.hyperelastic import Mistake
 from forward.settings import Settings
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Candidate, Data
 from inverse.data.observations import DataError, read
-from inverse.methods.selection import Select
+from inverse.methods.selection import SelectSpecimens
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import mistakes_of_materials
@@ -175,7 +176,7 @@ class SpecimenSelection(Comparison):
     model: dict[str, Any]
     data: MeasuredDisplacements
     candidates: dict[str, SpecimenCandidate] = Field(min_length=1)
-    method: Select
+    method: SelectSpecimens
     parallel: Parallel = Parallel()
 
     quantity: ClassVar[str] = "displacement"
@@ -207,6 +208,20 @@ class SpecimenSelection(Comparison):
             for finding in (*one.findings, *one.locking(ranges(self.candidates[name].parameters)))
         )
         return tuple(dict.fromkeys([*of_specimens, *super().findings]))
+
+    @cached_property
+    def unchecked(self) -> dict[str, str]:
+        """Why each candidate is not looked at on a finer mesh; empty where it is."""
+        return {name: self._unchecked(specimen) for name, specimen in self.specimens.items()}
+
+    def _unchecked(self, specimen: Specimen) -> str:
+        if not self.method.mesh_check:
+            return "method.mesh_check = false"
+        try:
+            finer(specimen)
+        except ValueError as error:  # a mesh that is not divided, or would be too large
+            return str(error)
+        return ""
 
     @property
     def models(self) -> dict[str, Candidate]:

@@ -1,5 +1,6 @@
 """Selection among models of a specimen: evidence against quadrature, meshes as candidates, mistakes, ranks."""
 
+import json
 import os
 import signal
 import subprocess
@@ -13,12 +14,17 @@ import xarray as xr
 from mpi4py import MPI
 from scipy.special import logsumexp
 
+from forward.fem.finer import FinerMesh, finer
+from inverse.criticism.finer import Finer
 from tests.inverse.methods.test_select import TISSUQ
 from tests.launch import run
 from tests.rubber import CONFIGS
-from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import LogNormal
+from workflows.__main__ import main
 from workflows.config.study import StudyError, dump, load, parse
+from workflows.report.selection_report import meshes
+from workflows.run import run as study_runs
 from workflows.run.plan import plan
 
 pytestmark = pytest.mark.fem
@@ -131,6 +137,64 @@ def test_one_line_for_a_mistake(study, old, new, told):
     with pytest.raises(StudyError, match=told) as caught:
         load(study)
     assert len(caught.value.args) == 1
+
+
+def test_what_a_finer_mesh_does_to_an_evidence(study):
+    """Beside the evidence of the candidate that has this mesh, of one candidate that moves little and one that does."""
+    it = load(study, ["method.noise.absolute=0.02", "method.samples=64"])
+    meshes = {name: finer(specimen) for name, specimen in it.specimens.items()}
+    coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
+    fine = {
+        name: spec.build(MPI.COMM_SELF, ("material.C1",)).observing(np.array(it.data.places), it._axes, [0] * 12)
+        for name, spec in meshes.items()
+    }
+    assert it.unchecked == {"right": "", "stiff": ""}
+    here, there = (
+        it.method.run(
+            it.models,
+            it.groups,
+            lambda name, _, models=models: SerialEvaluate(models[name]),
+            finer=lambda name, _: Finer(lambda point: FinerMesh(coarse[name]).outputs(coarse[name], point)),
+        )
+        for models in (coarse, fine)
+    )
+    assert here["mesh_checked"].all()
+    moves = here["mesh_log_evidence"].values[:, 0]
+    exact = (there["log_evidence"] - here["log_evidence"]).values
+    assert abs(exact).min() > 0.3
+    np.testing.assert_allclose(moves, exact, atol=0.15)  # of a model that is linear at the mode
+    at_mode = SerialEvaluate(fine["stiff"])(Request(here["constant_mode"].values[1])).outputs[0]
+    before = SerialEvaluate(coarse["stiff"])(Request(here["constant_mode"].values[1])).outputs[0]
+    np.testing.assert_allclose(here["mesh_error"].values[1], (at_mode - before) / 0.02, rtol=1e-6)
+    shift = here["mesh_shift"].values[1, 0, 0] * here["constant_std"].values[1, 0, 0]
+    gone = (there["constant_mode"] - here["constant_mode"]).values[1, 0, 0]
+    assert shift == pytest.approx(gone, rel=0.5)
+
+
+def test_a_study_says_what_its_meshes_do(study, monkeypatch):
+    """Coarse meshes are found out: exit code 3, evidences that are not trusted; and nothing is where no one looked."""
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    out = study.parent / "out"
+    assert main(["run", str(study), "--out", str(out), "--quiet"]) == 3
+    summary = json.loads((out / "summary.json").read_text())
+    assert not any(one["trusted"] for one in summary["models"].values())
+    said = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert any("a finer mesh moves the data by" in text and "material.C1" in text for text in said)
+    assert any(
+        text.startswith("Finer meshes move ln Z by: right ") for text in (f["text"] for f in summary["findings"])
+    )
+    found = xr.load_dataset(out / "results.nc")
+    table = meshes(found)
+    assert [row[0] for row in table.rows] == ["right", "stiff"]
+    blind = study.parent / "blind"
+    main(["run", str(study), "--out", str(blind), "--quiet", "--set", "method.mesh_check=false"])
+    summary = json.loads((blind / "summary.json").read_text())
+    assert not any(one["trusted"] for one in summary["models"].values())
+    said = [one["text"] for one in summary["findings"] if one["severity"] == "warning"]
+    assert "stiff: not checked for the mesh: method.mesh_check = false." in said
+    assert "right: not checked for the mesh: method.mesh_check = false." in said
+    assert any("nothing will be said to be trusted" in line for line in plan(load(study, ["method.mesh_check=false"])))
+    assert any("mesh check  one solve of" in line for line in plan(load(study)))
 
 
 @pytest.mark.mpi
