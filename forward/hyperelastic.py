@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from pydantic import Field, TypeAdapter, ValidationError, create_model, field_validator, model_validator
+from pydantic import Field, ValidationError, create_model, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
@@ -21,6 +20,7 @@ from forward.materials.admissible import Materials
 from forward.materials.energies import MATERIALS, constants, measures, splits
 from forward.model import Finding
 from forward.observables.outputs import Output, PointDisplacement, Reaction
+from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
 from forward.terms.loads import LOAD_SIZES, Displacement, Gravity, Load, Pressure
@@ -64,31 +64,6 @@ else:
         ],
         Field(discriminator="kind"),
     ]
-
-
-Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
-
-
-class Scalar(NamedTuple):
-    """A number of the model that can be made a parameter."""
-
-    value: float
-    block: type[Settings]
-    field: str
-    limits: tuple[Any, ...] = ()  # beyond those of the field
-
-    def objection(self, value: float) -> str | None:
-        """Say why the number cannot be `value`, or nothing if it can."""
-        try:
-            _admissible(self.block, self.field, self.limits).validate_python(value)
-        except ValidationError as error:
-            return str(error.errors()[0]["msg"]).lower()
-        return None
-
-
-@cache
-def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> TypeAdapter[float]:
-    return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
 
 
 CONTRAST = "contrast"

@@ -21,11 +21,12 @@ from forward.bodies.geometry import AXES, Body, Vector, holds, tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.hyperelastic import Hyperelastic, Material, Scalar, materials
+from forward.hyperelastic import Hyperelastic, Material, materials
 from forward.materials.admissible import Materials
 from forward.materials.energies import splits
 from forward.model import Finding, FloatArray, Reference, SolveError, Stability, Work
 from forward.observables.outputs import Output
+from forward.scalars import Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
 from forward.terms.loads import Displacement, Load

@@ -20,9 +20,9 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from forward.external.own_modules import Sources, sources
 from forward.external.patience import TimeLimitError, time_limit
-from forward.hyperelastic import Scalar
 from forward.machine import StopError, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
+from forward.scalars import Scalar
 from forward.settings import Settings, nearest
 
 SECONDS_TO_ANSWER = 30.0  # of questions that need no solve

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from forward.hyperelastic import Mistake
 from forward.materials.admissible import Materials
 from forward.model import Finding
+from forward.scalars import Mistake
 from uq.inputs.random_parameters import Inputs
 
 LEAST = 0.5  # probability that constants must have to be of a material at all

@@ -14,8 +14,9 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.external.models import PythonModel, UmBridgeModel
 from forward.fem.locking import Decision
-from forward.hyperelastic import Hyperelastic, Mistake, Scalar, too_far
+from forward.hyperelastic import Hyperelastic, too_far
 from forward.model import Finding, ModelError
+from forward.scalars import Mistake, Scalar
 from forward.settings import UNKNOWN_KIND, Settings, cut, nearest, one_line, shown
 from uq.evaluation.evaluate import BLOCKS
 from uq.inputs.distributions import Distribution, Normal

@@ -21,7 +21,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion, derived
-from forward.hyperelastic import Mistake
+from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.specimen import Specimen
 from inverse.data.errors import NORMAL, Errors

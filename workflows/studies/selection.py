@@ -12,11 +12,11 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import Vector
-from forward.hyperelastic import Mistake
 from forward.materials.admissible import Materials
 from forward.materials.energies import MATERIALS, constants
 from forward.materials.material_point import HELD, Component, HomogeneousModel, MaterialTest, Mode, named, unfit
 from forward.model import Finding, FloatArray, ForwardModel
+from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
 from inverse.criticism.comparison import Candidate, Data
 from inverse.criticism.weights import resampled

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 from forward.bodies.geometry import AXES, Vector, tolerance
 from forward.fem.cost import times
 from forward.fem.finer import finer
-from forward.hyperelastic import Mistake
+from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Candidate, Data

@@ -1,0 +1,47 @@
+"""Numbers of a model that can be made parameters, and mistakes with their places."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any, NamedTuple
+
+from annotated_types import Unit
+from pydantic import Field, TypeAdapter, ValidationError
+
+from forward.settings import Settings
+
+Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
+
+
+class Scalar(NamedTuple):
+    """A number of the model that can be made a parameter."""
+
+    value: float
+    block: type[Settings]
+    field: str
+    limits: tuple[Any, ...] = ()  # beyond those of the field
+
+    def objection(self, value: float) -> str | None:
+        """Say why the number cannot be `value`, or None if it can."""
+        try:
+            _admissible(self.block, self.field, self.limits).validate_python(value)
+        except ValidationError as error:
+            return str(error.errors()[0]["msg"]).lower()
+        return None
+
+    @property
+    def unit(self) -> str:
+        """SI unit, as the annotation of the field says it; "1" without."""
+        return next((item.unit for item in self.block.model_fields[self.field].metadata if isinstance(item, Unit)), "1")
+
+
+def numbers(block: type[Settings]) -> tuple[str, ...]:
+    """Return the fields of a block that are annotated with a unit: those that can be made parameters."""
+    return tuple(
+        name for name, field in block.model_fields.items() if any(isinstance(item, Unit) for item in field.metadata)
+    )
+
+
+@cache
+def _admissible(block: type[Settings], field: str, limits: tuple[Any, ...]) -> TypeAdapter[float]:
+    return TypeAdapter(Annotated[(float, Field(), *block.model_fields[field].metadata, *limits)])
