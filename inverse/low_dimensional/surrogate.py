@@ -66,6 +66,7 @@ class Surrogate:
     upper: FloatArray
     differentiable: bool = True
     displacements: int = 0
+    node_volumes: FloatArray | None = None
 
     def on(self, model: int) -> Surrogate:
         """Return itself: it stands for one model."""

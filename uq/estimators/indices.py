@@ -1,8 +1,8 @@
 """Sobol' indices: of expansions, of exchanged samples, and of their fields; each formula once.
 
 With the variance V of a quantity ψ, V_g = Var E[ψ | ω_g] and T_g = E Var(ψ | ω_~g) for a parameter or a group g, the
-index of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V, sums
-over its nodes and components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
+index of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V over
+the body, summed over the components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
 
 Of an expansion in orthonormal polynomials all these are sums of squares of coefficients (B. Sudret, Reliab. Eng. Syst.
 Safety 93 (2008) 964–979). From samples they come from rows of points: A and B, independent, AB_g, which is A with ω_g
@@ -206,7 +206,7 @@ def jackknife_error(left_out: FloatArray) -> FloatArray:
 
 
 def field_indices(
-    variance: FloatArray, first: FloatArray, total: FloatArray
+    variance: FloatArray, first: FloatArray, total: FloatArray, volumes: FloatArray | None = None
 ) -> dict[str, tuple[tuple[str, ...], FloatArray | NDArray[np.int64]]]:
     """Return the generalised indices of a field, its indices by node, and which parameter dominates there.
 
@@ -214,6 +214,8 @@ def field_indices(
     ----------
     variance, first, total
         V (nodes,), and V_i and T_i (d, nodes) of d parameters, sums over the components.
+    volumes
+        Share (nodes,) of the body that each node stands for in the integrals; by default all count alike.
 
     Returns
     -------
@@ -224,9 +226,10 @@ def field_indices(
     """
     moving = variance > MOVES * variance.max(initial=0.0)
     at_node = np.where(moving, variance, 0.0)
+    v = np.ones(len(variance)) if volumes is None else volumes
     return {
-        "field_sobol_first": (("parameter",), shares(first.sum(axis=1), variance.sum())),
-        "field_sobol_total": (("parameter",), shares(total.sum(axis=1), variance.sum())),
+        "field_sobol_first": (("parameter",), shares(first @ v, variance @ v)),
+        "field_sobol_total": (("parameter",), shares(total @ v, variance @ v)),
         "node_sobol_first": (("parameter", "node"), shares(first, at_node)),
         "node_sobol_total": (("parameter", "node"), shares(total, at_node)),
         "dominating": (("node",), np.where(moving, total.argmax(axis=0), -1)),

@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.machine import StopError, reason_to_stop
-from forward.model import ForwardModel, ModelError, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, SolveError
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 
@@ -113,6 +113,7 @@ class Ensemble:
         blocks: int = BLOCKS,
         arrived: Arrived = lambda block, kept: None,
         counted: bool = True,
+        node_volumes: Callable[[], FloatArray | None] = lambda: None,
     ) -> T | None:
         """Run `task` on rank 0 with an evaluation that all groups work on; collective.
 
@@ -135,6 +136,8 @@ class Ensemble:
             it was on disk.
         counted
             Whether a point of a request is a solve; if not, models count theirs, see `count`.
+        node_volumes
+            On rank 0: those of model number 0, see `Evaluate`.
 
         Returns
         -------
@@ -156,7 +159,8 @@ class Ensemble:
                         worker.work(order)
                 return None
             try:
-                return task(EnsembleEvaluate(worker, 0, progress if counted else _unseen, blocks, arrived))
+                told = progress if counted else _unseen
+                return task(EnsembleEvaluate(worker, 0, told, blocks, arrived, node_volumes))
             finally:
                 self.world.bcast(None)
 
@@ -193,6 +197,7 @@ class EnsembleEvaluate:
     progress: Callable[[int, int], None]
     blocks: int = BLOCKS
     arrived: Arrived = lambda block, kept: None
+    volumes: Callable[[], FloatArray | None] = lambda: None
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -213,6 +218,11 @@ class EnsembleEvaluate:
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
         return self.worker.models[self.number].displacements
+
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """Share (n_nodes,) of the body that each node of model number 0 stands for, see `Evaluate`."""
+        return self.volumes() if self.number == 0 else None
 
     def on(self, model: int) -> EnsembleEvaluate:
         """Return the evaluation of another of the models; all groups make it now."""

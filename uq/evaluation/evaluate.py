@@ -213,6 +213,10 @@ class Evaluate(Protocol):
     def displacements(self) -> int:
         """Number of displacements at the head of a state, see `ForwardModel.displacements`."""
 
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """Share (n_nodes,) of the body that each node stands for in integrals; None: all nodes count alike."""
+
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
 
@@ -232,11 +236,14 @@ class SerialEvaluate:
         Told the numbers of points that were done and that failed since it was last told.
     others
         Models number 1, 2, … that a method may ask for.
+    node_volumes
+        See `Evaluate`.
     """
 
     model: ForwardModel
     progress: Callable[[int, int], None] = lambda done, failed: None
     others: tuple[ForwardModel, ...] = ()
+    node_volumes: FloatArray | None = None
 
     def on(self, model: int) -> SerialEvaluate:
         """Return the evaluation of another of the models."""
@@ -304,6 +311,11 @@ class Recorder:
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
         return self._evaluate.displacements
+
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """Share (n_nodes,) of the body that each node stands for, see `Evaluate`."""
+        return self._evaluate.node_volumes
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""

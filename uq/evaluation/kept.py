@@ -83,6 +83,11 @@ class KeptEvaluate:
         """Number of displacements at the head of a state."""
         return self.model.displacements
 
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """None: no sums of fields."""
+        return None
+
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request, without sums of fields."""
         solver: BlockSolver | None = None

@@ -421,6 +421,11 @@ class _Memory:
         """Number of displacements at the head of a state."""
         return self._evaluate.displacements
 
+    @property
+    def node_volumes(self) -> FloatArray | None:
+        """Share (n_nodes,) of the body that each node stands for, see `Evaluate`."""
+        return self._evaluate.node_volumes
+
     def on(self, model: int) -> _Memory:
         """Return the evaluation of another of the models, with a memory of its own."""
         if model not in self._others:

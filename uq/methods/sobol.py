@@ -226,9 +226,11 @@ class Sobol(Amount):
         )
         expanded = method.expand(inputs, evaluate)
         dataset = expansion_dataset(method, evaluate, expanded)
-        return self._with_indices(dataset, inputs, expanded.regression)
+        return self._with_indices(dataset, inputs, expanded.regression, evaluate.node_volumes)
 
-    def _with_indices(self, dataset: xr.Dataset, inputs: Inputs, regression: Regression) -> xr.Dataset:
+    def _with_indices(
+        self, dataset: xr.Dataset, inputs: Inputs, regression: Regression, volumes: FloatArray | None
+    ) -> xr.Dataset:
         """Add the indices from a regression, and from its first samples."""
         found = regression.estimates(self._analysis(inputs))
         dataset = dataset.assign(_by_output(found))
@@ -241,7 +243,7 @@ class Sobol(Amount):
                 continue  # too few for an expansion
         dataset = dataset.assign(_running(running)).assign_coords(index_round=list(running))
         add(dataset, *regression.doubts(dataset["output"].to_numpy().tolist()), *of_indices(dataset))
-        return _with_maps(dataset) if self.fields else dataset
+        return _with_maps(dataset, volumes) if self.fields else dataset
 
     # --- from given data -----------------------------------------------------------------------------------------
 
@@ -269,7 +271,7 @@ class Sobol(Amount):
                 f"; expanded to order {regression.fit.chosen.order}, {regression.fit.chosen.which.size} terms, "
                 f"leave-one-out error {regression.fit.relative.max():.3g}"
             )
-            return self._with_indices(dataset, inputs, regression)
+            return self._with_indices(dataset, inputs, regression, evaluate.node_volumes)
         coefficients, indices = source["coefficients"].to_numpy().T, source["multi_index"].to_numpy()
         found = self._analysis(inputs)(coefficients, indices)
         nothing = source["loo_error"].to_numpy() > NOTHING
@@ -279,7 +281,7 @@ class Sobol(Amount):
             found[kept] = source[kept].to_numpy() if kept in source else np.full_like(found[name], np.nan)
             found[name][nothing] = np.nan
         dataset = dataset.assign(_by_output(found))
-        return _with_maps(dataset) if self.fields else dataset
+        return _with_maps(dataset, evaluate.node_volumes) if self.fields else dataset
 
     # --- from exchanged samples ----------------------------------------------------------------------------------
 
@@ -328,7 +330,7 @@ def _running(rounds: dict[int, dict[str, FloatArray]]) -> Variables:
     }
 
 
-def _with_maps(dataset: xr.Dataset) -> xr.Dataset:
+def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     """Add the indices of an expanded field.
 
     Their errors are those of the outputs in proportion to the relative errors of the standard deviations.
@@ -338,9 +340,11 @@ def _with_maps(dataset: xr.Dataset) -> xr.Dataset:
     squares = (dataset["field_coefficients"].to_numpy() ** 2).sum(axis=2).T
     indices = dataset["multi_index"].to_numpy()
     variance, first, total = partial_variances(squares, indices, np.eye(indices.shape[1], dtype=bool))
-    dataset = dataset.assign(field_indices(variance, first.T, total.T))
+    dataset = dataset.assign(field_indices(variance, first.T, total.T, volumes))
     of_outputs = dataset["std_error"] / dataset["std"]
-    of_field = np.linalg.norm(dataset["field_std_error"]) / np.linalg.norm(dataset["field_std"])
+    v = np.ones(dataset.sizes["node"]) if volumes is None else volumes
+    error, size = ((dataset[name].to_numpy() ** 2).sum(axis=1) @ v for name in ("field_std_error", "field_std"))
+    of_field = np.sqrt(error / size)
     for name in RUNNING:
         errors = shares(dataset[f"{name}_error"].to_numpy(), of_outputs.to_numpy()[:, None])
         dataset[f"field_{name}_error"] = (("parameter",), of_field * errors.max(axis=0))
@@ -531,6 +535,7 @@ class _Rows:
         sums = [total[:, :count] for total, _ in kept]
         counts = [n for _, n in kept]
         whole, n = np.sum(sums, axis=0), sum(counts)
+        volumes = self._evaluate.node_volumes
 
         def of(means: FloatArray) -> Variables:
             parts = self._of_fields.variances(means)
@@ -538,7 +543,7 @@ class _Rows:
                 part.reshape(*part.shape[:-1], -1, 3).sum(axis=-1)
                 for part in (parts.variance, parts.first[:d], parts.total[:d])
             )
-            return field_indices(variance, first, total)
+            return field_indices(variance, first, total, volumes)
 
         found = of(whole / n)
         without = [of((whole - s) / (n - c)) for s, c in zip(sums, counts, strict=True)]

@@ -32,6 +32,42 @@ def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> 
     cells
         Nodes of each cell (n_cells, 4, 10, 8 or 27), the vertices first, in VTK's order.
     """
+    shapes, slopes, weights = _basis(nodes, cells)
+    total, volume = np.zeros(len(fields)), 0.0
+    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
+        measure = _measure(nodes[part], slopes, weights)
+        volume += float(measure.sum())
+        for i, field in enumerate(fields):
+            values = np.einsum("qk,nkx->nqx", shapes, field[part])
+            total[i] += float((measure * (values**2).sum(axis=2)).sum())
+    return total, volume
+
+
+def node_volumes(nodes: FloatArray, cells: NDArray[np.int64]) -> FloatArray:
+    """Return the share (N,) of the body that each node stands for: Σ_n v_n f_n is ∫f dX of what is known at nodes only.
+
+    Of hexahedra these are the integrals of the shape functions: on bricks of degree 2 Simpson's rule. Of tetrahedra of
+    degree 2 they would be negative at the vertices; there f is linear on the eight parts that the midpoints of the
+    edges make, on average over the ways to cut the inner ones.
+
+    Parameters
+    ----------
+    nodes, cells
+        As of `squares`.
+    """
+    shapes, slopes, weights = _basis(nodes, cells)
+    found = np.zeros(len(nodes))
+    parts = np.full(10, 7 / 48)
+    parts[:4] = 1 / 32
+    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
+        measure = _measure(nodes[part], slopes, weights)
+        shares = measure.sum(axis=1)[:, None] * parts if cells.shape[1] == len(parts) else measure @ shapes
+        found += np.bincount(part.ravel(), shares.ravel(), minlength=len(nodes))
+    return found
+
+
+def _basis(nodes: FloatArray, cells: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the shape functions (q, k) and their slopes (3, q, k) at Gauss' points, and the weights (q,) of these."""
     tetrahedra = cells.shape[1] in {4, 10}
     corners = _TETRAHEDRON if tetrahedra else _HEXAHEDRON
     quadratic = cells.shape[1] > len(corners)
@@ -40,17 +76,14 @@ def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> 
     )
     basis = np.linalg.inv(_monomials(_reference(nodes[cells[0]], corners, tetrahedra=tetrahedra), powers))
     points, weights = _rule(tetrahedra=tetrahedra)
-    shapes = _monomials(points, powers) @ basis  # (q, k)
     slopes = np.array([_derivatives(points, powers, axis) @ basis for axis in range(3)])
-    total, volume = np.zeros(len(fields)), 0.0
-    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
-        jacobians = np.einsum("aqk,nkx->nqxa", slopes, nodes[part])
-        measure = np.abs(np.linalg.det(jacobians)) * weights
-        volume += float(measure.sum())
-        for i, field in enumerate(fields):
-            values = np.einsum("qk,nkx->nqx", shapes, field[part])
-            total[i] += float((measure * (values**2).sum(axis=2)).sum())
-    return total, volume
+    return _monomials(points, powers) @ basis, slopes, weights
+
+
+def _measure(places: FloatArray, slopes: FloatArray, weights: FloatArray) -> FloatArray:
+    """Volumes (n, q) of Gauss' points of cells with nodes at places (n, k, 3)."""
+    jacobians = np.einsum("aqk,nkx->nqxa", slopes, places)
+    return np.asarray(np.abs(np.linalg.det(jacobians)) * weights)
 
 
 def _reference(places: FloatArray, corners: FloatArray, *, tetrahedra: bool) -> FloatArray:

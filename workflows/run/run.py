@@ -46,6 +46,7 @@ from workflows.results.directory import (
     write_fields,
     write_text,
 )
+from workflows.results.norms import node_volumes
 from workflows.run import own_code
 from workflows.run.plan import memory, of_program, shortage
 from workflows.run.progress import Progress
@@ -155,6 +156,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
             blocks=study.parallel.blocks if job.counted else max(study.parallel.blocks, study.planned),
             arrived=job.arrived,
             counted=job.counted,
+            node_volumes=job.node_volumes,
         )
     except BaseException:
         if world.rank == 0:
@@ -277,6 +279,8 @@ class _Job:
         Told of each finished block of the first model, see `Ensemble.run`.
     counted
         Whether points of requests are solves; if not, they are counted where they are made.
+    node_volumes
+        Of the nodes of the first model, see `Evaluate`; on rank 0, if a method asks.
     """
 
     model: ForwardModel
@@ -289,6 +293,7 @@ class _Job:
     texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
     arrived: Callable[[Evaluations, bool], None] = field(default=lambda block, kept: None)
     counted: bool = True
+    node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
 
 
 def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> _Job:
@@ -331,7 +336,8 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
         found = with_regions(found, spec.body.regions, regions)
         return with_random_fields(found, factors, model.variance_kept)
 
-    return _Job(model, others, task, recorders, labelled)
+    volumes = partial(node_volumes, model.layout.coordinates, cells)
+    return _Job(model, others, task, recorders, labelled, node_volumes=volumes)
 
 
 def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
