@@ -16,6 +16,18 @@ MATERIALS = {
     "neo-hookean-coupled": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 2e5},
     "demiray": {"kind": "demiray", "a": 4e4, "b": 1.5, "D1": 2e5},
 }
+CONSTANTS: dict[str, dict[str, float]] = {
+    "mooney-rivlin": {"C1": 1e4, "C2": 2e4},
+    "neo-hookean": {"C1": 1e4},
+    "neo-hookean-coupled": {"mu": 1e4, "lmbda": 2e4},
+    "yeoh": {"C10": 1e4, "C20": -1e3, "C30": 500.0},
+    "gent": {"mu": 1e4, "Jm": 30.0},
+    "demiray": {"a": 1e4, "b": 0.7},
+    "saint-venant-kirchhoff": {"mu": 1e4, "lmbda": 2e4},
+    "blatz-ko": {"mu": 1e4},
+    "ogden": {"mu1": 1e4, "alpha1": 1.5, "mu2": -2e3, "alpha2": -2.0, "mu3": 100.0, "alpha3": 5.0},
+    "holzapfel-gasser-ogden": {"c": 1e4, "k1": 5e3, "k2": 0.8},
+}
 NOT_CONSTANTS = ("kind", "fibres")
 # Of these, what differs from the ones above is the energy: it is compared with closed forms.
 MORE_MATERIALS = {

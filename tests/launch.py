@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import xarray as xr
+
 ROOT = Path(__file__).parent.parent
+TISSUQ = Path(sys.executable).parent / "tissuq"
 
 
 def environment():
@@ -39,3 +42,11 @@ def run(ranks, *command):
 def run_script(ranks, script, *arguments):
     """Run a Python script."""
     return run(ranks, sys.executable, "-c", script, *arguments)
+
+
+def assert_same_bits(a, b):
+    """The results of two runs are the same bytes."""
+    left, right = (xr.load_dataset(d / "results.nc") for d in (a, b))
+    for name in left.variables:
+        assert left[name].values.tobytes() == right[name].values.tobytes(), name
+    assert (a / "results.nc").read_bytes() == (b / "results.nc").read_bytes()

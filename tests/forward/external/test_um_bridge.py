@@ -9,7 +9,6 @@ import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from threading import Barrier
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -23,12 +22,11 @@ from scipy.optimize import minimize
 from forward.conformance import check_derivatives
 from forward.external.models import UmBridgeModel
 from forward.model import ModelError, SolveError
-from tests.launch import ROOT, environment
+from tests.launch import ROOT, TISSUQ, environment
 from uq.evaluation.evaluate import SerialEvaluate
 from workflows.config.study import load, parse
 from workflows.serve import RefusalError, Service
 
-TISSUQ = Path(sys.executable).parent / "tissuq"
 POINT = [750.0, 2e5]
 FUNCTION = """
 [model]

@@ -10,7 +10,7 @@ from forward.bodies.mesh_file import OwnMesh, divided
 from forward.fem.finer import FinerMesh, finer
 from forward.model import ModelError
 from forward.specimen import Specimen
-from tests.forward.bodies.test_mesh_file import box, numbered
+from tests.meshes import box, numbered
 
 meshio = pytest.importorskip("meshio")
 

@@ -8,14 +8,14 @@ from forward.materials.admissible import Materials, admissible, moduli, objectio
 from forward.materials.energies import MATERIALS, constants, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import InadmissibleError
-from tests.forward.materials.test_material_point import VALUES
+from tests.bodies import CONSTANTS
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
 
 @pytest.mark.parametrize("kind", list(MATERIALS))
 def test_moduli_are_second_derivatives_of_the_energy(kind):
-    values = VALUES[kind] | ({"D1": 3e4} if "D1" in constants(MATERIALS[kind]) else {})
+    values = CONSTANTS[kind] | ({"D1": 3e4} if "D1" in constants(MATERIALS[kind]) else {})
     assert moduli(kind, values) == pytest.approx(small_strain_moduli(kind, values), rel=1e-9)
     arrays = {name: np.array([value, 2 * value]) for name, value in values.items()}
     assert moduli(kind, arrays)[0][0] == pytest.approx(moduli(kind, values)[0])

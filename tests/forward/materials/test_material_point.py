@@ -9,21 +9,10 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.energies import MATERIALS, constants, measures, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import SolveError
+from tests.bodies import CONSTANTS
 
-VALUES: dict[str, dict[str, float]] = {
-    "mooney-rivlin": {"C1": 1e4, "C2": 2e4},
-    "neo-hookean": {"C1": 1e4},
-    "neo-hookean-coupled": {"mu": 1e4, "lmbda": 2e4},
-    "yeoh": {"C10": 1e4, "C20": -1e3, "C30": 500.0},
-    "gent": {"mu": 1e4, "Jm": 30.0},
-    "demiray": {"a": 1e4, "b": 0.7},
-    "saint-venant-kirchhoff": {"mu": 1e4, "lmbda": 2e4},
-    "blatz-ko": {"mu": 1e4},
-    "ogden": {"mu1": 1e4, "alpha1": 1.5, "mu2": -2e3, "alpha2": -2.0, "mu3": 100.0, "alpha3": 5.0},
-    "holzapfel-gasser-ogden": {"c": 1e4, "k1": 5e3, "k2": 0.8},
-}
-CASES = [*VALUES.items()] + [
-    (kind, values | {"D1": 3e4}) for kind, values in VALUES.items() if "D1" in constants(MATERIALS[kind])
+CASES = [*CONSTANTS.items()] + [
+    (kind, values | {"D1": 3e4}) for kind, values in CONSTANTS.items() if "D1" in constants(MATERIALS[kind])
 ]
 STRETCHES = (0.7, 0.9, 1.1, 1.4)
 TESTS = [
@@ -45,7 +34,7 @@ def model(kind: str, values: dict[str, float], *tests: MaterialTest) -> Homogene
 
 
 def test_every_energy_is_read():
-    assert set(VALUES) == set(MATERIALS)
+    assert set(CONSTANTS) == set(MATERIALS)
 
 
 def test_incompressible_closed_forms():
@@ -79,7 +68,7 @@ def test_both_stresses_of_a_biaxial_test():
 @pytest.mark.parametrize("kind", ["mooney-rivlin", "blatz-ko"])
 def test_stresses_across_of_compressible_materials(kind):
     """What acts across is what acts along the specimen turned by a right angle, and so are its derivatives."""
-    values = VALUES[kind] | ({"D1": 3e4} if kind == "mooney-rivlin" else {})
+    values = CONSTANTS[kind] | ({"D1": 3e4} if kind == "mooney-rivlin" else {})
     point = np.array([list(values.values())])
     for stress in ("nominal", "cauchy"):
         turned = MaterialTest(mode="biaxial", at=(1.1, 0.9), across=(1.2, 1.3), stress=stress)
@@ -151,7 +140,7 @@ def test_small_strains_are_linear_elasticity(kind, values):
 @pytest.mark.parametrize("kind", ["mooney-rivlin", "ogden", "holzapfel-gasser-ogden"])
 def test_finite_elements_agree(kind):
     """A block between smooth plates deforms homogeneously; its force over its area is the stress."""
-    values = VALUES[kind] | {"D1": 5e4}
+    values = CONSTANTS[kind] | {"D1": 5e4}
     fibres = {"fibres": [[1.0, 0.0, 0.0]]} if "i4" in measures(kind) else {}
     spec = Hyperelastic.model_validate(
         {

@@ -11,7 +11,7 @@ from inverse.criticism.calibration import calibrate, rank_by_laplace, rank_by_we
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from tests.inverse.criticism.test_predictive import few
+from tests.problems import few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs

@@ -26,9 +26,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.surrogate import fit
-from tests.inverse.criticism.test_predictive import few
-from tests.inverse.fields.test_low_rank import DensePrior, Linear, N, curved, solved
-from tests.inverse.low_dimensional.test_evidence import ridge
+from tests.problems import DensePrior, Linear, N, curved, few, ridge, solved
 from uq.evaluation.evaluate import SerialEvaluate
 
 

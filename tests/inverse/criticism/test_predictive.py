@@ -21,23 +21,10 @@ from inverse.fields.newton_cg import find_mode
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from tests.inverse.fields.test_low_rank import DATA, Linear, N, solved
+from tests.problems import DATA, PLACES, G, Linear, N, few, solved
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-
-G = np.random.default_rng(5).standard_normal((30, 3))
-PLACES = np.random.default_rng(6).uniform(size=(30, 3))
-
-
-def few(seed=0, wave=0.0, noise=None):
-    """A linear model of three parameters, with data that a wave through all places may have been added to."""
-    rng = np.random.default_rng(seed)
-    names = ("a", "b", "c")
-    model = FunctionModel(lambda p: G @ p, names, tuple(f"y{i}" for i in range(30)), lambda p: G)
-    data = G @ rng.standard_normal(3) + 0.5 * rng.standard_normal(30) + wave * np.sin(8 * PLACES[:, 0])
-    inputs = Inputs({name: Normal(mean=0.0, std=1.0) for name in names})
-    return Posterior(inputs, SerialEvaluate(model), data, np.full(30, 0.5), noise)
 
 
 def test_derived_quantities_of_few_parameters():

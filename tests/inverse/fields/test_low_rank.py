@@ -4,63 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from forward.model import FunctionModel, SolveError
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior, leading_pairs
 from inverse.fields.newton_cg import find_mode
-
-N, DATA = 90, 60
-
-
-class DensePrior:
-    """N(0, LLᵀ) of a matrix L."""
-
-    def __init__(self, root):
-        self.matrix = root
-        self.variance = (root**2).sum(axis=1)
-
-    def root(self, noise):
-        return noise @ self.matrix.T
-
-    def root_transposed(self, g):
-        return g @ self.matrix
-
-
-class Linear:
-    """y = Gm + e with all that is known of it; the λ fall from 10⁴ to 10⁻⁴."""
-
-    def __init__(self, seed=0, data=DATA, holes=0):
-        rng = np.random.default_rng(seed)
-        x = np.linspace(0, 1, N)
-        self.prior_covariance = 0.49 * np.exp(-np.abs(x[:, None] - x) / 0.3)
-        root = np.linalg.cholesky(self.prior_covariance)
-        self.sigma = rng.uniform(0.5, 2, data)
-        left, _ = np.linalg.qr(rng.standard_normal((data, data)))
-        right, _ = np.linalg.qr(rng.standard_normal((N, data)))
-        A = (left * np.logspace(2, -2, data)) @ right.T
-        self.G = self.sigma[:, None] * A @ np.linalg.inv(root)
-        self.m_0 = rng.standard_normal(N)
-        truth = self.m_0 + root @ rng.standard_normal(N)
-        self.data = self.G @ truth + self.sigma * rng.standard_normal(data)
-        self.data[:holes] = np.nan
-        names, outputs = tuple(f"m{i}" for i in range(N)), tuple(f"y{i}" for i in range(data))
-        model = FunctionModel(lambda m: self.G @ m, names, outputs, lambda m: self.G)
-        self.posterior = FieldPosterior(model, self.data, self.sigma, DensePrior(root), self.m_0)
-        seen = np.isfinite(self.data)
-        self.seen = seen
-        K = self.G[seen]
-        self.scatter = K @ self.prior_covariance @ K.T + np.diag(self.sigma[seen] ** 2)  # of the data
-        gain = self.prior_covariance @ K.T @ np.linalg.inv(self.scatter)
-        self.mean = self.m_0 + gain @ (self.data[seen] - K @ self.m_0)
-        self.covariance = self.prior_covariance - gain @ K @ self.prior_covariance
-        self.values = np.linalg.eigvalsh((K @ root / self.sigma[seen, None]).T @ (K @ root / self.sigma[seen, None]))[
-            ::-1
-        ]
-
-
-def solved(problem, **settings):
-    mode = find_mode(problem.posterior, tolerance=1e-9)
-    return mode, LowRankPosterior.at(mode.point, **settings)
+from tests.problems import DATA, Linear, N, curved, solved
 
 
 @pytest.mark.parametrize("holes", [0, 7])
@@ -175,25 +122,6 @@ def test_calibration():
 
 
 # --- models that are not linear --------------------------------------------------------------------------------------
-
-
-def curved(limit=np.inf):
-    rng = np.random.default_rng(3)
-    B = rng.standard_normal((25, 12)) / 3
-
-    def function(m):
-        if np.abs(m).max() > limit:
-            raise SolveError("too far")
-        return np.exp(B @ m)
-
-    model = FunctionModel(
-        function, tuple(map(str, range(12))), tuple(map(str, range(25))), lambda m: np.exp(B @ m)[:, None] * B
-    )
-    truth = rng.standard_normal(12)
-    root = np.tril(rng.uniform(0, 0.4, (12, 12))) + np.eye(12)
-    sigma = np.full(25, 0.05)
-    data = np.exp(B @ truth) + sigma * rng.standard_normal(25)
-    return FieldPosterior(model, data, sigma, DensePrior(root))
 
 
 def test_gradient_and_product_are_derivatives():

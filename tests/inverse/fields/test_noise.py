@@ -7,7 +7,7 @@ from scipy import optimize, stats
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.fields.noise import Marginal, infer_noise
-from tests.inverse.fields.test_low_rank import DATA, Linear, N, curved, solved
+from tests.problems import DATA, Linear, N, curved, solved
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 
 PRIORS = [LogUniform(lower=0.1, upper=20.0), LogNormal(mean=1.5, std=1.0), Normal(mean=1.0, std=1.0)]

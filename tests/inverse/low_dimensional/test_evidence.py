@@ -17,39 +17,19 @@ from inverse.low_dimensional.posterior import Posterior
 from inverse.low_dimensional.surrogate import fit
 from inverse.methods.selection import _rescaled
 from inverse.methods.selection import posterior as assemble
+from tests.problems import FOUR, ridge, slopes_of_four, two_of_four
 from tests.rubber import CONFIGS, CURVED, FACTOR, LINEAR, on_treloar, treloar
 from uq.evaluation.evaluate import SerialEvaluate
-from uq.inputs.distributions import LogNormal, Normal, Uniform
+from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from workflows.config.study import load
-
-NAMES = ("a", "b", "c", "d")
-TRUTH = np.array([1.4, 0.8, 1.1, 1.3])
-
-
-def curved(points):
-    a, b, c, d = np.moveaxis(np.asarray(points), -1, 0)
-    return np.stack([a * b + 0.3 * c, a * c**2 + 0.5 * d * b], axis=-1)
-
-
-def slopes(point):
-    a, b, c, d = point
-    return [[b, a, 0.3, 0.0], [c**2, 0.5 * d, 2 * a * c, 0.5 * b]]
-
-
-def ridge(noise):
-    """Four parameters and two observations, which leave a curved ridge."""
-    inputs = Inputs({name: Uniform(lower=0.5, upper=2.0) for name in NAMES})
-    y = curved(TRUTH)
-    model = FunctionModel(curved, NAMES, ("u", "v"), slopes)
-    return Posterior(inputs, SerialEvaluate(model), y, noise * y)
 
 
 def brute_force(posterior, draws=2**19):
     """Ln of the mean likelihood over points of the prior."""
     points = posterior.inputs.points(sobol_points(5, 0, 0, draws, 4))
-    misfit = (((curved(points) - posterior.data) / posterior.sigma) ** 2).sum(axis=1) / 2
+    misfit = (((two_of_four(points) - posterior.data) / posterior.sigma) ** 2).sum(axis=1) / 2
     return logsumexp(-misfit) - np.log(draws) - np.log(2 * np.pi * posterior.sigma.prod())
 
 
@@ -133,7 +113,7 @@ def test_tail_shapes_are_those_of_arviz():
 
 
 def test_where_there_is_no_answer():
-    model = FunctionModel(curved, NAMES, ("u", "v"), slopes)
+    model = FunctionModel(two_of_four, FOUR, ("u", "v"), slopes_of_four)
     good = ridge(0.1)
     gaussian = laplace(good)
 
@@ -141,7 +121,7 @@ def test_where_there_is_no_answer():
         raise SolveError("never")
 
     posterior = Posterior(
-        good.inputs, SerialEvaluate(FunctionModel(refuse, NAMES, ("u", "v"), slopes)), good.data, good.sigma
+        good.inputs, SerialEvaluate(FunctionModel(refuse, FOUR, ("u", "v"), slopes_of_four)), good.data, good.sigma
     )
     with pytest.raises(SolveError, match="no answer at any of the points"):
         evidence(posterior, gaussian, 64)
@@ -156,14 +136,14 @@ def test_models_that_end_somewhere_are_weighted_by_nothing_there():
     def ends(point):
         if point[0] < 1.25:
             raise SolveError("ends")
-        return curved(point)
+        return two_of_four(point)
 
     whole = ridge(0.1)
     posterior = Posterior(
-        whole.inputs, SerialEvaluate(FunctionModel(ends, NAMES, ("u", "v"), slopes)), whole.data, whole.sigma
+        whole.inputs, SerialEvaluate(FunctionModel(ends, FOUR, ("u", "v"), slopes_of_four)), whole.data, whole.sigma
     )
     points = whole.inputs.points(sobol_points(5, 0, 0, 2**18, 4))
-    misfit = (((curved(points) - whole.data) / whole.sigma) ** 2).sum(axis=1) / 2
+    misfit = (((two_of_four(points) - whole.data) / whole.sigma) ** 2).sum(axis=1) / 2
     misfit[points[:, 0] < 1.25] = np.inf
     truth = logsumexp(-misfit) - np.log(2**18) - np.log(2 * np.pi * whole.sigma.prod())
     found = evidence(posterior, laplace(posterior), 256)

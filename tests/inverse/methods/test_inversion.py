@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import sys
 import tomllib
 from pathlib import Path
 
@@ -30,8 +29,8 @@ from inverse.methods.inversion import (
     sentence,
     variables,
 )
-from tests.inverse.fields.test_low_rank import curved
-from tests.launch import run, run_script
+from tests.launch import TISSUQ, run, run_script
+from tests.problems import curved
 from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
@@ -42,7 +41,6 @@ from workflows.run.run import run as run_study
 from workflows.starter import starter
 from workflows.studies.inversion import _volumes, groups
 
-TISSUQ = Path(sys.executable).parent / "tissuq"
 ROOT = Path(__file__).parent.parent.parent.parent
 
 # --- records ---------------------------------------------------------------------------------------------------------

@@ -2,9 +2,7 @@
 
 import json
 import re
-import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.selection import Noise, Select, posterior
-from tests.launch import run, run_script
+from tests.launch import TISSUQ, run, run_script
 from tests.rubber import CONFIGS, FACTOR, treloar
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal, Uniform
@@ -28,7 +26,6 @@ from workflows.report.verdict import doubts_of_selection, findings, grade
 from workflows.run.plan import plan
 from workflows.starter import starter
 
-TISSUQ = Path(sys.executable).parent / "tissuq"
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")
 TESTS = [MaterialTest(mode=mode, at=STRETCHES) for mode in MODES]

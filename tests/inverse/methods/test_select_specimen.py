@@ -16,8 +16,7 @@ from scipy.special import logsumexp
 
 from forward.fem.finer import FinerMesh, finer
 from inverse.criticism.finer import Finer
-from tests.inverse.methods.test_select import TISSUQ
-from tests.launch import run
+from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import LogNormal

@@ -10,8 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from forward.model import FunctionModel, SolveError
-from tests.launch import ROOT, run, run_script
-from tests.workflows.run.test_command import TISSUQ, assert_same_bits
+from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from uq.estimators.moments import combine, estimate, monomials, term
 from uq.evaluation.evaluate import Evaluations, Recorder, Request, SerialEvaluate
 from uq.inputs.distributions import Uniform

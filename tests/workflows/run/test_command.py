@@ -6,29 +6,19 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from tests.launch import ROOT, environment, on_ranks, run, run_script
+from tests.launch import ROOT, TISSUQ, assert_same_bits, environment, on_ranks, run, run_script
 
 TINY = ROOT / "configs" / "tiny.toml"
-TISSUQ = Path(sys.executable).parent / "tissuq"
 
 
 def tissuq(*arguments, ranks=None):
     return run(ranks, TISSUQ, *arguments)
-
-
-def assert_same_bits(a, b):
-    left, right = (xr.load_dataset(d / "results.nc") for d in (a, b))
-    for name in left.variables:
-        assert left[name].values.tobytes() == right[name].values.tobytes(), name
-    assert (a / "results.nc").read_bytes() == (b / "results.nc").read_bytes()
 
 
 @pytest.fixture(scope="module")

@@ -5,16 +5,13 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
 
-from tests.launch import ROOT, environment, on_ranks, run_script
+from tests.launch import ROOT, TISSUQ, environment, on_ranks, run_script
 
-TISSUQ = Path(sys.executable).parent / "tissuq"
 MODEL = """
 import os
 import sys
