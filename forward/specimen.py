@@ -325,11 +325,11 @@ class SpecimenModel:
     @cached_property
     def vertices(self) -> Layout:
         """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
-        from forward.fem import fenicsx
+        from forward.fem.dolfinx import spaces
         from forward.fem.layout import Layout
 
         body = self.models[0].body
-        return Layout(fenicsx.scalar_space(body.space.mesh, 1), body.comm)
+        return Layout(spaces.scalar_space(body.space.mesh, 1), body.comm)
 
     def log_fields(self, points: FloatArray) -> FloatArray:
         """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
@@ -449,10 +449,10 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
     """Where (n, 3) displacements are observed; collective."""
     if item.on is None:
         return np.array(item.at)
-    from forward.fem import fenicsx
+    from forward.fem.dolfinx import spaces
 
     body, layout = model.body, model.layout
-    mine = layout.nodes()[fenicsx.boundary_nodes(body.space, body.facets[item.on])]
+    mine = layout.nodes()[spaces.boundary_nodes(body.space, body.facets[item.on])]
     return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
 
 
@@ -468,13 +468,13 @@ def _interpolation(
     """
     from scipy.sparse import csr_matrix
 
-    from forward.fem import fenicsx
+    from forward.fem.dolfinx import spaces
 
     body, layout, spec = model.body, model.layout, model.body.spec.body
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     which = which.ravel()
     numbers = layout.nodes()
-    found, distances = fenicsx.point_weights(body.space, different) if len(places) else ([], np.zeros(0))
+    found, distances = spaces.point_weights(body.space, different) if len(places) else ([], np.zeros(0))
     far = np.flatnonzero(distances > max(tolerance(spec), spec.longest_edge))
     if len(far):
         where = ", ".join(f"{x:g}" for x in different[far[0]])

@@ -1,4 +1,4 @@
-"""Bodies with named boundaries, as specifications; the mesh itself is made in `fenicsx`."""
+"""Bodies with named boundaries, as specifications; the mesh itself is made in `forward.fem.dolfinx`."""
 
 from __future__ import annotations
 

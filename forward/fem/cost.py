@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
+from forward.machine import MIB
+
 ENTRIES = 1.4  # of MUMPS over those of the model
 OPERATIONS = 1.6
 # Displacements that one is coupled with on average, inside a large body.
@@ -22,6 +24,7 @@ SMALLEST = 3.0  # nodes across a part of the lattice that is not cut any more
 BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, with the room that pivoting may want
 BYTES_PER_NONZERO = 16.0  # of the matrix
 BYTES_PER_UNKNOWN = 3e3  # mesh, spaces, vectors
+SPARE = 64 * MIB  # for what libraries allocate without looking
 BYTES_OF_PROGRAM = 2.5e8  # Python with all libraries
 ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never touched
 # Processor times (s).

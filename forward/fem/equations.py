@@ -22,8 +22,9 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import stiffness_factor
 from forward.bodies.mesh_file import OwnMesh
-from forward.fem import fenicsx
+from forward.fem import ranks
 from forward.fem.cost import factor
+from forward.fem.dolfinx import assembly, compile, linear, meshes, spaces, unknowns, version
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
 from forward.hyperelastic import CONTRAST, Hyperelastic
@@ -43,7 +44,7 @@ _OPS = SimpleNamespace(
     tanh=ufl.tanh,
     sin=ufl.sin,
     cos=ufl.cos,
-    atan2=fenicsx.atan2,
+    atan2=version.atan2,
     sinh=ufl.sinh,
     tr=ufl.tr,
     det=ufl.det,
@@ -70,35 +71,35 @@ class Discretisation:
         self.comm = comm
         self.parameters = parameters
         self.work = Work()
-        self.mesh, self.facets = fenicsx.mesh_body(comm, spec.body)
-        self.unknowns = fenicsx.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
+        self.mesh, self.facets = meshes.mesh_body(comm, spec.body)
+        self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
         self.size = self.unknowns.size
         self.space = self.unknowns.displacement
         self.layout = Layout(self.space, comm, self.unknowns.pressure)
-        self.nodes_owned = fenicsx.owned_nodes(self.space)
+        self.nodes_owned = spaces.owned_nodes(self.space)
         self.dx = ufl.dx(domain=self.mesh, metadata={"quadrature_degree": spec.body.quadrature})
-        self._ds, self._tags = fenicsx.facet_measure(self.mesh, self.facets, spec.body.quadrature)
+        self._ds, self._tags = meshes.facet_measure(self.mesh, self.facets, spec.body.quadrature)
 
         self._values = {path: scalar.value for path, scalar in spec.scalars.items()}
         self._constants = {
-            path: fenicsx.constant(self.mesh, value)
+            path: spaces.constant(self.mesh, value)
             for path, value in self._values.items()
             if not path.startswith("displacements.")
         }
         self._variables = {path: ufl.variable(constant) for path, constant in self._constants.items()}
         self.scalars = np.array([i for i, path in enumerate(parameters) if path in self._values], dtype=np.int64)
         self.fields = tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
-        self._directions = {path: fenicsx.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
-        self._load = fenicsx.constant(self.mesh, 1.0)
+        self._directions = {path: spaces.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
+        self._load = spaces.constant(self.mesh, 1.0)
 
-        self._state = fenicsx.function(self.unknowns.whole)
-        self._along = fenicsx.function(self.unknowns.whole)
+        self._state = spaces.function(self.unknowns.whole)
+        self._along = spaces.function(self.unknowns.whole)
         self._variation = ufl.TestFunction(self.unknowns.whole)
         self.u, self.p = self.unknowns.split(self._state)
         self.test, self._test_pressure = self.unknowns.split(self._variation)
         self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
         self.J = ufl.det(self.F)
-        self._fibres = [fenicsx.constant(self.mesh, unit) for unit in spec.fibres]
+        self._fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
         self._of_stretches = "l1" in measures(spec.energy)
         self._gradient = ufl.variable(ufl.grad(self.u)) if self._of_stretches else ufl.grad(self.u)
         self._deformation = kinematics.deformation(_OPS, self._gradient, ufl.Identity(3))
@@ -111,11 +112,11 @@ class Discretisation:
         self._residual = self.vector(imbalance)
         self._prescribe()
         trial = ufl.TrialFunction(self.unknowns.whole)
-        self._stiffness = fenicsx.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
+        self._stiffness = compile.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
         self._solver = self.new_solver()
         self._factorised_at = np.zeros(self.size)
-        points = fenicsx.quadrature_points(self.space, spec.body.quadrature)
-        self._jacobians = fenicsx.PointValues(self.J, points, self.space, comm)
+        points = spaces.quadrature_points(self.space, spec.body.quadrature)
+        self._jacobians = assembly.PointValues(self.J, points, self.space, comm)
         self._external = 0.0
         self._rounding: float | None = None
         self._given: FloatArray | None = None  # parameters that are set
@@ -150,7 +151,7 @@ class Discretisation:
         """Indicators of the regions that have numbers of their own."""
         if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
             return {}
-        found = fenicsx.region_indicators(self.comm, self.spec.body, self.mesh)
+        found = spaces.region_indicators(self.comm, self.spec.body, self.mesh)
         return {name: found[name] for name in self.spec.regions}
 
     @property
@@ -227,9 +228,9 @@ class Discretisation:
         """Measure of a named boundary."""
         return self._ds(self._tags[boundary])
 
-    def vector(self, form: Any) -> fenicsx.VectorAssembler:
+    def vector(self, form: Any) -> assembly.VectorAssembler:
         """Compile a linear form."""
-        return fenicsx.VectorAssembler(form, self.unknowns, self.comm)
+        return assembly.VectorAssembler(form, self.unknowns, self.comm)
 
     def _virtual_works(self) -> list[tuple[Any, Any]]:
         """Virtual works (integrand, measure) of the loads, with the sign of forces that are out of balance."""
@@ -238,10 +239,10 @@ class Discretisation:
             size = self._load * self._variables[f"loads.{load.label}.{LOAD_SIZES[load.kind]}"]
             match load:
                 case Gravity():
-                    pull = fenicsx.constant(self.mesh, load.acceleration * np.array(load.unit))
+                    pull = spaces.constant(self.mesh, load.acceleration * np.array(load.unit))
                     works.append((-size * self._factor_of("density") * ufl.dot(pull, self.test), self.dx))
                 case Traction():
-                    direction = fenicsx.constant(self.mesh, load.unit)
+                    direction = spaces.constant(self.mesh, load.unit)
                     works.append((-size * ufl.dot(direction, self.test), self.surface(load.on)))
                 case Pressure():
                     # Nanson's formula: the deformed area element is J F⁻ᵀ N dS.
@@ -273,12 +274,12 @@ class Discretisation:
         return sum(terms[1:], terms[0]) if terms else None
 
     @cached_property
-    def _parameter_force(self) -> fenicsx.VectorAssembler | None:
+    def _parameter_force(self) -> assembly.VectorAssembler | None:
         form = self._imbalance_form(self.along_parameters)
         return None if form is None else self.vector(form)
 
     @cached_property
-    def _field_forces(self) -> tuple[tuple[VertexField, fenicsx.VectorAssembler], ...]:
+    def _field_forces(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
         """The fields that forces depend on, each with ∂(wᵀF)/∂m by its values m at the vertices, w being `_along`."""
         found = []
         for field in self.fields:
@@ -289,23 +290,23 @@ class Discretisation:
             form = self._imbalance_form(by_vertices)
             if form is not None:
                 form = ufl.replace(form, {self._variation: self._along})
-                found.append((field, fenicsx.VectorAssembler(form, None, self.comm)))
+                found.append((field, assembly.VectorAssembler(form, None, self.comm)))
         return tuple(found)
 
     @cached_property
-    def _stiffness_action(self) -> fenicsx.VectorAssembler:
+    def _stiffness_action(self) -> assembly.VectorAssembler:
         return self.vector(ufl.derivative(self._imbalance_form(), self._state, self._along))
 
     @cached_property
-    def _transposed_action(self) -> fenicsx.VectorAssembler:
+    def _transposed_action(self) -> assembly.VectorAssembler:
         if self.symmetric:
             return self._stiffness_action
         return self.vector(self.derivative(ufl.action(self._imbalance_form(), self._along)))
 
     @cached_property
-    def gradients(self) -> fenicsx.NodalGradients:
+    def gradients(self) -> assembly.NodalGradients:
         """Deformation gradients at the nodes, at the state that is set."""
-        return fenicsx.NodalGradients(self.F, self.space, self.comm)
+        return assembly.NodalGradients(self.F, self.space, self.comm)
 
     @cached_property
     def _unit_loads(self) -> dict[str, FloatArray]:
@@ -330,13 +331,13 @@ class Discretisation:
         self._load.value, self.work = kept, work
         return forces
 
-    def new_solver(self) -> fenicsx.DirectSolver:
+    def new_solver(self) -> linear.DirectSolver:
         """Return a matrix and a solver of their own for the stiffness."""
         return self._new_solver(self._stiffness, symmetric=self.symmetric)
 
-    def _new_solver(self, form: Any, *, symmetric: bool) -> fenicsx.DirectSolver:
+    def _new_solver(self, form: Any, *, symmetric: bool) -> linear.DirectSolver:
         expected = factor(self.spec.body, mixed=self.spec.mixed)
-        return fenicsx.DirectSolver(
+        return linear.DirectSolver(
             form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
         )
 
@@ -347,13 +348,13 @@ class Discretisation:
         moved: dict[tuple[int, int], str] = {}
         self._constraints = []
         for displacement in self.spec.displacements:
-            nodes = fenicsx.boundary_nodes(self.space, self.facets[displacement.on])
+            nodes = spaces.boundary_nodes(self.space, self.facets[displacement.on])
             for axis in displacement.components:
                 a = AXES.index(axis)
                 self._constraints.append(self.unknowns.constraint(a, nodes))
                 moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
         for boundary in self.spec.clamp:
-            nodes = fenicsx.boundary_nodes(self.space, self.facets[boundary])
+            nodes = spaces.boundary_nodes(self.space, self.facets[boundary])
             for a in range(3):
                 self._constraints.append(self.unknowns.constraint(a, nodes))
                 moved |= {(int(n), a): "" for n in nodes}
@@ -395,7 +396,7 @@ class Discretisation:
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
-        places = STRETCH * fenicsx.node_coordinates(self.space)
+        places = STRETCH * spaces.node_coordinates(self.space)
         if self.p is not None:
             places[:, 1:] = 0
         return self.with_pressures(places.ravel())
@@ -450,7 +451,7 @@ class Discretisation:
 
     def dot(self, x: FloatArray, y: FloatArray) -> float:
         """Inner product over all ranks."""
-        return float(fenicsx.total(self.comm, np.array([x @ y]))[0])
+        return float(ranks.total(self.comm, np.array([x @ y]))[0])
 
     # --- the nonlinear system ----------------------------------------------------------------------------------------
 
@@ -503,7 +504,7 @@ class Discretisation:
         if self._deadline is None:
             return
         end, seconds = self._deadline
-        if fenicsx.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
+        if ranks.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
             message = f"the solve took longer than solve_seconds = {seconds:g}"
             raise SolveError(message, work=self.work)
 
@@ -517,7 +518,7 @@ class Discretisation:
     @cached_property
     def _extent(self) -> float:
         """Norm of the distances (m) of the nodes from their mean: what displacements are compared with."""
-        places = fenicsx.node_coordinates(self.space)
+        places = spaces.node_coordinates(self.space)
         count, *sums = self.total(np.array([len(places), *places.sum(axis=0)])).tolist()
         return self.norm(self.with_pressures((places - np.array(sums) / count).ravel()))
 
@@ -565,7 +566,7 @@ class Discretisation:
         """Solve K x = right; rows of prescribed unknowns give their values."""
         if self._moves or self._movers:
             known = right[self.fixed]
-            if fenicsx.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
+            if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
                 w = np.zeros_like(right)
                 w[self.fixed] = known
                 self.set_state(self._factorised_at)
@@ -602,7 +603,7 @@ class Discretisation:
 
     def total(self, values: FloatArray) -> FloatArray:
         """Sum over all ranks."""
-        return fenicsx.total(self.comm, values)
+        return ranks.total(self.comm, values)
 
     def norms(self, rows: FloatArray) -> FloatArray:
         """Euclidean norms over the displacements of rows (k, U_local), of all ranks."""
@@ -616,7 +617,7 @@ class Discretisation:
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J over the quadrature points of all ranks."""
         self.set_state(u)
-        return fenicsx.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
+        return ranks.smallest(self.comm, float(self._jacobians().min(initial=np.inf)))
 
     def assembled_stiffness(self) -> Any:
         """The stiffness at the state that is set, for `products`; the factor of `factorise` is lost."""
@@ -633,14 +634,14 @@ class Discretisation:
             return self._stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
         form = ufl.derivative(self._imbalance_form(), self._state, trial)
-        return fenicsx.compile_form(0.5 * form + 0.5 * ufl.adjoint(form), self.comm)
+        return compile.compile_form(0.5 * form + 0.5 * ufl.adjoint(form), self.comm)
 
-    def new_symmetric_solver(self) -> fenicsx.DirectSolver:
+    def new_symmetric_solver(self) -> linear.DirectSolver:
         """Return a matrix and a solver of their own for the symmetric part of the stiffness."""
         return self._new_solver(self._symmetric_stiffness, symmetric=True)
 
     @cached_property
-    def _symmetric_part(self) -> fenicsx.DirectSolver:
+    def _symmetric_part(self) -> linear.DirectSolver:
         return self.new_symmetric_solver()
 
     def negative_eigenvalues(self, u: FloatArray) -> int:
@@ -673,7 +674,7 @@ class Discretisation:
         largest = np.abs(rows[:, : 3 * self.nodes_owned]).max(axis=1, initial=0.0)
         products = np.empty_like(rows)
         for row, product, size in zip(rows, products, largest, strict=True):
-            step = self._nudge / max(-fenicsx.smallest(self.comm, -float(size)), float(np.finfo(float).tiny))
+            step = self._nudge / max(-ranks.smallest(self.comm, -float(size)), float(np.finfo(float).tiny))
             product[:] = (self._imbalance(u + step * row) - imbalance) / step
         products[:, self.fixed] = 0
         return products

@@ -14,7 +14,8 @@ import ufl
 
 from forward.bodies.geometry import AXES, tolerance
 from forward.bodies.mesh_file import OwnMesh
-from forward.fem import fenicsx
+from forward.fem import ranks
+from forward.fem.dolfinx import assembly, spaces
 from forward.materials import kinematics
 from forward.model import FloatArray, ModelError
 from forward.observables.outputs import (
@@ -85,7 +86,7 @@ class _Linear:
 
 
 def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
-    (found,), (distance,) = fenicsx.point_weights(body.space, np.array([output.at]))
+    (found,), (distance,) = spaces.point_weights(body.space, np.array([output.at]))
     spec = body.spec.body
     # Points beside bodies with six sides were refused before; the mesh may cut their curved faces.
     most = tolerance(spec) if isinstance(spec, OwnMesh) else max(tolerance(spec), spec.longest_edge)
@@ -96,16 +97,16 @@ def _at_point(body: Discretisation, output: PointDisplacement) -> _Linear:
             f"expected at most {most:.3g} m"
         )
         raise ModelError(message)
-    probe = fenicsx.function(body.space)
+    probe = spaces.function(body.space)
     if found is not None:
         nodes, weights = found
         probe.x.array[3 * nodes + AXES.index(output.component)] = weights
     # Weights of ghost nodes travel to the ranks that own them.
-    return _Linear(body, body.with_pressures(fenicsx.sum_ghosts(probe)))
+    return _Linear(body, body.with_pressures(spaces.sum_ghosts(probe)))
 
 
 def _mean_over_boundary(body: Discretisation, output: MeanDisplacement) -> _Linear:
-    axis = fenicsx.constant(body.mesh, np.eye(3)[AXES.index(output.component)])
+    axis = spaces.constant(body.mesh, np.eye(3)[AXES.index(output.component)])
     surface = body.surface(output.on)
     weights = body.vector(ufl.inner(axis, body.test) * surface)()
     area = body.dot(weights, np.ones_like(weights))
@@ -114,7 +115,7 @@ def _mean_over_boundary(body: Discretisation, output: MeanDisplacement) -> _Line
 
 def _volume(body: Discretisation) -> float:
     """Volume of the undeformed mesh, which is not that of the body where linear tetrahedra cut its faces."""
-    return fenicsx.ScalarAssembler(fenicsx.constant(body.mesh, 1.0) * body.dx, body.comm)()
+    return assembly.ScalarAssembler(spaces.constant(body.mesh, 1.0) * body.dx, body.comm)()
 
 
 class _Extreme:
@@ -129,13 +130,13 @@ class _Extreme:
         return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
 
     def value(self) -> float:
-        return -fenicsx.smallest(self._body.comm, -self._candidates().max(initial=0.0))
+        return -ranks.smallest(self._body.comm, -self._candidates().max(initial=0.0))
 
     def gradient(self) -> FloatArray:
         candidates, top = self._candidates(), self.value()
         ties = np.flatnonzero(candidates >= top * (1 - 1e-10))
         position = self._body.layout.positions[ties]
-        first = fenicsx.smallest(self._body.comm, float(position.min(initial=np.iinfo(np.int64).max)))
+        first = ranks.smallest(self._body.comm, float(position.min(initial=np.iinfo(np.int64).max)))
         g = np.zeros((len(candidates), 3))
         if top > 0:
             for node in ties[position == first]:
@@ -157,26 +158,29 @@ class _Integral:
         self._body = body
         self._density = density
         self.size = size
-        self._value = fenicsx.ScalarAssembler(density * body.dx, body.comm)
+        self._value = assembly.ScalarAssembler(density * body.dx, body.comm)
 
     def value(self) -> float:
         return self._value() / self.size
 
     # What is compiled lives as long as the output that it belongs to.
     @cached_property
-    def _gradient(self) -> fenicsx.VectorAssembler:
+    def _gradient(self) -> assembly.VectorAssembler:
         return self._body.vector(self._body.derivative(self._density * self._body.dx))
 
     @cached_property
-    def _partial(self) -> fenicsx.ScalarAssembler:
-        return fenicsx.ScalarAssembler(self._body.along_parameters(self._density) * self._body.dx, self._body.comm)
+    def _partial(self) -> assembly.ScalarAssembler:
+        return assembly.ScalarAssembler(self._body.along_parameters(self._density) * self._body.dx, self._body.comm)
 
     @cached_property
-    def _by_fields(self) -> tuple[tuple[VertexField, fenicsx.VectorAssembler], ...]:
+    def _by_fields(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
         """The random fields that the density depends on, with its derivative by their values at the vertices."""
         body = self._body
         return tuple(
-            (field, fenicsx.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm))
+            (
+                field,
+                assembly.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm),
+            )
             for field in body.fields
             if field.inside(self._density)
         )
@@ -201,7 +205,7 @@ class _Reaction:
 
     def __init__(self, body: Discretisation, output: Reaction) -> None:
         self._body = body
-        nodes = fenicsx.boundary_nodes(body.space, body.facets[output.on])
+        nodes = spaces.boundary_nodes(body.space, body.facets[output.on])
         owned = nodes[nodes < body.nodes_owned]
         self._w = np.zeros(body.size)
         self._w[3 * owned + AXES.index(output.component)] = 1
@@ -232,13 +236,13 @@ class _MaxVonMises:
         cauchy = body.stress_of(body.energy) * body.F.T / body.J
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature
-        points = fenicsx.quadrature_points(body.space, degree)
-        self._values = fenicsx.PointValues(stress, points, body.space, body.comm)
-        self._selector = fenicsx.function(fenicsx.quadrature_space(body.mesh, degree))
+        points = spaces.quadrature_points(body.space, degree)
+        self._values = assembly.PointValues(stress, points, body.space, body.comm)
+        self._selector = spaces.function(spaces.quadrature_space(body.mesh, degree))
         self._stress = stress
 
     def value(self) -> float:
-        return -fenicsx.smallest(self._body.comm, -self._values().max(initial=0.0))
+        return -ranks.smallest(self._body.comm, -self._values().max(initial=0.0))
 
     def _at_place(self) -> _Integral:
         """Return the stress at the point where it is largest now."""
@@ -258,8 +262,8 @@ class _MaxVonMises:
         return _Integral(self._body, self._selector * self._stress, 1.0)
 
     @cached_property
-    def _weight(self) -> fenicsx.ScalarAssembler:
-        return fenicsx.ScalarAssembler(self._selector * self._body.dx, self._body.comm)
+    def _weight(self) -> assembly.ScalarAssembler:
+        return assembly.ScalarAssembler(self._selector * self._body.dx, self._body.comm)
 
     def gradient(self) -> FloatArray:
         return self._at_place().gradient()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import Body
-from forward.fem import fenicsx
+from forward.fem.dolfinx import assembly, spaces
 from forward.model import FloatArray
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Layout:
 
     def nodes(self) -> NDArray[np.int64]:
         """Return the canonical positions of this rank's nodes, ghosts included."""
-        return np.asarray(self._canonical[fenicsx.global_node_numbers(self._space)])
+        return np.asarray(self._canonical[spaces.global_node_numbers(self._space)])
 
     def cells(self) -> tuple[NDArray[np.int64], int]:
         """Return all cells (n_cells, k) as canonical nodes in VTK's order, and VTK's number of the type; collective."""
@@ -86,13 +86,13 @@ class Layout:
 
     def _cells(self) -> tuple[NDArray[np.int64], int]:
         """This rank's cells."""
-        local, kind = fenicsx.vtk_cells(self._space)
+        local, kind = spaces.vtk_cells(self._space)
         return self.nodes()[local], kind
 
 
 def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
     """Return the sorted places (N, 3) of all nodes of a space, and canonical numbers: by global number, and of ours."""
-    parts = comm.allgather(fenicsx.node_coordinates(space))
+    parts = comm.allgather(spaces.node_coordinates(space))
     everywhere = np.concatenate(parts)
     # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
     # simple fractions of the largest extent, off the ends of the intervals.
@@ -112,7 +112,7 @@ def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
     would depend on how the hexahedra are cut.
     Each process that calls makes a mesh of its own: the numbers do not depend on how others share theirs.
     """
-    space, matrices = fenicsx.trilinear_elements(body)
+    space, matrices = assembly.trilinear_elements(body)
     _, canonical, _ = sorted_by_place(space, space.mesh.comm)
     order = np.argsort(canonical)
     mass, laplacian, surface = (matrix[order][:, order] for matrix in matrices)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.mesh_file import OwnMesh
-from forward.fem import fenicsx
+from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
 from forward.hyperelastic import Hyperelastic
@@ -142,7 +142,7 @@ class HyperelasticModel:
         """
         self._visited = None
         self.body.forget_parameters()
-        space = fenicsx.scalar_space(self.body.mesh, degree or self.spec.body.degree)
+        space = spaces.scalar_space(self.body.mesh, degree or self.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in self.body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}
 
@@ -153,7 +153,7 @@ class HyperelasticModel:
         """
         if not isinstance(self.spec.body, OwnMesh):
             return None
-        return self.layout.by_cell(fenicsx.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
+        return self.layout.by_cell(meshes.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
 
     @property
     def variance_kept(self) -> dict[str, float]:

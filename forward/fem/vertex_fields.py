@@ -9,7 +9,8 @@ import ufl
 
 from forward.bodies.geometry import Body
 from forward.bodies.random_fields import Expansion, Modes, RandomField
-from forward.fem import fenicsx
+from forward.fem import ranks
+from forward.fem.dolfinx import spaces
 from forward.fem.layout import sorted_by_place
 from forward.model import FloatArray
 
@@ -45,7 +46,7 @@ class VertexField:
     def __init__(self, field: RandomField, body: Body, msh: Any, comm: Any, parameters: tuple[str, ...]) -> None:
         self.field = field
         self._comm = comm
-        self._space = fenicsx.scalar_space(msh, 1)
+        self._space = spaces.scalar_space(msh, 1)
         _, _, self._vertices = sorted_by_place(self._space, comm)
         numbers = {path: i for i, path in enumerate(field.paths(body))}
         self._count = len(numbers)
@@ -67,9 +68,9 @@ class VertexField:
         self._modes = None if modes is None else np.ascontiguousarray(modes[self._vertices])
         if self._modes is not None:
             self._expansion = None  # every rank keeps its part only
-        self._function = fenicsx.function(self._space)
+        self._function = spaces.function(self._space)
         self.log = ufl.variable(self._function)
-        self.direction = fenicsx.function(self._space)
+        self.direction = spaces.function(self._space)
         self.test = ufl.TestFunction(self._space)
         self.set(np.zeros(len(parameters)))
 
@@ -93,7 +94,7 @@ class VertexField:
     def pull(self, slopes: FloatArray) -> FloatArray:
         """Return derivatives (k,) by this field's parameters from this rank's part of those by the vertices."""
         if self._modes is not None:
-            return fenicsx.total(self._comm, slopes @ self._modes)[self._numbers]
+            return ranks.total(self._comm, slopes @ self._modes)[self._numbers]
         parts = self._comm.gather((self._vertices, slopes))
         pulled = None
         if parts is not None and self._expansion is not None:
@@ -112,7 +113,7 @@ class VertexField:
         rows = []
         for point in points:
             self.set(point)
-            rows.append(np.exp(fenicsx.interpolate(self._function, space)))
+            rows.append(np.exp(spaces.interpolate(self._function, space)))
         parts = self._comm.gather((positions, np.array(rows)))
         if parts is None:
             return None

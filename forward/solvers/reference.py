@@ -19,8 +19,8 @@ from forward.solvers.anderson import Inverse
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
 
 if TYPE_CHECKING:
+    from forward.fem.dolfinx.linear import DirectSolver
     from forward.fem.equations import Discretisation
-    from forward.fem.fenicsx import DirectSolver
 
 
 def rotations(F: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from forward.bodies.inclusions import Ellipsoid, Sphere, derived
 from forward.conformance import EXACT, check_derivatives
-from forward.fem import fenicsx
+from forward.fem.dolfinx import assembly
 from tests.bodies import MATERIALS, loaded_body
 
 pytestmark = pytest.mark.fem
@@ -65,7 +65,7 @@ def test_an_inclusion_that_covers_the_body_multiplies_its_energy(model, homogene
 
 def test_factors_of_inclusions_that_overlap_multiply(model):
     body = model.body
-    density = fenicsx.ScalarAssembler(body.stiffness_factor * body.dx, body.comm)
+    density = assembly.ScalarAssembler(body.stiffness_factor * body.dx, body.comm)
     body.set_parameters(changed({"tumour.radius": 30.0, "gap.radius": 30.0}))
     assert density() == pytest.approx(8.0 * 0.2 * np.prod(model.spec.body.size), rel=1e-12)
 
@@ -84,7 +84,7 @@ def test_the_factor_follows_its_formula():
         # The 2 × 2 × 2 cells are halves of the box: cells and reference points of the places.
         low = np.minimum(np.floor(np.array(place) / size * 2), 1)
         reference = np.array(place) / size * 2 - low
-        values = fenicsx.PointValues(body.stiffness_factor, reference[None], body.space, body.comm)
+        values = assembly.PointValues(body.stiffness_factor, reference[None], body.space, body.comm)
         centres = body.mesh.geometry.x[body.mesh.geometry.dofmap.array.reshape(-1, 8)].mean(axis=1)
         cell = np.argmin(np.abs(centres - (low + 0.5) * size / 2).sum(axis=1))
         found.append(float(values()[cell, 0]))

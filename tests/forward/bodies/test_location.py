@@ -72,7 +72,7 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
-from forward.fem import fenicsx
+from forward.fem.dolfinx import meshes, spaces
 from forward.bodies.geometry import Box
 from forward.bodies.mesh_file import OwnMesh
 
@@ -80,16 +80,16 @@ for file in sys.argv[1:]:
     degree = 2
     body = OwnMesh(file=file, unit=1e-3, degree=degree) if file != "box" else Box(
         size=(0.05, 0.04, 0.03), cells=(3, 3, 2), cell="tetrahedron", degree=degree)
-    msh, _ = fenicsx.mesh_body(MPI.COMM_WORLD, body)
-    space = fenicsx.vector_space(msh, degree)
-    nodes = np.concatenate(MPI.COMM_WORLD.allgather(fenicsx.node_coordinates(space)))
+    msh, _ = meshes.mesh_body(MPI.COMM_WORLD, body)
+    space = spaces.vector_space(msh, degree)
+    nodes = np.concatenate(MPI.COMM_WORLD.allgather(spaces.node_coordinates(space)))
     points = 1e-3 * np.array([[float(f"{x:.5f}") for x in row] for row in 1e3 * nodes])  # as a scan writes them, in mm
-    found, distances = fenicsx.point_weights(space, points)
+    found, distances = spaces.point_weights(space, points)
     count = MPI.COMM_WORLD.allreduce(np.array([one is not None for one in found], dtype=int))
     assert (count == 1).all(), count
     assert (distances <= 1e-8).all(), distances.max()
     # The weights reproduce a quadratic function, of the place.
-    f = fenicsx.function(space)
+    f = spaces.function(space)
     x = space.tabulate_dof_coordinates()
     f.x.array[0::3] = x[:, 0] * x[:, 1] + x[:, 2] ** 2
     for point, one in zip(points, found):

@@ -90,12 +90,12 @@ def test_nearest_places_are_those_of_the_box(tmp_path, kind):
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("kind", ["hexahedron", "tetra"])
 def test_nodes_are_those_of_the_space(tmp_path, kind, degree):
-    from forward.fem import fenicsx
+    from forward.fem.dolfinx import meshes, spaces
 
     meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
     own = OwnMesh(file=str(tmp_path / "box.vtu"), degree=degree)
-    msh, facets = fenicsx.mesh_body(MPI.COMM_SELF, own)
-    assert len(fenicsx.node_coordinates(fenicsx.scalar_space(msh, degree))) == own.nodes
+    msh, facets = meshes.mesh_body(MPI.COMM_SELF, own)
+    assert len(spaces.node_coordinates(spaces.scalar_space(msh, degree))) == own.nodes
     per_face = 1 if kind == "hexahedron" else 2
     assert {name: len(found) for name, found in facets.items()} == {
         f"{10 + k}": per_face * (1 if k < 2 else 2) for k in range(6)

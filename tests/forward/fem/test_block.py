@@ -6,7 +6,7 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 from forward.bodies.geometry import Block, Box
-from forward.fem import fenicsx
+from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
 from forward.hyperelastic import Hyperelastic
@@ -105,7 +105,7 @@ def test_a_pressure_pushes_on_its_face_only(corners, cell, degree):
         body.set_state(np.zeros(spec.unknowns))
         forces = body.imbalance().reshape(-1, 3)
         np.testing.assert_allclose(forces.sum(axis=0), area(corners, face), atol=1e-13)
-        nodes = fenicsx.boundary_nodes(body.space, body.facets[face])
+        nodes = spaces.boundary_nodes(body.space, body.facets[face])
         assert len(nodes) == np.prod([n + 1 for axis, n in zip("xyz", (2, 3, 2), strict=True) if axis != face[0]])
         assert np.abs(np.delete(forces, nodes, axis=0)).max() < 1e-10
 

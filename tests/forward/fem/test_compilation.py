@@ -16,7 +16,7 @@ SCRIPT = """
 import pathlib, sys, tempfile
 from mpi4py import MPI
 import ufl
-from forward.fem import fenicsx
+from forward.fem.dolfinx import assembly, meshes, spaces
 from forward.bodies.geometry import Box
 
 make, made = tempfile.mkdtemp, []
@@ -25,10 +25,10 @@ def counted(*arguments, **options):
     return made[-1]
 tempfile.mkdtemp = counted
 comm = MPI.COMM_WORLD
-msh, _ = fenicsx.mesh_body(comm, Box(size=(1.0, 2.0, 3.0), cells=(2, 2, 2), degree=1))
-v = ufl.TestFunction(fenicsx.scalar_space(msh, 1))
-one = fenicsx.constant(msh, 1.0)
-volume = fenicsx.VectorAssembler(one * v * ufl.dx(domain=msh), None, comm)
+msh, _ = meshes.mesh_body(comm, Box(size=(1.0, 2.0, 3.0), cells=(2, 2, 2), degree=1))
+v = ufl.TestFunction(spaces.scalar_space(msh, 1))
+one = spaces.constant(msh, 1.0)
+volume = assembly.VectorAssembler(one * v * ufl.dx(domain=msh), None, comm)
 found = comm.gather((round(comm.allreduce(volume().sum()), 12), len(made)))
 for line in found or ():  # two ranks that print may mix their lines
     print(*line)

@@ -9,7 +9,7 @@ import sympy as sp
 import ufl
 from mpi4py import MPI
 
-from forward.fem import fenicsx
+from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.hyperelastic import Hyperelastic
 from forward.solvers.newton import solve
@@ -62,7 +62,7 @@ class Forced(Discretisation):
         super().__init__(spec, comm, ())
         _, places, *_ = self.interpolation(spec.body.quadrature)
         force = manufactured()[2](places.reshape(-1, 3))
-        densities = [fenicsx.function(fenicsx.quadrature_space(self.mesh, spec.body.quadrature)) for _ in range(3)]
+        densities = [spaces.function(spaces.quadrature_space(self.mesh, spec.body.quadrature)) for _ in range(3)]
         for density, column in zip(densities, force.T, strict=True):
             density.x.array[density.function_space.dofmap.list.array] = column
         load = self.vector(ufl.inner(ufl.as_vector(densities), self.test) * self.dx)()

@@ -7,7 +7,7 @@ import sympy as sp
 import ufl
 from mpi4py import MPI
 
-from forward.fem import fenicsx
+from forward.fem.dolfinx import compile, meshes, spaces
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
 from forward.fem.layout import Layout
@@ -233,7 +233,7 @@ def test_the_published_beam():
 )
 def test_nodes_are_counted_and_numbered_by_place(cell, degree):
     spec = unloaded_body("mooney-rivlin", body={"cells": (3, 2, 4), "cell": cell, "degree": degree})
-    space = fenicsx.vector_space(fenicsx.mesh_body(MPI.COMM_SELF, spec.body)[0], degree)
+    space = spaces.vector_space(meshes.mesh_body(MPI.COMM_SELF, spec.body)[0], degree)
     layout = Layout(space, MPI.COMM_SELF)
     assert layout.coordinates.size == spec.unknowns == 3 * (3 * degree + 1) * (2 * degree + 1) * (4 * degree + 1)
     axes = [np.linspace(0, length, degree * n + 1) for length, n in zip(SIZE, (3, 2, 4), strict=True)]
@@ -253,7 +253,7 @@ def test_nodes_are_counted_and_numbered_by_place(cell, degree):
 def test_places_are_told_apart_on_fine_meshes():
     # Nodes at multiples of 1/1024 fall on the ends of intervals that divide the length by powers of ten.
     spec = unloaded_body("mooney-rivlin", body={"size": (1.0, 0.01, 0.01), "cells": (1024, 1, 1)}, outputs=OUTPUTS[:1])
-    layout = Layout(fenicsx.vector_space(fenicsx.mesh_body(MPI.COMM_SELF, spec.body)[0], 1), MPI.COMM_SELF)
+    layout = Layout(spaces.vector_space(meshes.mesh_body(MPI.COMM_SELF, spec.body)[0], 1), MPI.COMM_SELF)
     columns = layout.coordinates.reshape(-1, 2, 2, 3)
     np.testing.assert_allclose(columns[:, 0, :, 1], 0, atol=1e-15)
     np.testing.assert_allclose(columns[:, :, 1, 2], 0.01)
@@ -261,13 +261,13 @@ def test_places_are_told_apart_on_fine_meshes():
 
 def test_compiling_a_form_changes_no_other(tmp_path, monkeypatch):
     # Else forms would be compiled again in the next run.
-    monkeypatch.setattr(fenicsx, "_CACHE", tmp_path)
-    msh = fenicsx.mesh_body(MPI.COMM_SELF, unloaded_body("mooney-rivlin").body)[0]
-    u = fenicsx.function(fenicsx.vector_space(msh, 1))
+    monkeypatch.setattr(compile, "_CACHE", tmp_path)
+    msh = meshes.mesh_body(MPI.COMM_SELF, unloaded_body("mooney-rivlin").body)[0]
+    u = spaces.function(spaces.vector_space(msh, 1))
     forms = [k * ufl.inner(u, u) * ufl.dx(domain=msh, metadata={"quadrature_degree": 1}) for k in (2, 2, 3)]
     before = forms[0].signature()
     compiled = len(list(tmp_path.glob("*/*.so")))  # elements
-    fenicsx.compile_form(forms[2], MPI.COMM_SELF)
+    compile.compile_form(forms[2], MPI.COMM_SELF)
     assert len(list(tmp_path.glob("*/*.so"))) == compiled + 1
     assert forms[1].signature() == before
 

@@ -9,7 +9,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.bodies.geometry import Box
-from forward.fem import fenicsx
+from forward.fem.dolfinx import meshes, spaces
 from forward.fem.layout import Layout
 from workflows.results.directory import label, with_random_fields, write_fields
 
@@ -18,7 +18,7 @@ SIZE = (2.0, 1.0, 0.5)
 
 def layout(cell, degree):
     body = Box(size=SIZE, cells=(2, 1, 1), cell=cell, degree=degree)
-    return Layout(fenicsx.vector_space(fenicsx.mesh_body(MPI.COMM_SELF, body)[0], degree), MPI.COMM_SELF)
+    return Layout(spaces.vector_space(meshes.mesh_body(MPI.COMM_SELF, body)[0], degree), MPI.COMM_SELF)
 
 
 def polynomial(x, degree):

@@ -9,7 +9,7 @@ import ufl
 from mpi4py import MPI
 from mpmath import mp
 
-from forward.fem import fenicsx
+from forward.fem.dolfinx import assembly, meshes, spaces
 from forward.fem.equations import _OPS
 from forward.hyperelastic import Hyperelastic
 from forward.materials import kinematics
@@ -188,9 +188,9 @@ def test_ogden_stress_and_stiffness_where_stretches_are_equal():
     """P = F Σ ∂W/∂λ_k n_k⊗n_k / λ_k in 40 digits, and differences of it, at repeated, close and distinct stretches."""
     values = {"mu1": 6e5, "alpha1": 1.3, "mu2": 1e3, "alpha2": 5.0, "mu3": -1e4, "alpha3": -20.0, "D1": 2e6}
     # One linear tetrahedron with a homogeneous deformation: its state is a deformation gradient.
-    mesh = fenicsx.mesh_body(MPI.COMM_SELF, unloaded_body("ogden").body)[0]
-    space = fenicsx.vector_space(mesh, 1)
-    u, along = fenicsx.function(space), fenicsx.function(space)
+    mesh = meshes.mesh_body(MPI.COMM_SELF, unloaded_body("ogden").body)[0]
+    space = spaces.vector_space(mesh, 1)
+    u, along = spaces.function(space), spaces.function(space)
     gradient = ufl.variable(ufl.grad(u))
     deformation = kinematics.deformation(_OPS, gradient, ufl.Identity(3))
     strains = kinematics.principal_strains(_OPS, deformation)
@@ -198,7 +198,7 @@ def test_ogden_stress_and_stiffness_where_stretches_are_equal():
     W = MATERIALS["ogden"](_OPS, *logarithms, deformation.dilation, **values)
     P = ufl.diff(W, gradient)
     point = np.array([[0.2, 0.2, 0.2]])
-    values_at = [fenicsx.PointValues(form, point, space, MPI.COMM_SELF) for form in (P, ufl.derivative(P, u, along))]
+    values_at = [assembly.PointValues(form, point, space, MPI.COMM_SELF) for form in (P, ufl.derivative(P, u, along))]
     places = space.tabulate_dof_coordinates()
 
     def stress(F):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.fem import fenicsx
+from forward.fem.dolfinx import linear
 from forward.model import SolveError
 from tests.bodies import FORMS, OUTPUTS, loaded_body, unloaded_body
 
@@ -174,8 +174,8 @@ def test_a_factorisation_that_fails_leaves_no_factor(model, monkeypatch):
         factorise(solver)
         raise SolveError("the stiffness is singular")
 
-    factorise = fenicsx.DirectSolver.factorise
-    monkeypatch.setattr(fenicsx.DirectSolver, "factorise", fail)
+    factorise = linear.DirectSolver.factorise
+    monkeypatch.setattr(linear.DirectSolver, "factorise", fail)
     with pytest.raises(SolveError):
         second.tangent(POINT)
     monkeypatch.undo()

@@ -1,0 +1,21 @@
+"""The only package that knows DOLFINx: compiled forms, meshes, spaces, assembly, linear solvers.
+
+Written for DOLFINx 0.5 (Debian 12) and 0.11 (the wheel `dolfinx-solver-real`); what these call differently is in
+`version`. To import any of it makes the libraries ready, in the order that they need.
+"""
+
+from contextlib import suppress
+
+from forward.machine import reserve_for_linear_algebra
+
+with suppress(ModuleNotFoundError):
+    import dolfinx_solver as _  # the wheel wants to be first  # noqa: F401
+import petsc4py
+
+petsc4py.init(["tissuq", "-no_signal_handler"])  # PETSc would end the study where a child process dies (SIGPIPE)
+
+import basix  # noqa: E402
+import dolfinx.fem.petsc  # noqa: E402, F401
+
+reserve_for_linear_algebra()
+basix.create_element(basix.ElementFamily.P, basix.CellType.interval, 1)  # with the linear algebra of DOLFINx, too

@@ -1,0 +1,130 @@
+"""Assembly of compiled forms, and their values at points."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from forward.bodies.geometry import Body
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.dolfinx import version
+from forward.fem.dolfinx.compile import compile_form, compiled, options_for
+from forward.fem.dolfinx.meshes import mesh_body, owned_cells
+from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_ghosts
+from forward.fem.dolfinx.unknowns import Unknowns
+from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+class VectorAssembler:
+    """A compiled linear form with its vector, used again for every assembly.
+
+    Its test functions are those of the unknowns, or of any other space where no unknowns are given.
+    """
+
+    def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any) -> None:
+        self._form = compile_form(form, comm)
+        self._unknowns = unknowns
+        self._vector = version.new_vector(self._form)
+
+    def __call__(self) -> FloatArray:
+        """Assemble; return a copy of this rank's part (U_local,)."""
+        with self._vector.localForm() as local:
+            local.set(0.0)
+        fem.petsc.assemble_vector(self._vector, self._form)
+        self._vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        values = self._vector.array_r
+        return np.array(values) if self._unknowns is None else self._unknowns.take(values)
+
+
+class ScalarAssembler:
+    """A compiled functional, summed over the ranks."""
+
+    def __init__(self, form: Any, comm: Any) -> None:
+        self._form = compile_form(form, comm)
+        self._comm = comm
+
+    def __call__(self) -> float:
+        """Assemble; return the same value on every rank."""
+        return float(self._comm.allreduce(fem.assemble_scalar(self._form)))
+
+
+class PointValues:
+    """A compiled UFL expression with its values at reference `points` (q, 3) of this rank's cells."""
+
+    def __init__(self, expression: Any, points: FloatArray, space: Any, comm: Any) -> None:
+        self._expression = compiled(
+            (expression, points), lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
+        )
+        self._mesh = space.mesh
+        self._cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
+
+    def __call__(self) -> FloatArray:
+        """Return the values (n_cells, q · size of the expression) at the state that is set."""
+        values = version.evaluate(self._expression, self._mesh, self._cells)
+        return np.asarray(values).reshape(len(self._cells), -1)
+
+
+class NodalGradients:
+    """Deformation gradients at the nodes: averages over the cells that meet there."""
+
+    def __init__(self, F: Any, space: Any, comm: Any) -> None:
+        nodes = cell_element(space).points
+        self._comm = comm
+        self._values = PointValues(F, nodes, space, comm)
+        self._count = space.dofmap.index_map.size_local + space.dofmap.index_map.num_ghosts
+        self._nodes = version.nodes_of_cells(space, len(nodes))[: owned_cells(space.mesh)].ravel()
+        self._carrier = fem.Function(space)
+        meeting = np.bincount(self._nodes, minlength=self._count).astype(float)
+        self._meeting = self._owned(np.broadcast_to(meeting, (3, self._count)))[0]
+
+    def _owned(self, rows: FloatArray) -> FloatArray:
+        """Add what other ranks hold of three rows (3, n) at this rank's nodes."""
+        if self._comm.size == 1:
+            return rows
+        self._carrier.x.array[:] = rows.T.ravel()
+        return np.asarray(sum_ghosts(self._carrier).reshape(-1, 3).T)
+
+    def __call__(self) -> FloatArray:
+        """Return F (3, 3, n_owned) at this rank's nodes, for the state that is set."""
+        values = self._values().reshape(-1, 9).T
+        sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
+        F = np.array([self._owned(rows) for rows in sums.reshape(3, 3, -1)])
+        return np.asarray(F / self._meeting)
+
+
+def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
+    """Mesh a body in this process; return linear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them.
+
+    They are on hexahedra, but for bodies that come with a mesh of tetrahedra.
+    """
+    from scipy.sparse import csr_matrix
+
+    boxed = body if isinstance(body, OwnMesh) else body.model_copy(update={"cell": "hexahedron"})
+    msh, _ = mesh_body(MPI.COMM_SELF, boxed)
+    space = scalar_space(msh, 1)
+    v, w = ufl.TestFunction(space), ufl.TrialFunction(space)
+    parts = [constant(msh, 0.0) for _ in range(3)]
+    exact = {"quadrature_degree": 3}
+    dx, ds = ufl.dx(domain=msh, metadata=exact), ufl.ds(domain=msh, metadata=exact)
+    form = compile_form(
+        parts[0] * v * w * dx + parts[1] * ufl.inner(ufl.grad(v), ufl.grad(w)) * dx + parts[2] * v * w * ds,
+        MPI.COMM_SELF,
+    )
+    matrices = []
+    for part in parts:
+        for other in parts:
+            other.value = float(other is part)
+        matrix = fem.petsc.assemble_matrix(form)
+        matrix.assemble()
+        indptr, indices, values = matrix.getValuesCSR()
+        matrices.append(csr_matrix((values, indices, indptr), shape=matrix.getSize()))
+        matrix.destroy()
+    return space, matrices

@@ -1,0 +1,182 @@
+"""Linear solvers of assembled stiffness matrices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from petsc4py import PETSc
+
+from forward.fem.cost import BYTES_PER_NONZERO, SPARE, Factor
+from forward.fem.dolfinx.unknowns import Unknowns
+from forward.machine import StopError, headroom, require
+from forward.model import FloatArray, SolveError
+
+ROOM = 60  # for what pivoting adds to the factor, in per cent of MUMPS's own estimate
+MOST_ROOM = 4000
+HOPELESS = 0.6  # part of the memory that a factor is expected to take, without which it is not begun
+SINGULAR = -10  # errors of MUMPS, as its guide numbers them
+TOO_LITTLE_ROOM = {-8, -9, -14, -15, -17, -20}  # more than was estimated is needed: more room helps
+TOO_LITTLE_MEMORY = {-5, -7, -11, -13, -18, -19, -22}
+
+
+class DirectSolver:
+    """A stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
+
+    One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
+    communicator is created in a loop.
+
+    Parameters
+    ----------
+    form
+        Compiled bilinear form.
+    constraints
+        Prescribed unknowns; their rows and columns become those of the identity.
+    unknowns
+        Knows the order of vectors.
+    comm
+        Communicator of the ranks that share the matrix.
+    symmetric
+        Whether the form is.
+    expected
+        What the factor is expected to be.
+
+    Raises
+    ------
+    StopError
+        If there is no memory for the matrix.
+    """
+
+    def __init__(
+        self,
+        form: Any,
+        constraints: list[Any],
+        unknowns: Unknowns,
+        comm: Any,
+        *,
+        symmetric: bool,
+        expected: Factor,
+    ) -> None:
+        self._expected = expected
+        require(2 * BYTES_PER_NONZERO * expected.nonzeros / comm.size + SPARE, "the stiffness matrix")
+        self._form = form
+        self._unknowns = unknowns
+        self._constraints = constraints
+        self._matrix = fem.petsc.create_matrix(form)
+        self._symmetric = symmetric
+        if symmetric:
+            self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._room = ROOM
+        self._analysed = False
+        self._ksp = self._new_ksp(comm)
+        self._right = self._matrix.createVecLeft()
+        self._solution = self._matrix.createVecRight()
+
+    def factorise(self) -> None:
+        """Assemble and factorise.
+
+        Raises
+        ------
+        SolveError
+            If the matrix is singular or has entries that are not finite.
+        StopError
+            If there is no memory for the factor.
+        """
+        unknowns, ranks = self._matrix.getSize()[0], self._ksp.comm.size
+        if not self._analysed:  # the analysis crashes where it finds no memory
+            hopeless = HOPELESS * self._expected.bytes / ranks + SPARE
+            require(hopeless, f"the factor of the stiffness of {unknowns:,} unknowns")
+        self._assemble()
+        while (status := self._try()) in TOO_LITTLE_ROOM and self._room < MOST_ROOM:
+            self._room *= 4
+            self._renew()
+        self._analysed = True
+        if status >= 0:
+            return
+        if status == SINGULAR:
+            message = "the stiffness is singular"
+            raise SolveError(message)
+        needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
+        self._renew()  # or else PETSc would report this failure for ever
+        if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
+            have = headroom()
+            message = (
+                f"memory ran out: the factor of the stiffness of {unknowns:,} unknowns needs {needed:,} MiB"
+                f"{' on one rank' if ranks > 1 else ''}, {have}"
+            )
+            raise StopError(message)
+        message = f"the factorisation failed (MUMPS error {status})"
+        raise SolveError(message)
+
+    def _try(self) -> int:
+        """Factorise; return MUMPS's status, negative where it failed."""
+        self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
+        return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(1))
+
+    def _new_ksp(self, comm: Any) -> Any:
+        ksp = PETSc.KSP().create(comm)
+        ksp.setOperators(self._matrix)
+        ksp.setType("preonly")
+        ksp.pc.setType("cholesky" if self._symmetric else "lu")
+        ksp.pc.setFactorSolverType("mumps")
+        ksp.pc.setFactorSetUpSolverType()
+        ksp.pc.getFactorMatrix().setMumpsIcntl(14, self._room)
+        if (
+            self._symmetric
+        ):  # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots
+            ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
+        return ksp
+
+    def _renew(self) -> None:
+        """Begin with a new factor, which is analysed again."""
+        self._ksp.destroy()
+        self._ksp = self._new_ksp(self._matrix.comm)
+        self._analysed = False
+
+    def _assemble(self) -> None:
+        self._matrix.zeroEntries()
+        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
+        self._matrix.assemble()
+
+    def assembled(self) -> Any:
+        """Assemble; return a copy of the matrix, for `products`. The factor at hand is that of another matrix then."""
+        self._assemble()
+        return self._matrix.copy()
+
+    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
+        """Return the products (k, n) of such a matrix with rows (k, n)."""
+        found = np.empty_like(rows)
+        for row, product in zip(rows, found, strict=True):
+            self._right.array[:] = self._unknowns.reorder(row)
+            matrix.mult(self._right, self._solution)
+            product[:] = self._unknowns.take(self._solution.array_r)
+        return found
+
+    def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
+        transpose = transpose and not self._symmetric
+        if right.ndim == 1:
+            self._right.array[:] = self._unknowns.reorder(right)
+            (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
+            return self._unknowns.take(self._solution.array_r)
+        if transpose or len(right) == 1 or self._ksp.comm.size > 1:
+            return np.array([self.solve(row, transpose=transpose) for row in right]).reshape(right.shape)
+        # The factor is read once for all of them.
+        ordered = np.asfortranarray(self._unknowns.reorder(right).T)
+        rights = PETSc.Mat().createDense(ordered.shape, array=ordered, comm=self._ksp.comm)
+        solutions = PETSc.Mat().createDense(ordered.shape, comm=self._ksp.comm)
+        for matrix in (rights, solutions):
+            matrix.setUp()
+            matrix.assemble()
+        self._ksp.pc.getFactorMatrix().matSolve(rights, solutions)
+        result = self._unknowns.take(np.array(solutions.getDenseArray().T, order="C"))
+        rights.destroy()
+        solutions.destroy()
+        return result
+
+    def negative_pivots(self) -> int:
+        """Number of negative pivots of LDLᵀ, that is of negative eigenvalues; −1 where it is not known."""
+        if not self._symmetric:
+            return -1
+        return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))

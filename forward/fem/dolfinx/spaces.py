@@ -1,0 +1,138 @@
+"""Spaces of functions on a mesh, their nodes, and values at points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from forward.bodies.location import locate
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.dolfinx import version
+from forward.fem.dolfinx.compile import compiled, options_for
+from forward.fem.dolfinx.meshes import owned_cells, region_numbers
+from forward.model import FloatArray
+
+
+def new_space(msh: Any, element: Any) -> Any:
+    """Return the space of an element."""
+    if not version.ELEMENTS_ARE_COMPILED:
+        return version.new_space(msh, element, {})
+    return compiled(element, lambda folder: version.new_space(msh, element, options_for(folder)), msh.comm)
+
+
+def vector_space(msh: Any, degree: int) -> Any:
+    """Continuous vector-valued Lagrange elements."""
+    return new_space(msh, version.lagrange(msh.ufl_cell(), degree, vector=True))
+
+
+def scalar_space(msh: Any, degree: int) -> Any:
+    """Continuous scalar Lagrange elements."""
+    return new_space(msh, version.lagrange(msh.ufl_cell(), degree, vector=False))
+
+
+def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
+    """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
+    of_cells = region_numbers(comm, body, msh)
+    space = new_space(msh, version.by_cell(msh.ufl_cell()))
+    dofs = np.array([space.dofmap.cell_dofs(cell)[0] for cell in range(len(of_cells))])
+    found = {}
+    for number, name in enumerate(body.regions):
+        found[name] = fem.Function(space)
+        found[name].x.array[dofs] = of_cells == number
+    return found
+
+
+def quadrature_space(msh: Any, degree: int) -> Any:
+    """Scalars at the quadrature points."""
+    return new_space(msh, version.at_quadrature_points(msh.ufl_cell(), degree))
+
+
+def cell_element(space: Any) -> Any:
+    """Lagrange elements of a space on one cell, the nodes in the order of the cells' lists."""
+    family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
+    return basix.create_element(family, version.cell_type(space), version.degree(space), variant)
+
+
+def interpolate(values: Any, space: Any) -> FloatArray:
+    """Return this rank's values of a function at the nodes of another space on its mesh."""
+    other = fem.Function(space)
+    other.interpolate(values)
+    return np.array(other.x.array[: owned_nodes(space)])
+
+
+def owned_nodes(space: Any) -> int:
+    """Number of nodes that this rank owns."""
+    return int(space.dofmap.index_map.size_local)
+
+
+def node_coordinates(space: Any) -> FloatArray:
+    """Coordinates (n_owned, 3) of the nodes that this rank owns."""
+    return np.asarray(space.tabulate_dof_coordinates()[: owned_nodes(space)])
+
+
+def global_node_numbers(space: Any) -> NDArray[np.int64]:
+    """Global numbers of this rank's nodes, ghosts included."""
+    index_map = space.dofmap.index_map
+    count = index_map.size_local + index_map.num_ghosts
+    return np.asarray(index_map.local_to_global(np.arange(count, dtype=np.int32)))
+
+
+def boundary_nodes(space: Any, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return this rank's nodes (ghosts included) on facets; collective."""
+    return np.asarray(fem.locate_dofs_topological(space, 2, facets))
+
+
+def vtk_cells(space: Any) -> tuple[NDArray[np.int64], int]:
+    """Return the nodes (n_cells, k) of this rank's cells in VTK's order, and VTK's number of the cell type."""
+    topology, kinds, _ = version.vtk_mesh(space)
+    owned = owned_cells(space.mesh)
+    return np.asarray(topology).reshape(len(kinds), -1)[:owned, 1:].astype(np.int64), int(kinds[0])
+
+
+def point_weights(
+    space: Any, points: FloatArray
+) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
+    """Return nodes and weights that interpolate at each point (n, 3), on one rank each; collective.
+
+    A point in no cell has the weights of the place of the mesh that is nearest; the other array (n,) says, on every
+    rank, how far it is from there (m). The rank that is nearest, and of several the first, has the point.
+    """
+    msh, comm = space.mesh, space.mesh.comm
+    found = locate(msh.geometry.x[version.corners_of_cells(msh)[: owned_cells(msh)]], points)
+    every = np.array(comm.allgather(found.distances))
+    # Nodes of degree 1 and 2 stand in the same order in every cell: none has two on an edge or a face.
+    values = cell_element(space).tabulate(0, found.reference)[0, :, :, 0]
+    mine = every.argmin(axis=0) == comm.rank
+    here = [
+        (np.asarray(space.dofmap.cell_dofs(cell)), np.array(row)) if own else None
+        for cell, row, own in zip(found.cells, values, mine, strict=True)
+    ]
+    return here, every.min(axis=0)
+
+
+def quadrature_points(space: Any, degree: int) -> FloatArray:
+    """Reference points (q, 3) of the quadrature that the integrals use."""
+    points, _ = basix.make_quadrature(version.cell_type(space), degree)
+    return np.asarray(points)
+
+
+def constant(msh: Any, value: Any) -> Any:
+    """A constant of forms whose value can change without compiling again."""
+    return fem.Constant(msh, np.asarray(value, dtype=PETSc.ScalarType))
+
+
+def function(space: Any) -> Any:
+    """A finite-element function, zero."""
+    return fem.Function(space)
+
+
+def sum_ghosts(values: Any) -> FloatArray:
+    """Send what a function holds at ghost nodes to their owners, add it there, and return the owned part."""
+    vector = version.vector_of(values)
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    return np.array(vector.array_r)
