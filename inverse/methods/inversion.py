@@ -346,6 +346,7 @@ _OF_PARAMETERS: dict[str, tuple[str, ...]] = {
     "alone_std": ("case", "parameter"),
     "start_mode": ("start", "parameter"),
     "start_log_posterior": ("start",),
+    "zero_likelihood": (),
     "draw": ("sample", "parameter"),
     "draw_log_likelihood": ("sample", "datum"),
 }
@@ -636,6 +637,7 @@ def _invert(
         "trust": np.array(TRUST.index(verdict.trust)),
         "why": _letters(str(verdict)),
         "solves": np.array(counted.solves),
+        "zero_likelihood": np.array(float(sum(one.inadmissible for part in counted.log for one in part.failures))),
         "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in gaussian.steps]),
         "start_mode": posterior.physical(gaussian.modes),
         "start_log_posterior": gaussian.ends,

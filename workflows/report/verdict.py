@@ -269,10 +269,19 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
     return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)
 
 
-def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
-    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail."""
+def findings_of_solves(evaluations: Iterable[Evaluations], dataset: xr.Dataset) -> list[Finding]:
+    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail.
+
+    Of data sets that are inverted side by side the results know.
+    """
     every = list(evaluations)
     lost = [failure for found in every for failure in found.failures if failure.inadmissible]
+    if not lost and "zero_likelihood" in dataset and (count := int(np.nansum(dataset["zero_likelihood"]))):
+        text = (
+            f"{count:,} of {int(np.nansum(dataset['solves'])):,} solves were of parameters for which there is no "
+            "model: their likelihood is zero, and they count as answered."
+        )
+        return [Finding("note", text)]
     if not lost:
         return []
     solves = sum(len(found.points) for found in every)

@@ -170,7 +170,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     own_code.keep(directory, study, loaded)
-    add(dataset, *(verdict.findings_of_solves(evaluations.values()) if _explains(study) else ()))
+    add(dataset, *(verdict.findings_of_solves(evaluations.values(), dataset) if _explains(study) else ()))
     if isinstance(study, Study):
         dataset = _with_stability(study, dataset, evaluations["/"])
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
@@ -714,9 +714,11 @@ def _summary(
 
     every = evaluations.values()
     explains = _explains(study)
+    names = {label: _parameters(study, label) for label in evaluations}
     unlikely = sum(failure.inadmissible for found in every for failure in found.failures) if explains else 0
     failed = sum(len(found.failures) for found in every) - unlikely
-    names = {label: _parameters(study, label) for label in evaluations}
+    if "zero_likelihood" in dataset and names["/"] == ("data_set",):  # whose solves were counted by each
+        unlikely += int(np.nansum(dataset["zero_likelihood"]))
     source = own_code.digest(study)
     stability = branch.counts(every)
     return {

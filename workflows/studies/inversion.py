@@ -700,7 +700,18 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
         z = np.random.default_rng([study.method.seed, 1]).standard_normal(PRIOR_DRAWS)
         columns[NOISE] = (("chain", "draw"), study.method.noise.from_normal(z)[0][None])
     left["prior"] = xr.Dataset(columns)
-    left["log_likelihood"] = xr.Dataset({"displacement": draws("draw_log_likelihood")})
+    dense = draws("draw_log_likelihood")
+    left["log_likelihood"] = xr.Dataset({"displacement": dense})
+    seen = np.isfinite(found["measured"].to_numpy())
+    if (
+        len(seen) > 1 and not seen.all()
+    ):  # data sets of different numbers of data: one variable of each, without what is filled up
+        parts = {
+            str(name): dense.sel(data_set=name, drop=True)[..., here].rename(datum=f"datum_{name}")
+            for name, here in zip(found.data_set.values, seen, strict=True)
+            if here.any()
+        }
+        left["log_likelihood"] = left["log_likelihood"].assign(parts)
     return left
 
 

@@ -320,6 +320,29 @@ def test_one_bad_file_does_not_stop_the_others(folder):
     found = xr.load_dataset(folder / "one" / "results.nc", engine="h5netcdf")
     np.testing.assert_array_equal(found["ok"], [True, True, False])
     assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
+    assert summary["zero_likelihood"] == 0
+    arviz = pytest.importorskip("arviz")
+    kept = arviz.from_netcdf(folder / "one" / "results.nc")
+    counts = np.isfinite(found["measured"]).sum("datum").to_numpy()
+    assert set(kept.log_likelihood.data_vars) == {"displacement", "made-1", "made-2"}
+    for name, count in zip(("made-1", "made-2"), counts, strict=False):
+        left_out = arviz.loo(kept, var_name=name)
+        assert left_out.n_data_points == count
+        assert np.isfinite(left_out.elpd_loo)
+
+
+def test_solves_without_a_model_are_counted_in_batches_too(folder, monkeypatch):
+    monkeypatch.setattr(study_runs, "_report", lambda directory: None)
+    prior = "parameters.material.mu={ kind = 'normal', mean = 1e4, std = 3e4 }"
+    changes = ("data.files=['data/made-*.csv']", "method.mesh_check=false", "method.samples=128", prior)
+    here(folder / "few.toml", folder / "tails", *changes)
+    found = xr.load_dataset(folder / "tails" / "results.nc", engine="h5netcdf")
+    summary = json.loads((folder / "tails" / "summary.json").read_text())
+    assert summary["failed"] == 0 < summary["zero_likelihood"] == found["zero_likelihood"].sum()
+    told = (
+        f"{summary['zero_likelihood']:,} of {summary['solves']:,} solves were of parameters for which there is no model"
+    )
+    assert any(one["text"].startswith(told) for one in summary["findings"])
 
 
 KILLED = """
