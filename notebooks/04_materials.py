@@ -25,9 +25,9 @@ from pathlib import Path
 
 from workflows.config.study import parse
 from workflows.report import plots, selection_report
-from workflows.report.verdict import findings
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
+from workflows.studies.findings_selection import findings
 
 STUDY = """
 [data]

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from forward.words import number, settings, with_error
 from workflows.report import plots
 from workflows.report.tables import Table
-from workflows.report.words import number, settings, unit_of, with_error
+from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.words import number
 from uq.findings import findings
 from workflows.config.study import Study, StudyError, parse
 from workflows.report import bodies, plots, tables, words
 from workflows.report.tables import Results, Table
-from workflows.report.words import model_in_words, number
+from workflows.report.words import model_in_words
 from workflows.results.directory import read_dataset, read_summary, write_text
 
 if TYPE_CHECKING:

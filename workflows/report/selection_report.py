@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.words import NONE, number, settings, with_error, with_unit
 from inverse.criticism.weights import RULE
 from workflows.report import plots
 from workflows.report.tables import Table
-from workflows.report.verdict import bayes_factor, by_probability, conflicts, grade, ranking
-from workflows.report.words import NONE, number, settings, unit_of, with_error, with_unit
+from workflows.report.words import unit_of
+from workflows.studies.findings_selection import bayes_factor, by_probability, conflicts, grade, ranking
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from forward.words import NONE, duration, number, per, settings, with_error, with_unit, worth
 from uq.estimators.moments import half_width
 from uq.methods.compare import gains as gains_of
 from uq.methods.compare import plain_samples
 from workflows.config.study import Study
-from workflows.report.words import NONE, duration, number, per, settings, unit_of, with_error, with_unit, worth
+from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr

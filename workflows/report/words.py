@@ -1,10 +1,9 @@
-"""Numbers rounded to their errors, and studies in words, for reports."""
+"""Studies in words, for reports."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from typing import Any, assert_never
+from typing import assert_never
 
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
@@ -12,11 +11,8 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.energies import MATERIALS, constants, units
 from forward.observables.outputs import Output
 from forward.terms.loads import Gravity, Load, Pressure, Traction
+from forward.words import listed, number, settings, with_unit
 from workflows.config.study import Study
-
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-DIGITS = 15  # that a number has
-NONE = "–"  # what stands for a number that there is not
 
 
 def stability(counts: dict[str, int]) -> str:
@@ -29,49 +25,6 @@ def stability(counts: dict[str, int]) -> str:
         *([f"{refused:,} refused as unstable"] if refused else []),
     ]
     return f"stability of the states: {', '.join(parts)}"
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """Write a number with some significant digits; powers of ten where it is very small or large."""
-    if value is None or math.isnan(value):
-        return NONE
-    if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
-    power = _power(float(f"{value:.{digits - 1}e}"))
-    if power:
-        return _scaled(f"{value / 10.0**power:.{digits}g}", power)
-    return f"{float(f'{value:.{digits}g}'):,.10g}".replace("-", "−")
-
-
-def with_error(value: float, error: float) -> str:
-    """Write a value and its standard error, which has two significant digits: 0.12279 ± 0.00015."""
-    if not (math.isfinite(value) and math.isfinite(error) and error > 0):
-        return f"{number(value, 6)} ± {number(error, 2)}"
-    decimals = 1 - math.floor(math.log10(error))
-    if value:
-        # Numbers have fifteen digits: an error below them is one of the last.
-        decimals = min(decimals, DIGITS - 1 - math.floor(math.log10(abs(value))))
-        error = max(error, 10.0**-decimals)
-    power = _power(max(abs(value), error))
-    places = max(decimals + power, 0)
-    rounded = [round(x, decimals) / 10.0**power for x in (value, error)]
-    text = " ± ".join(f"{x:,.{places}f}" for x in rounded)
-    return _scaled(f"({text})", power) if power else text.replace("-", "−")
-
-
-def duration(seconds: float) -> str:
-    """Write a time: 0.23 s, 35 s, 4 min 10 s, 3 h 05 min."""
-    if seconds < 99.5:
-        return f"{seconds:.2g} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 100:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def worth(ratio: float) -> str:
-    """Write how many plain samples a controlled one is worth."""
-    return number(ratio, 3)
 
 
 def unit_of(path: str) -> str:
@@ -92,23 +45,6 @@ def unit_of(path: str) -> str:
     return {"displacements": "m", "loads": "Pa"}.get(block, "1")
 
 
-def with_unit(text: str, unit: str) -> str:
-    """Write the unit after a number, if it has one."""
-    return text if unit == "1" or text == NONE else f"{text} {unit}"
-
-
-def per(unit: str, divisor: str) -> str:
-    """Unit of a derivative."""
-    if divisor == "1":
-        return unit
-    return f"{unit}/({divisor})" if "/" in divisor else f"{unit}/{divisor}"
-
-
-def settings(block: dict[str, Any], *left_out: str) -> str:
-    """Write the settings of a block: a = 2, b = 2."""
-    return ", ".join(f"{key} = {_value(value)}" for key, value in block.items() if key not in left_out)
-
-
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     """Say what was solved: headings, each with its lines."""
     if study.body is None:
@@ -122,7 +58,7 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
     kind = model.energy
     numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(MATERIALS[kind])]
-    fibres = [f"fibres along {' and '.join(map(_value, model.fibres))}"] if model.fibres else []
+    fibres = [f"fibres along {' and '.join(map(listed, model.fibres))}"] if model.fibres else []
     law = str(MATERIALS[kind].__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(numbers), *fibres]
     if model.regions:
@@ -186,10 +122,10 @@ def _load(study: Study, load: Load) -> str:
     match load:
         case Gravity():
             density = _scalar(study, f"loads.{load.label}.density")
-            return f"gravity: density {density} × {load.acceleration:g} m/s² along {_value(load.direction)}"
+            return f"gravity: density {density} × {load.acceleration:g} m/s² along {listed(load.direction)}"
         case Traction():
             size = _scalar(study, f"loads.{load.label}.size")
-            return f"traction on {load.on}: {size} along {_value(load.direction)}"
+            return f"traction on {load.on}: {size} along {listed(load.direction)}"
         case Pressure():
             return f"pressure on {load.on}: {_scalar(study, f'loads.{load.label}.size')}"
         case _:
@@ -201,19 +137,3 @@ def _scalar(study: Study, path: str) -> str:
     if path in study.parameters:
         return "random"
     return with_unit(number(study.model.scalars[path].value, 6), unit_of(path))
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, tuple | list):
-        return f"({', '.join(_value(item) for item in value)})"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _power(value: float) -> int:
-    """Power of ten that is written apart: none for numbers of ordinary size."""
-    power = math.floor(math.log10(abs(value))) if value else 0
-    return 0 if -3 <= power < 6 else power
-
-
-def _scaled(text: str, power: int) -> str:
-    return f"{text} × 10{str(power).translate(_SUPERSCRIPTS)}".replace("-", "−")

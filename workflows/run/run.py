@@ -28,8 +28,7 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
 from uq.findings import add, findings
 from uq.inputs.sampling import random_points
 from workflows.config.study import Study, StudyError, differences, document, dump
-from workflows.report import verdict, words
-from workflows.report.locking import measured
+from workflows.report import words
 from workflows.results.directory import (
     above_rounding,
     blank_where_still,
@@ -50,6 +49,9 @@ from workflows.results.norms import node_volumes
 from workflows.run import own_code
 from workflows.run.plan import memory, of_program, shortage
 from workflows.run.progress import Progress
+from workflows.studies import findings_selection
+from workflows.studies.findings_inversion import judged
+from workflows.studies.findings_solves import findings_of_solves, measured
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -170,7 +172,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
     evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
     own_code.keep(directory, study, loaded)
-    add(dataset, *(verdict.findings_of_solves(evaluations.values(), dataset) if _explains(study) else ()))
+    add(dataset, *(findings_of_solves(evaluations.values(), dataset) if _explains(study) else ()))
     if isinstance(study, Study):
         dataset = _with_stability(study, dataset, evaluations["/"])
     summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
@@ -372,9 +374,9 @@ def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
-        doubts = verdict.doubts_of_selection(found, candidates, study.method.noise.factor)
-        add(found, *verdict.findings(found), *doubts)
-        return verdict.trusted_on_meshes(found)
+        doubts = findings_selection.doubts_of_selection(found, candidates, study.method.noise.factor)
+        add(found, *findings_selection.findings(found), *doubts)
+        return findings_selection.trusted_on_meshes(found)
 
     others: list[Callable[[], ForwardModel]] = [*makers[1:]]
     others += [partial(_once_on_finer_mesh, makers[number]) for number in checked]
@@ -479,7 +481,7 @@ def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint
         [],
         many,
         recorders,
-        lambda found: verdict.judged(found, study),
+        lambda found: judged(found, study),
         groups=partial(inversion.groups, study),
         texts=lambda found: {BATCH: inversion.batch_table(found)},
         arrived=arrived,
@@ -513,7 +515,7 @@ def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
         others,
         task,
         recorders,
-        lambda found: verdict.judged(found, study),
+        lambda found: judged(found, study),
         groups=partial(inversion.groups, study),
         texts=lambda found: {BATCH: inversion.batch_table(found)},
     )

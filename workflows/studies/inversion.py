@@ -40,7 +40,7 @@ from workflows.config.study import (
     ranges,
     refused,
 )
-from workflows.report import verdict
+from workflows.studies.findings_inversion import judged
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -660,7 +660,7 @@ class Rows:
             data = self._study.data.model_copy(update={"sets": (sets,)})
             alone = self._study.model_copy(update={"data": data, "measurements": (measurements,)})
             why = {0: reasons[i]} if i in reasons else {}
-            found = verdict.judged(dataset(alone, row[None], why, self._vertices, self._layout), alone)
+            found = judged(dataset(alone, row[None], why, self._vertices, self._layout), alone)
             self._head, line = batch_table(found).splitlines()
             self._lines[number] = line
             solves += float(np.nansum(found["solves"]))

@@ -22,9 +22,9 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import StudyError, dump, load, parse
-from workflows.report.verdict import doubts_of_selection, findings, grade
 from workflows.run.plan import plan
 from workflows.starter import starter
+from workflows.studies.findings_selection import doubts_of_selection, findings, grade
 
 STRETCHES = (1.2, 1.5, 1.9, 2.4, 2.9, 3.3)
 MODES = ("uniaxial", "equibiaxial", "pure-shear")

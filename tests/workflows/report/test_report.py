@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
+from forward import words as numbers
 from forward.model import WORK, FunctionModel, SolveError
 from uq.estimators.indices import field_indices
 from uq.evaluation.evaluate import SerialEvaluate
@@ -61,7 +62,7 @@ def test_inclusions_in_words():
     assert said == ["tumour (sphere): x = 0.5 m, y = 0.5 m, z = 0.5 m, radius = random, contrast = 4, width = 0.1 m"]
     assert words.unit_of("inclusions.tumour.contrast") == "1"
     assert words.unit_of("inclusions.tumour.x") == "m"
-    assert words.per("m", "1") == "m"
+    assert numbers.per("m", "1") == "m"
 
 
 def function(point):
@@ -155,11 +156,11 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         "x-min clamped",
         "uniform: lower = 600, upper = 900",
         "kg/m³",
-        words.with_error(float(sag["mean"]), float(sag["mean_error"])) + " m",
-        words.with_error(float(sag["std"]), float(sag["std_error"])) + " m",
-        words.with_error(float(sag["plain_mean"]), float(sag["plain_mean_error"])) + " m",
-        words.with_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0])) + " m",
-        f"worth {words.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        numbers.with_error(float(sag["mean"]), float(sag["mean_error"])) + " m",
+        numbers.with_error(float(sag["std"]), float(sag["std_error"])) + " m",
+        numbers.with_error(float(sag["plain_mean"]), float(sag["plain_mean_error"])) + " m",
+        numbers.with_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0])) + " m",
+        f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
         "2.6667 × 10⁻⁴ m/(kg/m³)",
         "root mean square of the derivative",
         "none failed",
@@ -221,9 +222,9 @@ def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
         "scatter of 16 independent scrambles",
         "a 95 % interval is ± 2.13 of them",
         words_,
-        words.with_error(float(sag["mean"]), float(sag["mean_error"])) + " m",
-        words.with_error(float(sag["std"]), float(sag["std_error"])) + " m",
-        f"worth {words.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        numbers.with_error(float(sag["mean"]), float(sag["mean_error"])) + " m",
+        numbers.with_error(float(sag["std"]), float(sag["std_error"])) + " m",
+        f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
     ):
         assert text in page, text
     assert page.count("<figure>") == 2 * 3 + 4 + 2
@@ -269,7 +270,7 @@ def test_sobol_indices_are_reported(tmp_path, undrawn, design):
     sag = dataset.sel(output="sag", parameter="material.D1")
     for told in (
         "the shares of the variance that parameters have alone",
-        words.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
+        numbers.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
         "group both",
         "second order",
         "Generalised indices",
@@ -290,7 +291,7 @@ def test_bounds_are_reported(tmp_path, undrawn):
     sag = dataset.sel(output="sag", parameter="material.D1")
     for told in (
         "Sensitivity from derivatives",
-        words.with_error(float(sag["total_bound"]), float(sag["total_bound_error"])),
+        numbers.with_error(float(sag["total_bound"]), float(sag["total_bound_error"])),
         "leading direction",
         "Poincaré constant",
     ):
@@ -423,8 +424,8 @@ def test_comparison_puts_studies_side_by_side(tmp_path, sampled, undrawn):
     for dataset, name in ((sampled, "controlled"), (plain, "plain")):
         sag = dataset.sel(output="sag")
         assert f">{name}<" in page
-        assert words.with_error(float(sag["mean"]), float(sag["mean_error"])) in page
-        assert words.with_error(float(sag["std"]), float(sag["std_error"])) in page
+        assert numbers.with_error(float(sag["mean"]), float(sag["mean_error"])) in page
+        assert numbers.with_error(float(sag["std"]), float(sag["std_error"])) in page
     assert page.count("<figure>") == 2 * 2
     assert page.count("12 s") == 2
     assert "<i>" not in page
@@ -511,7 +512,7 @@ def test_two_samples_of_a_linear_model_are_drawn():
     ],
 )
 def test_values_are_rounded_to_their_errors(value, error, text):
-    assert words.with_error(value, error) == text
+    assert numbers.with_error(value, error) == text
 
 
 @pytest.mark.parametrize(
@@ -528,20 +529,20 @@ def test_values_are_rounded_to_their_errors(value, error, text):
     ],
 )
 def test_numbers_are_rounded(value, text):
-    assert words.number(value) == text
+    assert numbers.number(value) == text
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.2288, "0.23 s"), (34.9, "35 s"), (99.7, "1 min 40 s"), (11100, "3 h 05 min")]
 )
 def test_times_are_readable(seconds, text):
-    assert words.duration(seconds) == text
+    assert numbers.duration(seconds) == text
 
 
 def test_no_error_is_below_rounding():
     """Printed with fifteen digits at most, and kept as what rounding leaves."""
-    assert words.with_error(0.1, 1e-31) == "0.100000000000000 ± 0.000000000000001"
-    assert words.with_error(-1541.02, 1e-20) == "−1,541.02000000000 ± 0.00000000001"
+    assert numbers.with_error(0.1, 1e-31) == "0.100000000000000 ± 0.000000000000001"
+    assert numbers.with_error(-1541.02, 1e-20) == "−1,541.02000000000 ± 0.00000000001"
     found = above_rounding(
         xr.Dataset(
             {
@@ -605,5 +606,5 @@ def test_report_imports_nothing_that_draws():
 )
 def test_units_of_parameters(path, unit, of_a_length, number):
     assert words.unit_of(path) == unit
-    assert words.per("m", unit) == of_a_length
-    assert words.with_unit(words.number(2.0), unit) == number
+    assert numbers.per("m", unit) == of_a_length
+    assert numbers.with_unit(numbers.number(2.0), unit) == number

@@ -1,24 +1,20 @@
-"""What a comparison of models, or an inversion, says in sentences."""
+"""What a comparison of models says in sentences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import Finding, Severity
-from uq.findings import add
-from workflows.report.words import number, with_error
+from forward.model import Finding
+from forward.words import number, with_error
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from inverse.criticism.doubts import Doubt
-    from uq.evaluation.evaluate import Evaluations
     from uq.inputs.distributions import Distribution
     from uq.inputs.random_parameters import Inputs
-    from workflows.studies.inversion import Inversion
 
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
@@ -194,102 +190,6 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     if "mesh_checked" not in dataset:
         return dataset
     return dataset.assign(trusted=dataset["trusted"] & (np.abs(dataset["mesh_log_evidence"]) <= MOVED))
-
-
-NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md
-SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
-
-
-def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
-    """Look for all that makes the posteriors of an inversion doubtful; return the results with verdicts that say so."""
-    words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
-    said: list[Finding] = []
-    for k, name in enumerate(dataset.data_set.values):
-        if not bool(dataset["ok"][k]):
-            said.append(Finding("warning", f"{name} could not be inverted: {words[k]}"))
-            continue
-        doubts = doubts_of(dataset.isel(data_set=k), study, k)
-        words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
-        said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
-        said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
-    found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
-    add(found, *said)
-    return found
-
-
-def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
-    """Return the sentence and the number of a verdict, given what it was before anything was doubted."""
-    errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
-    warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
-    if trust == NEITHER:
-        return "; ".join([words, *errors, *warnings]), NEITHER
-    if errors:
-        return f"not to be trusted: {'; '.join([*errors, *warnings])}", NEITHER
-    if warnings:
-        return f"doubtful: {'; '.join(warnings)}; but for that: {words}", DOUBTFUL
-    return words, trust
-
-
-def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
-    """Say what is doubtful of one data set, by its number."""
-    from inverse.criticism import doubts as criticism
-    from uq.inputs.distributions import Normal
-
-    found: list[Doubt] = []
-    names = [str(name) for name in one.parameter.values]
-    mode, mean = one["mode"].to_numpy(), one["mean"].to_numpy()
-    square, degrees = float(one["prior_square"]), float(one["prior_degrees"])
-    d = len(names) - (study.method.noise is not None)
-    if study.field:
-        centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
-        priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
-    else:
-        priors = dict(study.inputs.marginals)
-        found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d])
-    found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees)
-    seen = np.isfinite(one["measured"].to_numpy())
-    residual, resolution = one["residual"].to_numpy()[seen], one["resolution"].to_numpy()[seen]
-    if study.method.noise is not None:
-        sigma, measured = one["sigma"].to_numpy()[seen], one["measured"].to_numpy()[seen]
-        found += criticism.noise_far(float(mode[-1]), study.method.noise.at(0.5), sigma, measured)
-    else:
-        found += criticism.too_large_errors(
-            *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
-        )
-    labels = study.measurements[number].observations.data_labels()
-    found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
-    if int(one["points_moved"]):
-        count, farthest = int(one["points_moved"]), float(one["largest_move"])
-        points = "1 point" if count == 1 else f"{count} points"
-        moved = f"{points} outside the body moved to its surface, by up to {farthest:.2g} m"
-        found.append(criticism.Doubt("note", moved, ""))
-    shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
-    nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
-    why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
-    return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)
-
-
-def findings_of_solves(evaluations: Iterable[Evaluations], dataset: xr.Dataset) -> list[Finding]:
-    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail.
-
-    Of data sets that are inverted side by side the results know.
-    """
-    every = list(evaluations)
-    lost = [failure for found in every for failure in found.failures if failure.inadmissible]
-    if not lost and "zero_likelihood" in dataset and (count := int(np.nansum(dataset["zero_likelihood"]))):
-        text = (
-            f"{count:,} of {int(np.nansum(dataset['solves'])):,} solves were of parameters for which there is no "
-            "model: their likelihood is zero, and they count as answered."
-        )
-        return [Finding("note", text)]
-    if not lost:
-        return []
-    solves = sum(len(found.points) for found in every)
-    text = (
-        f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
-        f"({lost[0].reason}): their likelihood is zero, and they count as answered."
-    )
-    return [Finding("note", text)]
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:

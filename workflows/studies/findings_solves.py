@@ -1,15 +1,21 @@
-"""What locking does to the outputs of a study, by a solve that locks less."""
+"""What the solves of a study say: how far locking changes its outputs, and how many were of no model."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from forward.model import Finding, SolveError
+from forward.words import number, with_unit
 from workflows.config.study import ranges
-from workflows.report.words import number, with_unit
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from forward.fem.model import HyperelasticModel
+    from uq.evaluation.evaluate import Evaluations
     from workflows.config.study import Study
 
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
@@ -38,3 +44,26 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     form = "quadratic cells and pressures" if better.mixed else "quadratic cells"
     text = f"At the mean of the inputs, against {form} on the same mesh, which lock less: {'; '.join(said)}."
     return [Finding("warning", text)]
+
+
+def findings_of_solves(evaluations: Iterable[Evaluations], dataset: xr.Dataset) -> list[Finding]:
+    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail.
+
+    Of data sets that are inverted side by side the results know.
+    """
+    every = list(evaluations)
+    lost = [failure for found in every for failure in found.failures if failure.inadmissible]
+    if not lost and "zero_likelihood" in dataset and (count := int(np.nansum(dataset["zero_likelihood"]))):
+        text = (
+            f"{count:,} of {int(np.nansum(dataset['solves'])):,} solves were of parameters for which there is no "
+            "model: their likelihood is zero, and they count as answered."
+        )
+        return [Finding("note", text)]
+    if not lost:
+        return []
+    solves = sum(len(found.points) for found in every)
+    text = (
+        f"{len(lost):,} of {solves:,} solves were of parameters for which there is no model, as for the first of them "
+        f"({lost[0].reason}): their likelihood is zero, and they count as answered."
+    )
+    return [Finding("note", text)]

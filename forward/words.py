@@ -1,0 +1,87 @@
+"""Numbers in words: rounded to their errors, with units, for people to read."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+DIGITS = 15  # that a number has
+NONE = "–"  # what stands for a number that there is not
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Write a number with some significant digits; powers of ten where it is very small or large."""
+    if value is None or math.isnan(value):
+        return NONE
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    power = _power(float(f"{value:.{digits - 1}e}"))
+    if power:
+        return _scaled(f"{value / 10.0**power:.{digits}g}", power)
+    return f"{float(f'{value:.{digits}g}'):,.10g}".replace("-", "−")
+
+
+def with_error(value: float, error: float) -> str:
+    """Write a value and its standard error, which has two significant digits: 0.12279 ± 0.00015."""
+    if not (math.isfinite(value) and math.isfinite(error) and error > 0):
+        return f"{number(value, 6)} ± {number(error, 2)}"
+    decimals = 1 - math.floor(math.log10(error))
+    if value:
+        # Numbers have fifteen digits: an error below them is one of the last.
+        decimals = min(decimals, DIGITS - 1 - math.floor(math.log10(abs(value))))
+        error = max(error, 10.0**-decimals)
+    power = _power(max(abs(value), error))
+    places = max(decimals + power, 0)
+    rounded = [round(x, decimals) / 10.0**power for x in (value, error)]
+    text = " ± ".join(f"{x:,.{places}f}" for x in rounded)
+    return _scaled(f"({text})", power) if power else text.replace("-", "−")
+
+
+def duration(seconds: float) -> str:
+    """Write a time: 0.23 s, 35 s, 4 min 10 s, 3 h 05 min."""
+    if seconds < 99.5:
+        return f"{seconds:.2g} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 100:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def worth(ratio: float) -> str:
+    """Write how many plain samples a controlled one is worth."""
+    return number(ratio, 3)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Write the unit after a number, if it has one."""
+    return text if unit == "1" or text == NONE else f"{text} {unit}"
+
+
+def per(unit: str, divisor: str) -> str:
+    """Unit of a derivative."""
+    if divisor == "1":
+        return unit
+    return f"{unit}/({divisor})" if "/" in divisor else f"{unit}/{divisor}"
+
+
+def settings(block: dict[str, Any], *left_out: str) -> str:
+    """Write the settings of a block: a = 2, b = 2."""
+    return ", ".join(f"{key} = {listed(value)}" for key, value in block.items() if key not in left_out)
+
+
+def listed(value: Any) -> str:
+    """Write a setting: numbers short, lists in parentheses."""
+    if isinstance(value, tuple | list):
+        return f"({', '.join(listed(item) for item in value)})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _power(value: float) -> int:
+    """Power of ten that is written apart: none for numbers of ordinary size."""
+    power = math.floor(math.log10(abs(value))) if value else 0
+    return 0 if -3 <= power < 6 else power
+
+
+def _scaled(text: str, power: int) -> str:
+    return f"{text} × 10{str(power).translate(_SUPERSCRIPTS)}".replace("-", "−")
