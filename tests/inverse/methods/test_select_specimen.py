@@ -202,7 +202,7 @@ def test_a_study_from_the_command_line(study):
     """One rank or two: the same bytes; the report shows what is left of the data."""
     for name, ranks in (("one", None), ("two", 2)):
         done = run(ranks, TISSUQ, "run", study, "--out", study.parent / name)
-        assert done.returncode == 0, done.stderr
+        assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (study.parent / "one/results.nc").read_bytes() == (study.parent / "two/results.nc").read_bytes()
     page = (study.parent / "one" / "report.html").read_text()
     for words in ("What is left of the data", "Posteriors of the constants", "neo-hookean on 1 × 1 × 1 cells"):
@@ -222,5 +222,5 @@ def test_same_bits_after_a_kill(study):
     process.wait()
     for out in (directory, study.parent / "whole"):
         done = run(None, TISSUQ, "run", study, "--out", out, "--set", "method.samples=256")
-        assert done.returncode == 0, done.stderr
+        assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (directory / "results.nc").read_bytes() == (study.parent / "whole/results.nc").read_bytes()
