@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any, Literal, assert_never
 
 import numpy as np
@@ -24,12 +23,12 @@ from forward.bodies.inclusions import stiffness_factor
 from forward.bodies.mesh_file import OwnMesh
 from forward.fem import ranks
 from forward.fem.cost import factor
-from forward.fem.dolfinx import assembly, compile, linear, meshes, spaces, unknowns, version
+from forward.fem.dolfinx import assembly, compile, linear, meshes, spaces, unknowns
+from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
 from forward.hyperelastic import CONTRAST, Hyperelastic
-from forward.materials import kinematics
-from forward.materials.energies import MATERIALS, measures
+from forward.materials.energies import MATERIALS
 from forward.model import FloatArray, SolveError, Work
 from forward.solvers.newton import Residual
 from forward.terms.loads import LOAD_SIZES, Gravity, Pressure, Traction
@@ -37,24 +36,6 @@ from forward.terms.loads import LOAD_SIZES, Gravity, Pressure, Traction
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that is rounding, over displacements as a part of the body
-_OPS = SimpleNamespace(
-    ln=ufl.ln,
-    exp=ufl.exp,
-    sqrt=ufl.sqrt,
-    tanh=ufl.tanh,
-    sin=ufl.sin,
-    cos=ufl.cos,
-    atan2=version.atan2,
-    sinh=ufl.sinh,
-    tr=ufl.tr,
-    det=ufl.det,
-    inv=ufl.inv,
-    inner=ufl.inner,
-    outer=ufl.outer,
-    positive=lambda x: ufl.max_value(x, 0.0),
-    near=lambda z, limit, inside, outside: ufl.conditional(ufl.lt(abs(z), limit), inside, outside),
-)
-_OPS.log1p, _OPS.expm1 = kinematics.log1p_of(_OPS), kinematics.expm1_of(_OPS)
 
 
 class Discretisation:
@@ -97,13 +78,12 @@ class Discretisation:
         self._variation = ufl.TestFunction(self.unknowns.whole)
         self.u, self.p = self.unknowns.split(self._state)
         self.test, self._test_pressure = self.unknowns.split(self._variation)
-        self.F = kinematics.deformation_gradient(ufl.grad(self.u), ufl.Identity(3))
+        fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
+        self._invariants = Invariants(
+            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres
+        )
+        self.F = self._invariants.F
         self.J = ufl.det(self.F)
-        self._fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
-        self._of_stretches = "l1" in measures(spec.energy)
-        self._gradient = ufl.variable(ufl.grad(self.u)) if self._of_stretches else ufl.grad(self.u)
-        self._deformation = kinematics.deformation(_OPS, self._gradient, ufl.Identity(3))
-        self._measures = self._measures_of_the_energy()
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._loads = self._virtual_works()
@@ -112,11 +92,10 @@ class Discretisation:
         self._residual = self.vector(imbalance)
         self._prescribe()
         trial = ufl.TrialFunction(self.unknowns.whole)
-        self._stiffness = compile.compile_form(ufl.derivative(imbalance, self._state, trial), comm)
+        self._stiffness = self._matrix(self.derivative(imbalance, trial))
         self._solver = self.new_solver()
         self._factorised_at = np.zeros(self.size)
-        points = spaces.quadrature_points(self.space, spec.body.quadrature)
-        self._jacobians = assembly.PointValues(self.J, points, self.space, comm)
+        self._jacobians = self.at_points(self.J)
         self._external = 0.0
         self._rounding: float | None = None
         self._given: FloatArray | None = None  # parameters that are set
@@ -125,26 +104,13 @@ class Discretisation:
 
     # --- forms -------------------------------------------------------------------------------------------------------
 
-    def _measures_of_the_energy(self) -> dict[str, Any]:
-        """What the energy is a function of, by name, as variables of forms; those of stretches are of the gradient."""
-        names, at = measures(self.spec.energy), self._deformation
-        if self._of_stretches:
-            strains = kinematics.principal_strains(_OPS, at)
-            logarithms = kinematics.isochoric([_OPS.log1p(strain) / 2 for strain in strains])
-            return dict(zip(("l1", "l2", "l3"), logarithms, strict=True)) | {"j": at.dilation}
-        found = {name: kinematics.measure(_OPS, name, at, self._fibres) for name in names}
-        return {
-            name: tuple(map(ufl.variable, value)) if isinstance(value, tuple) else ufl.variable(value)
-            for name, value in found.items()
-        }
-
     @cached_property
     def energy(self) -> Any:
         """Energy density; in the mixed form, without that of the change of volume."""
         values = self._material
         if self.p is not None:
             values["D1"] = 0
-        return self.stiffness_factor * MATERIALS[self.spec.energy](_OPS, *self._measures.values(), **values)
+        return self.stiffness_factor * MATERIALS[self.spec.energy](OPS, *self._invariants.measures.values(), **values)
 
     @cached_property
     def _regions(self) -> dict[str, Any]:
@@ -174,7 +140,7 @@ class Discretisation:
         X = ufl.SpatialCoordinate(self.mesh)
         for inclusion in self.spec.inclusions:
             numbers = self._numbers(f"inclusions.{inclusion.label}")
-            factor *= stiffness_factor(_OPS, X, inclusion.kind, **numbers)
+            factor *= stiffness_factor(OPS, X, inclusion.kind, **numbers)
         return factor * self._factor_of("stiffness")
 
     def _factor_of(self, quantity: Literal["stiffness", "density"]) -> Any:
@@ -199,30 +165,26 @@ class Discretisation:
         In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
         keeps its digits however small it is.
         """
-        energy, j, p = self.energy, self._measures.get("j", self._deformation.dilation), self._pressure
+        dilation, p = self._invariants.deformation.dilation, self._pressure
+        energy, j = self.energy, self._invariants.measures.get("j", dilation)
         if p is None:
-            return energy, energy, self._deformation.dilation
+            return energy, energy, dilation
         bulk = 2 * self.stiffness_factor * self._material["D1"]
         of_pressure = p**2 / (2 * bulk)
         return energy + of_pressure, energy + p * j - of_pressure, p / bulk
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
-        if self._of_stretches:
-            return ufl.diff(density, self._gradient)
-        slopes = {name: ufl.diff(density, found) for name, found in self._measures.items() if name != "i4"}
-        of_fibres = [ufl.diff(density, longer) for longer in self._measures.get("i4", ())]
-        fibres = list(zip(self._fibres, of_fibres, strict=True)) if of_fibres else []
-        return kinematics.nominal_stress(_OPS, self.F, self._deformation, slopes, fibres)
+        return self._invariants.stress(density)
 
     def _variation_of(self, density: Any) -> Any:
         """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
         work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
         return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
 
-    def derivative(self, form: Any) -> Any:
-        """Gâteaux derivative of a functional with respect to all unknowns."""
-        return ufl.derivative(form, self._state, self._variation)
+    def derivative(self, form: Any, direction: Any | None = None) -> Any:
+        """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
+        return self._invariants.derivative(form, self._state, self._variation if direction is None else direction)
 
     def surface(self, boundary: str) -> Any:
         """Measure of a named boundary."""
@@ -230,7 +192,23 @@ class Discretisation:
 
     def vector(self, form: Any) -> assembly.VectorAssembler:
         """Compile a linear form."""
-        return assembly.VectorAssembler(form, self.unknowns, self.comm)
+        return assembly.VectorAssembler(self._invariants.inserted(form), self.unknowns, self.comm)
+
+    def by_vertices(self, form: Any) -> assembly.VectorAssembler:
+        """Compile a form that is linear in values at the vertices."""
+        return assembly.VectorAssembler(self._invariants.inserted(form), None, self.comm)
+
+    def scalar(self, form: Any) -> assembly.ScalarAssembler:
+        """Compile a functional."""
+        return assembly.ScalarAssembler(self._invariants.inserted(form), self.comm)
+
+    def at_points(self, expression: Any) -> assembly.PointValues:
+        """Compile an expression that is wanted at the quadrature points."""
+        points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
+        return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
+
+    def _matrix(self, form: Any) -> Any:
+        return compile.compile_form(self._invariants.inserted(form), self.comm)
 
     def _virtual_works(self) -> list[tuple[Any, Any]]:
         """Virtual works (integrand, measure) of the loads, with the sign of forces that are out of balance."""
@@ -290,12 +268,12 @@ class Discretisation:
             form = self._imbalance_form(by_vertices)
             if form is not None:
                 form = ufl.replace(form, {self._variation: self._along})
-                found.append((field, assembly.VectorAssembler(form, None, self.comm)))
+                found.append((field, self.by_vertices(form)))
         return tuple(found)
 
     @cached_property
     def _stiffness_action(self) -> assembly.VectorAssembler:
-        return self.vector(ufl.derivative(self._imbalance_form(), self._state, self._along))
+        return self.vector(self.derivative(self._imbalance_form(), self._along))
 
     @cached_property
     def _transposed_action(self) -> assembly.VectorAssembler:
@@ -633,8 +611,14 @@ class Discretisation:
         if self.symmetric:
             return self._stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
-        form = ufl.derivative(self._imbalance_form(), self._state, trial)
-        return compile.compile_form(0.5 * form + 0.5 * ufl.adjoint(form), self.comm)
+        followers = [
+            integrand * measure
+            for load, (integrand, measure) in zip(self.spec.loads, self._loads, strict=True)
+            if isinstance(load, Pressure)
+        ]
+        of_followers = self.derivative(sum(followers[1:], followers[0]), trial)
+        of_energy = self.derivative(self._variation_of(self._potential) * self.dx, trial)
+        return self._matrix(of_energy + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
 
     def new_symmetric_solver(self) -> linear.DirectSolver:
         """Return a matrix and a solver of their own for the symmetric part of the stiffness."""

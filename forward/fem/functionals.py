@@ -115,7 +115,7 @@ def _mean_over_boundary(body: Discretisation, output: MeanDisplacement) -> _Line
 
 def _volume(body: Discretisation) -> float:
     """Volume of the undeformed mesh, which is not that of the body where linear tetrahedra cut its faces."""
-    return assembly.ScalarAssembler(spaces.constant(body.mesh, 1.0) * body.dx, body.comm)()
+    return body.scalar(spaces.constant(body.mesh, 1.0) * body.dx)()
 
 
 class _Extreme:
@@ -158,7 +158,7 @@ class _Integral:
         self._body = body
         self._density = density
         self.size = size
-        self._value = assembly.ScalarAssembler(density * body.dx, body.comm)
+        self._value = body.scalar(density * body.dx)
 
     def value(self) -> float:
         return self._value() / self.size
@@ -170,7 +170,7 @@ class _Integral:
 
     @cached_property
     def _partial(self) -> assembly.ScalarAssembler:
-        return assembly.ScalarAssembler(self._body.along_parameters(self._density) * self._body.dx, self._body.comm)
+        return self._body.scalar(self._body.along_parameters(self._density) * self._body.dx)
 
     @cached_property
     def _by_fields(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
@@ -179,7 +179,7 @@ class _Integral:
         return tuple(
             (
                 field,
-                assembly.VectorAssembler(field.test * ufl.diff(self._density, field.log) * body.dx, None, body.comm),
+                body.by_vertices(field.test * ufl.diff(self._density, field.log) * body.dx),
             )
             for field in body.fields
             if field.inside(self._density)
@@ -236,8 +236,7 @@ class _MaxVonMises:
         cauchy = body.stress_of(body.energy) * body.F.T / body.J
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = body.spec.body.quadrature
-        points = spaces.quadrature_points(body.space, degree)
-        self._values = assembly.PointValues(stress, points, body.space, body.comm)
+        self._values = body.at_points(stress)
         self._selector = spaces.function(spaces.quadrature_space(body.mesh, degree))
         self._stress = stress
 
@@ -263,7 +262,7 @@ class _MaxVonMises:
 
     @cached_property
     def _weight(self) -> assembly.ScalarAssembler:
-        return assembly.ScalarAssembler(self._selector * self._body.dx, self._body.comm)
+        return self._body.scalar(self._selector * self._body.dx)
 
     def gradient(self) -> FloatArray:
         return self._at_place().gradient()

@@ -99,24 +99,52 @@ def excess(mean: Any, square: Any, product: Any, root: Any) -> Any:
     return 3 * (mean * square - product) / (root * (mean**2 + mean * root + root**2))
 
 
-def principal_strains(ops: ModuleType | SimpleNamespace, at: Deformation) -> tuple[Any, Any, Any]:
-    """Eigenvalues D_k of 3 dev C / tr C, from the trigonometric solution of their cubic; C has m (1 + D_k), m = tr C/3.
+class Shape(NamedTuple):
+    """What a change of shape is but for its axes: q² and θ of the eigenvalues of D = 3 dev C / tr C.
 
-    With D = dev C/m, q² = D:D/6 and r = det D/2,
+    With m = tr C/3, of which C has the eigenvalues m (1 + D_k), and r = det D/2,
 
-        D_k = 2q cos(θ + 2πk/3),   θ = atan2(√(q⁶ − r²), r)/3.
+        D_k = 2q cos(θ + 2πk/3),   q² = D:D/6,   θ = atan2(y, r)/3,   y = √(q⁶ − r²).
 
     Where two of them are equal they have no derivatives, though symmetric functions of them do. So q² is made larger by
     (εq)² with ε = `APART`: the D_k stay apart by about εq and have derivatives everywhere, of which what is infinite
     for ε → 0 cancels in symmetric functions. Of an energy, the stress is wrong by a part of the order ε², and
-    ε_machine/ε of its stiffness is rounding. A body without strain has D_k of the size of `LEAST`.
+    ε_machine/ε of its stiffness is rounding, if dθ is formed before it is multiplied with anything. A body without
+    strain has D_k of the size of `LEAST`.
     Source: O. K. Smith, Commun. ACM 4 (1961) 168.
+
+    Attributes
+    ----------
+    spread
+        q².
+    angle
+        θ.
+    slopes
+        ∂/∂F of both by their names, from ∂(D:D)/∂F = 4/m F (D − D:D/3 I) and ∂r/∂F = F (dev D² − 2r I)/m;
+        ∂θ = (r/(2q²) ∂q² − ∂r/3)/y.
     """
-    D = at.deviator / (1 + at.trace / 3)
-    square = ops.tr(D * D) / 6 * (1 + APART**2) + LEAST**2
-    r = ops.det(D) / 2
-    angle = ops.atan2(ops.sqrt(square**3 - r**2), r) / 3
-    q = ops.sqrt(square)
+
+    spread: Any
+    angle: Any
+    slopes: dict[str, Any]
+
+
+def shape(ops: ModuleType | SimpleNamespace, F: Any, at: Deformation, identity: Any) -> Shape:
+    """Return the invariants of the change of shape of a deformation."""
+    mean = 1 + at.trace / 3
+    D = at.deviator / mean
+    square, r = ops.tr(D * D), ops.det(D) / 2
+    spread = square / 6 * (1 + APART**2) + LEAST**2
+    y = ops.sqrt(spread**3 - r**2)
+    of_spread = 2 * (1 + APART**2) / (3 * mean) * F * (D - square / 3 * identity)
+    of_r = F * (D * D - (square / 3 + 2 * r) * identity) / mean
+    slopes = {"spread": of_spread, "angle": (r / (2 * spread) * of_spread - of_r / 3) / y}
+    return Shape(spread, ops.atan2(y, r) / 3, slopes)
+
+
+def principal_strains(ops: ModuleType | SimpleNamespace, spread: Any, angle: Any) -> tuple[Any, Any, Any]:
+    """Eigenvalues of 3 dev C / tr C from q² and θ of a `Shape`."""
+    q = ops.sqrt(spread)
     a, b, c = (2 * q * ops.cos(angle + 2 * math.pi * k / 3) for k in range(3))
     return a, b, c
 

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 import sympy as sp
-import ufl
 from mpi4py import MPI
 from mpmath import mp
 
 from forward.fem.dolfinx import assembly, meshes, spaces
-from forward.fem.equations import _OPS
+from forward.fem.invariants import OPS, Invariants
 from forward.hyperelastic import Hyperelastic
 from forward.materials import kinematics
 from forward.materials.energies import MATERIALS, constants, measured, measures, small_strain_moduli, splits, units
@@ -191,14 +190,12 @@ def test_ogden_stress_and_stiffness_where_stretches_are_equal():
     mesh = meshes.mesh_body(MPI.COMM_SELF, unloaded_body("ogden").body)[0]
     space = spaces.vector_space(mesh, 1)
     u, along = spaces.function(space), spaces.function(space)
-    gradient = ufl.variable(ufl.grad(u))
-    deformation = kinematics.deformation(_OPS, gradient, ufl.Identity(3))
-    strains = kinematics.principal_strains(_OPS, deformation)
-    logarithms = kinematics.isochoric([_OPS.log1p(strain) / 2 for strain in strains])
-    W = MATERIALS["ogden"](_OPS, *logarithms, deformation.dilation, **values)
-    P = ufl.diff(W, gradient)
+    of = Invariants("ogden", mesh, u, lambda direction: direction)
+    P = of.stress(MATERIALS["ogden"](OPS, *of.measures.values(), **values))
     point = np.array([[0.2, 0.2, 0.2]])
-    values_at = [assembly.PointValues(form, point, space, MPI.COMM_SELF) for form in (P, ufl.derivative(P, u, along))]
+    values_at = [
+        assembly.PointValues(of.inserted(form), point, space, MPI.COMM_SELF) for form in (P, of.derivative(P, u, along))
+    ]
     places = space.tabulate_dof_coordinates()
 
     def stress(F):
