@@ -1,4 +1,7 @@
-"""Run benchmarks: python -m benchmarks [NAME ...] (default: all). Ratios are measured side by side in one run."""
+"""Run benchmarks: python -m benchmarks [NAME ...] (default: all). Ratios are measured side by side in one run.
+
+What begins with dashes is for benchmarks that take options: python -m benchmarks tails --repeats 40.
+"""
 
 from __future__ import annotations
 
@@ -49,18 +52,27 @@ ALL = {
     "scaling": scaling.main,
     "startup": startup.main,
 }
+WITH_OPTIONS = {"tails": tails.main, "coverage": coverage.main}
 
 
 def main() -> int:
     """Run the benchmarks that are named, or all of them."""
-    names = sys.argv[1:] or list(ALL)
+    given = sys.argv[1:]
+    first = next((i for i, word in enumerate(given) if word.startswith("--")), len(given))
+    names, options = given[:first] or list(ALL), given[first:]
     unknown = [name for name in names if name not in ALL]
     if unknown:
         sys.stderr.write(f"unknown benchmark {unknown[0]}, expected one of: {', '.join(ALL)}\n")
         return 2
+    if options and not all(name in WITH_OPTIONS for name in names):
+        sys.stderr.write(f"{options[0]}, expected no options but for: {', '.join(WITH_OPTIONS)}\n")
+        return 2
     for name in names:
-        print(f"\n## {name}\n")
-        ALL[name]()
+        print(f"\n## {name}\n", flush=True)
+        if name in WITH_OPTIONS:
+            WITH_OPTIONS[name](options)
+        else:
+            ALL[name]()
     return 0
 
 

@@ -239,10 +239,25 @@ def _methods() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Row:
-    """Coverage of mean, std and all quantiles together; claimed over true error; share of runs with a finding."""
+    """What claims of mean, std and all quantiles are worth, as shares of the runs.
+
+    Attributes
+    ----------
+    covered
+        Whose 95 % intervals hold the truth.
+    claimed
+        Claimed over true errors.
+    silent
+        Whose intervals miss it while no finding says so.
+    found
+        With a finding.
+    lost
+        Number of runs without an estimate.
+    """
 
     covered: FloatArray
     claimed: FloatArray
+    silent: FloatArray
     found: float
     lost: int
 
@@ -269,10 +284,12 @@ def measure(case: Case, method: Any, repeats: int) -> Row:
         rows.append((within, claims / half, np.abs(estimates - exact)))
         warned.append(any(f["severity"] != "note" for f in _findings(data)))
     if not rows:
-        return Row(np.full(len(exact), np.nan), np.full(len(exact), np.nan), 1.0, lost)
+        nothing = np.full(len(exact), np.nan)
+        return Row(nothing, nothing, nothing, 1.0, lost)
     within, claims, errors = (np.array(column) for column in zip(*rows, strict=True))
     ratio = np.sqrt(np.mean(claims**2, axis=0) / np.maximum(np.mean(errors**2, axis=0), 1e-300))
-    return Row(within.mean(axis=0), ratio, float(np.mean(warned)), lost)
+    silent = ~within & ~np.array(warned)[:, None]
+    return Row(within.mean(axis=0), ratio, silent.mean(axis=0), float(np.mean(warned)), lost)
 
 
 def _findings(data: Any) -> list[dict[str, str]]:

@@ -71,7 +71,7 @@ def methods() -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] = ()) -> None:
-    """Print the coverage of the standard deviation in %, and in brackets the share of runs with a finding."""
+    """Print the coverage of the standard deviation in %; in brackets runs with a finding, and misses without one."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks tails")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--cases", default="")
@@ -80,12 +80,16 @@ def main(arguments: Sequence[str] = ()) -> None:
     chaos.DRAWN, coverage.REFERENCE = 13, 8  # quantiles are not looked at
     chosen = [case for case in cases() if options.cases in case.name]
     print("| method | " + " | ".join(case.name for case in chosen) + " |")
-    print("|" + "---|" * (1 + len(chosen)))
+    print("|" + "---|" * (1 + len(chosen)), flush=True)
     for name, method in methods().items():
         if options.methods in name:
             rows = [measure(case, method, options.repeats) for case in chosen]
-            cells = [f"{100 * row.covered[1]:.0f} ({100 * row.found:.0f})" for row in rows]
+            cells = [f"{_percent(row.covered[1])} ({_percent(row.found)}, {_percent(row.silent[1])})" for row in rows]
             print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f}"
 
 
 if __name__ == "__main__":

@@ -534,8 +534,28 @@ class Regression:
 
     def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
         """Return what follows from the coefficients, by output, with standard errors."""
-        cautious = None in [m.support for m in self.inputs.marginals.values()]
-        return _estimates(self.fit, self.largest.indices, self.data, self.beyond if cautious else None, of)
+        return _estimates(self.fit, self.largest.indices, self.data, self._rest(), of)
+
+    def _rest(self) -> FloatArray | None:
+        """Return the norms (m,) of what is missing in outputs, or None where no parameter has a tail.
+
+        Samples reach up to the ends of a range, and know it as the leave-one-out error. Where distributions have tails
+        they do not: what is missing is, before all else, the next power of a parameter with a tail, and beyond the
+        samples it grows. Of such a function ψ, of norm 1, the fit to these samples leaves residuals of a sum of squares
+        r²; a sum of squares s² of the outputs' own is that of a function of norm s/r.
+        """
+        tails = np.flatnonzero([marginal.support is None for marginal in self.inputs.marginals.values()])
+        if not tails.size:
+            return None
+        basis, data = self.basis, self.data
+        powers = np.zeros((tails.size, basis.indices.shape[1]), dtype=np.int64)
+        powers[np.arange(tails.size), tails] = basis.indices[:, tails].max(axis=0) + 1
+        following, left = data.left(orthonormal(self.inputs, powers)), data.left(basis)
+        rows = left.shape[0] * left.shape[1]
+        q, _ = np.linalg.qr(left.reshape(rows, -1))
+        columns = following.reshape(rows, -1)
+        residual = columns - q @ (q.T @ columns)
+        return np.maximum(self.fit.loo, np.sqrt(shares(self.fit.squares, (residual**2).sum(axis=0).min())))
 
     @property
     def beyond(self) -> FloatArray:
@@ -564,7 +584,7 @@ class Regression:
 
 
 def _estimates(
-    fit: Fit, largest: IntArray, data: Data, outside: FloatArray | None, of: Analysis
+    fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis
 ) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples and by what it leaves.
 
@@ -583,11 +603,9 @@ def _estimates(
     mean, and above `TRUSTED` they take the place of
     those of the fit (docs/decisions/0011-claims-of-expansions.md).
 
-    Where distributions have tails, the part r of the function outside the basis is large there and no sample says so:
-    there its norm is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the mean, which keeps
-    the jackknife. Samples know it as λ; they are where 1 − b of the variance is, b the share `outside` them, and in
-    proportion it is λ/(1 − b). (Without, intervals of functions of normal and gamma parameters covered 60 %
-    instead of 95 %.)
+    Where distributions have tails, the part of the function outside the basis is large there and no sample says so:
+    there its norm, the `rest`, is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the
+    mean, which keeps the jackknife.
 
     Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
     """
@@ -597,8 +615,8 @@ def _estimates(
     groups, n = len(fit.without), len(fit.unseen)
     seen = _unseen(fit, largest, data)
     trusted = fit.relative <= TRUSTED
-    cautious = outside is not None
-    tails = np.zeros_like(fit.loo) if outside is None else fit.loo / np.maximum(1 - outside, 1 / n)
+    cautious = rest is not None
+    tails = np.zeros_like(fit.loo) if rest is None else rest
     bias = shares(fit.loo**2, 2 * central["std"])
     whole: FloatArray = np.where(trusted, central["std"], seen["std"])
     share = shares(fit.loo**2, whole**2)
