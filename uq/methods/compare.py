@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
 
-from forward.model import Finding, FloatArray, SolveError
+from forward.model import Finding, FloatArray, Severity, SolveError
 from forward.settings import Settings
 from uq.estimators.moments import ESTIMATES, half_width, ratio
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
@@ -43,6 +43,8 @@ ROUNDING = 16 * np.finfo(float).eps  # relative error of a reference that claims
 UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
 TIGHT, TEXTBOOK, REFINED = 1, 2, 3  # numbers of the models beside the study's own
 TIGHTER = 1e-3  # tolerances of the solver that makes the reference, relative to those of the study
+# Severity of a finding of a comparison, and those of the methods' own that it repeats.
+TOLD: tuple[tuple[Severity, set[str]], ...] = (("warning", {"error", "warning"}), ("note", {"note"}))
 
 
 class Known(Settings):
@@ -347,7 +349,7 @@ class _Trial:
     reason
         Why there is no estimate.
     doubts
-        What the method found out against its own numbers.
+        What the method found out about its own numbers.
     """
 
     estimates: dict[str, FloatArray]
@@ -369,17 +371,29 @@ def _try(method: Sampling, inputs: Inputs, memory: _Memory) -> _Trial:
         return _Trial(dict.fromkeys(ESTIMATES, nothing), 0.0, recorder.solves, recorder.seconds, 0.0, str(error))
     own = time.process_time() - begin - (memory.clock.seconds - before)
     estimates = {name: found[name].to_numpy() for name in ESTIMATES}
-    doubts = tuple(one for one in findings(found) if one.severity != "note")
+    doubts = tuple(findings(found))
     return _Trial(estimates, half_width(found), recorder.solves, recorder.seconds, max(own, 0.0), doubts=doubts)
 
 
 def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]]) -> Iterator[Finding]:
-    """Find the methods that found out something against their own numbers, at which budgets and how often."""
-    for (entry, budget), row in zip(rows, trials, strict=True):
-        told = [trial.doubts[0] for trial in row if trial.doubts]
-        if told:
-            who = f"{entry.label} with {budget} samples, {len(told)} of {len(row)} repeats"
-            yield Finding("warning", f"{who}: {told[0].text}")
+    """Find what each method found out about its own numbers, at which budgets and how often: a line for each severity.
+
+    Errors are warnings here, where the numbers are compared with the reference.
+    """
+    for label in dict.fromkeys(entry.label for entry, _ in rows):
+        own = [i for i, (entry, _) in enumerate(rows) if entry.label == label]
+        runs = sum(len(trials[i]) for i in own)
+        for severity, told_as in TOLD:
+            told = [
+                (rows[i][1], next(one.text for one in trial.doubts if one.severity in told_as))
+                for i in own
+                for trial in trials[i]
+                if told_as & {one.severity for one in trial.doubts}
+            ]
+            if told:
+                budgets = ", ".join(str(budget) for budget in dict.fromkeys(budget for budget, _ in told))
+                who = f"{label} with {budgets} samples, {len(told)} of {runs} runs"
+                yield Finding(severity, f"{who}: {told[0][1]}")
 
 
 @dataclass

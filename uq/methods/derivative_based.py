@@ -35,6 +35,7 @@ from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
 from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.findings import add
 from uq.inputs.distributions import (
@@ -337,7 +338,8 @@ class _Samples:
     def _moments(self, each: int) -> Estimates:
         sums, counts = self._sums(each)
         means = sums / counts[:, None, None]
-        return estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.middle)
+        found = estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.middle)
+        return counted(found, self._inputs, self.outputs[:, :each][self.ok[:, :each]])
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
         """Flatten (R, n, …) to (n R, …), the first points of all scrambles first: a shorter study is the beginning."""
@@ -385,7 +387,7 @@ class _Samples:
                         dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
                 dataset["loo_error"] = (("output",), regression.fit.relative)
                 add(dataset, *of_indices(dataset))
-        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
+        add(dataset, *of_tails(self._evaluate.outputs, inputs, values[ok], last.relative_std_error))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
         return dataset

@@ -22,6 +22,7 @@ from uq.estimators.moments import (
     monomials,
     quantiles,
 )
+from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
@@ -182,12 +183,15 @@ def _scalar_moments(
         reasons = sorted({failure.reason for failure in evaluations.failures})
         message = f"{n} of {len(ok)} samples have an answer, expected at least 2: {'; '.join(reasons[:3])}"
         raise SolveError(message)
+    values = evaluations.outputs[ok]
     if control is None:
-        return estimate(monomials(evaluations.outputs[ok] - centre.outputs, None).sum(axis=1), n, centre.outputs)
-    deviations, slopes = evaluations.outputs[ok] - centre.middle, centre.output_slopes
+        plain = estimate(monomials(values - centre.outputs, None).sum(axis=1), n, centre.outputs)
+        return counted(plain, inputs, values)
+    deviations, slopes = values - centre.middle, centre.output_slopes
     predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
     variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
-    return estimate(monomials(deviations, predictions).sum(axis=1), n, centre.middle, variance, *control)
+    found = estimate(monomials(deviations, predictions).sum(axis=1), n, centre.middle, variance, *control)
+    return counted(found, inputs, values)
 
 
 def _field_moments(
@@ -250,7 +254,7 @@ def _dataset(
         moved = influences(
             first - scalars.coefficient * predicted, first**2 - scalars.second_coefficient * predicted**2
         )
-    add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
+    add(dataset, *of_tails(evaluate.outputs, inputs, values, scalars.relative_std_error, moved))
     if not ok.all():
         which = "plain estimates" if control else "all estimates"
         dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)

@@ -28,6 +28,7 @@ from uq.estimators.moments import (
     quantiles_from_replicates,
     ratio,
 )
+from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -197,6 +198,7 @@ class QuasiMonteCarlo(MonteCarlo):
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
         # What plain Monte Carlo would claim from as many independent samples.
         plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
+        plain = counted(plain, inputs, values[ok])
         running = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
@@ -222,7 +224,8 @@ class QuasiMonteCarlo(MonteCarlo):
             add(dataset, *of_control(evaluate.outputs, self.control, scalars))
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
-        add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, samples.influences(scalars)))
+        moved = samples.influences(scalars)
+        add(dataset, *of_tails(evaluate.outputs, inputs, values[ok], scalars.relative_std_error, moved))
         field = samples.field()
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
@@ -366,8 +369,12 @@ class _Samples:
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
-        unseen = np.where(found.second_coefficient == 0, 0.0, self._unseen(each))
-        return replace(found, std_error=np.hypot(found.std_error, unseen))
+        # A tangent grows no faster than a normal quantity; what grows faster says itself what is beyond the samples.
+        tails = counted(found, self._inputs, self.outputs[:, :each][ok])
+        if self._method.control not in ("quadratic", "chaos"):
+            return tails
+        known = np.hypot(found.std_error, self._unseen(each))
+        return replace(found, std_error=np.where(found.second_coefficient == 0, tails.std_error, known))
 
     def _unseen(self, each: int) -> FloatArray:
         """Error (m,) of the standard deviation from where a polynomial controls what no sample has seen.
@@ -378,8 +385,8 @@ class _Samples:
         """
         control = self._control
         controls = self._controls(each)
-        if control is None or controls is None or self._method.control == "tangent":
-            return np.zeros(self.outputs.shape[2])
+        assert control is not None
+        assert controls is not None
         ok = self.ok[:, :each]
         outside = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
         left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]

@@ -38,7 +38,8 @@ from uq.estimators.indices import (
     partial_variances,
     shares,
 )
-from uq.estimators.moments import ESTIMATES, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
+from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -589,7 +590,7 @@ class _Rows:
             }
         )
         last = moments[self.each].relative_std_error
-        add(dataset, *of_tails(self._evaluate.outputs, values[independent], last))
+        add(dataset, *of_tails(self._evaluate.outputs, self._inputs, values[independent], last))
         lost = int((~self.ok).sum())
         if lost:
             dataset.attrs["note"] = (
@@ -598,9 +599,12 @@ class _Rows:
             )
         return dataset
 
-    def _moments(self, each: int) -> Any:
+    def _moments(self, each: int) -> Estimates:
         """Moments of the outputs from the points A and B."""
         sums, counts = self._of_outputs(each)
         means = sums / counts[:, None, None]
         K = self.products.size
-        return estimate_from_replicates(np.array([(means[:, 0] + means[:, 1]) / 2, means[:, K]]), self._centre.outputs)
+        products = np.array([(means[:, 0] + means[:, 1]) / 2, means[:, K]])
+        rows = self._parts * each
+        drawn = self.outputs[:rows, :2][self.ok[:rows]].reshape(-1, self.outputs.shape[2])
+        return counted(estimate_from_replicates(products, self._centre.outputs), self._inputs, drawn)

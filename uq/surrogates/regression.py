@@ -577,15 +577,14 @@ class Regression:
             first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
             yield from of_tails(
                 [names[i] for i in which],
+                self.inputs,
                 self.data.values[:, which],
                 np.ones(which.size),
                 influences(first, second)[:, which],
             )
 
 
-def _estimates(
-    fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis
-) -> dict[str, FloatArray]:
+def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis) -> dict[str, FloatArray]:
     """Moments and indices by output with their standard errors, by the jackknife over samples and by what it leaves.
 
     The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its

@@ -122,8 +122,8 @@ def test_the_solve_at_the_mean_is_one_that_the_fit_has_not_seen():
     ids=lambda method: f"{method.kind}{getattr(method, 'control', '')}",
 )
 def test_heavy_tails_are_told(method):
-    told = [severities(run(method.model_copy(update={"seed": s}), "exponential")) == ["warning"] for s in range(10)]
-    assert sum(told) >= 8
+    told = [severities(run(method.model_copy(update={"seed": s}), "exponential")) for s in range(10)]
+    assert sum(one in (["warning"], ["error"]) for one in told) >= 8
     inputs = Inputs({"a": UNIT, "b": Normal(mean=0.0, std=1.0)})
     model = FunctionModel(lambda p: p[0] + p[1], inputs.names, ("y",), lambda p: [[1.0, 1.0]])
     told = [
@@ -136,8 +136,9 @@ def test_heavy_tails_are_told(method):
 def test_samples_that_look_log_normal_are_told_whatever_their_largest():
     """1/ω: a third of the sets of 64 samples have no large one."""
     case = next(case for case in tails.cases() if case.name == "1/ω, cv 1")
-    for seed in range(12):
-        assert severities(MonteCarlo(samples=64, seed=seed).run(case.inputs, Vectorised(case))) == ["warning"]
+    told = [severities(MonteCarlo(samples=64, seed=seed).run(case.inputs, Vectorised(case))) for seed in range(12)]
+    assert all(told)
+    assert told.count(["warning"]) >= 10
 
 
 def test_expansions_tell_what_is_beyond_their_samples():
@@ -157,7 +158,21 @@ def test_comparisons_say_what_their_methods_found_out():
     (found,) = findings(Compare.model_validate(block).run(case.inputs, Vectorised(case)))
     assert found.severity == "warning"
     assert "monte-carlo with 64 samples" in found.text
-    assert "5 of 5" in found.text or "4 of 5" in found.text
+    assert "5 of 5 runs" in found.text or "4 of 5 runs" in found.text
+
+
+def test_comparisons_repeat_that_a_control_was_dropped_once_for_a_method():
+    """The quadratic of exp(−a − b) leaves more scatter than there is, at both budgets."""
+    case = next(case for case in tails.cases() if case.name == "exp(−a − b), cv 2")
+    block = {
+        "methods": ({"kind": "quasi-monte-carlo", "control": "quadratic", "budgets": (64, 128)},),
+        "reference": {"kind": "given", "values": {"f": dict(zip(("mean", "std"), case.exact, strict=True))}},
+        "textbook": 0,
+        "repeats": 3,
+    }
+    found = findings(Compare.model_validate(block).run(case.inputs, Vectorised(case)))
+    (note,) = (one for one in found if one.severity == "note")
+    assert note.text.startswith("quasi-monte-carlo with 64, 128 samples, 6 of 6 runs: The quadratic control of f")
 
 
 # --- indices beyond their bounds -----------------------------------------------------------------------------------

@@ -1,0 +1,81 @@
+"""What samples do not hold of the tails that they let one guess: part of the error of a standard deviation.
+
+The largest of n samples of a log-normal quantity is about as far out as one in n of it, and of its variance a share is
+from beyond, which most sets of n samples miss: their standard deviation is too small, and so is its scatter among
+them, by which errors are claimed. Samples whose logarithms are about symmetric are log-normal as far as they say, and
+their tails are known from the spread s of all logarithms, which few samples tell much better than the tail itself.
+
+Half the share by which that from beyond exceeds the one of a normal quantity, which scatter knows, counts as a standard
+error of the standard deviation, relative to it. With it, 95 % intervals of plain Monte Carlo with 64 to 1 024 samples
+cover 89 to 97 % up to s = 0.65, and 87 to 96 % at 0.83 (without: 84 to 96 % and 81 to 88 %); those of 64 quasi-random
+samples 87 to 93 % instead of 76 to 92 %, and those of 1 024 up to 100 % instead of 79 to 97 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from forward.model import FloatArray
+from uq.estimators.moments import Estimates
+from uq.inputs.random_parameters import Inputs
+
+FROM = 0.25  # standard deviation of logarithms up to which scatter knows enough
+CLOSER = 0.75  # skewness of logarithms over that of the values: below, the values look log-normal
+SHORTER = -0.6  # skewness of logarithms below which the far tail is shorter than that of a log-normal
+ENDLESS = 2.1  # kurtosis of logarithms below which they seem to have ends: 1.8 for a uniform, 3 for a normal quantity
+
+
+Found = TypeVar("Found", bound=Estimates)
+
+
+def counted(found: Found, inputs: Inputs, values: FloatArray) -> Found:
+    """Return estimates from samples (n, m) with the errors that come from beyond them."""
+    return replace(found, std_error=np.hypot(found.std_error, unseen(inputs, values) * found.std))
+
+
+def unseen(inputs: Inputs, values: FloatArray) -> FloatArray:
+    """Return the relative error (m,) of standard deviations from beyond n samples (n, m) that look log-normal.
+
+    Zero where no parameter has a tail: samples reach up to the ends.
+    """
+    n, m = values.shape
+    if all(marginal.support is not None for marginal in inputs.marginals.values()):
+        return np.zeros(m)
+    return np.array([_share_beyond(s, n) / 2 if s > FROM else 0.0 for s in map(spread, values.T)])
+
+
+def spread(values: FloatArray) -> float:
+    """Standard deviation of the logarithms of values (n,) that look log-normal, on the far side of the median; else 0.
+
+    Logarithms may have a longer tail there than normal ones, but none that is much shorter: they would end.
+    """
+    if not (values.min() > 0 or values.max() < 0):
+        return 0.0
+    logarithms = np.log(np.abs(values))
+    deviations = logarithms - logarithms.mean()
+    ends = (deviations**4).mean() < ENDLESS * (deviations**2).mean() ** 2
+    skewness = _skewness(logarithms)
+    if ends or not SHORTER < skewness < CLOSER * abs(_skewness(values)):
+        return 0.0
+    return float(np.sqrt(2 * (np.maximum(logarithms - np.median(logarithms), 0) ** 2).mean()))
+
+
+def _share_beyond(s: float, n: int) -> float:
+    """Share of the variance of exp(s z), z normal, from beyond the z that one of n passes, less that of z itself.
+
+    With w = exp(s²): E[(x − μ)²; z > a] = w²Φ(2s − a) − 2wΦ(s − a) + wΦ(−a), and Var x = w² − w.
+    """
+    from scipy.special import ndtr, ndtri
+
+    a, w = -ndtri(1 / n), np.exp(s**2)
+    share = (w * ndtr(2 * s - a) - 2 * ndtr(s - a) + ndtr(-a)) / (w - 1)
+    normal = a * np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi) + ndtr(-a)
+    return float(max(share - normal, 0.0))
+
+
+def _skewness(values: FloatArray) -> float:
+    deviations = values - values.mean()
+    return float((deviations**3).mean() / max(float((deviations**2).mean()) ** 1.5, 1e-300))
