@@ -157,6 +157,7 @@ class Vectorised:
     outputs: tuple[str, ...] = ("f",)
     differentiable: bool = True
     displacements: int = 0
+    node_volumes: FloatArray | None = None
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What samples do not hold of tails: claims for standard deviations that count it, and errors where that is hopeless."""
+"""What samples do not hold of tails: claims for standard deviations that count it, or errors where that is hopeless."""
 
 import numpy as np
 import pytest
