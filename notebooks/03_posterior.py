@@ -30,7 +30,7 @@ import numpy as np
 
 from uq.findings import findings
 from workflows.config.study import load
-from workflows.report import inversion_report, plots
+from workflows.report import plots
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
 
@@ -50,8 +50,8 @@ print(*(f"{one.severity}: {one.text}" for one in findings(data)), sep="\n")
 # posterior, and its standard deviation beside that of the prior.
 
 # %%
-cut = inversion_report.Cut.of(one)
-inversion_report.slices(one, cut).figure
+cut = plots.inversion.Cut.of(one)
+plots.inversion.slices(one, cut).figure
 
 # %% [markdown]
 # ## How much is from the data: the spectrum
@@ -60,7 +60,7 @@ inversion_report.slices(one, cut).figure
 # shows is the prior. The posterior width of a direction is the prior's over √(1 + λ).
 
 # %%
-inversion_report.spectrum(one).figure
+plots.inversion.spectrum(one).figure
 
 # %%
 eigenvalues = one["eigenvalue"].values
@@ -75,13 +75,13 @@ print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all:
 # from the faces that were measured.
 
 # %%
-inversion_report.direction_slices(one, cut).figure
+plots.inversion.direction_slices(one, cut).figure
 
 # %% [markdown]
 # Each load case alone would have said less:
 
 # %%
-inversion_report.alone_slices(one, cut).figure
+plots.inversion.alone_slices(one, cut).figure
 
 # %% [markdown]
 # ## Draws, and what they predict
@@ -110,4 +110,4 @@ ax.figure
 # posterior should be read further before this test is passed.
 
 # %%
-inversion_report.misfits(one).figure
+plots.inversion.misfits(one).figure

@@ -24,7 +24,7 @@ import tomllib
 from pathlib import Path
 
 from workflows.config.study import parse
-from workflows.report import plots, selection_report
+from workflows.report import plots
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
 from workflows.studies.findings_selection import findings
@@ -75,7 +75,7 @@ print(*findings(data), sep="\n")
 data["trusted"].to_pandas()
 
 # %%
-selection_report.evidence_bars(data).figure
+plots.selection.evidence_bars(data).figure
 
 # %% [markdown]
 # ## What the ranking depends on
@@ -83,7 +83,7 @@ selection_report.evidence_bars(data).figure
 # Other errors, part of the data, priors half and twice as wide.
 
 # %%
-selection_report.probability_bars(data).figure
+plots.selection.probability_bars(data).figure
 
 # %% [markdown]
 # ## Is the best one any good?
@@ -97,7 +97,7 @@ data[["misfit_probability", "correlation_probability"]].min("group").to_pandas()
 # %%
 group = str(data["group"].values[0])
 test = str(data["output_test"].values[0])
-selection_report.curves(data, group, test).figure
+plots.selection.curves(data, group, test).figure
 
 # %% [markdown]
 # ## Posteriors of the constants
@@ -106,7 +106,7 @@ selection_report.curves(data, group, test).figure
 
 # %%
 best = str(data["model"].values[data["log_evidence"].argmax().item()])
-selection_report.corner(data, best, group).figure
+plots.selection.corner(data, best, group).figure
 
 # %% [markdown]
 # Any other picture is some lines of matplotlib on `plots.axes()`: the predicted stress at the last stretch, with

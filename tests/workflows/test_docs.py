@@ -207,7 +207,7 @@ def test_names_that_python_snippets_import_are_there():
 
 def test_pictures_that_the_docs_name_are_functions():
     for page, (module, name) in each(
-        lambda text: re.findall(r"`(plots|bodies|selection_report|inversion_report)\.(\w+)`", text)
+        lambda text: re.findall(r"`(plots|plots\.inversion|plots\.selection|bodies)\.(\w+)`", text)
     ):
         assert callable(getattr(importlib.import_module(f"workflows.report.{module}"), name, None)), (page, name)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import assert_never
+from collections.abc import Iterator, Mapping
+from typing import Any, assert_never
 
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
@@ -27,6 +27,16 @@ def stability(counts: dict[str, int]) -> str:
     return f"stability of the states: {', '.join(parts)}"
 
 
+def solves(summary: Mapping[str, Any]) -> int:
+    """Return the number of solves; a data set of several that are inverted side by side is one evaluation of many."""
+    return int(max(summary["evaluations"], summary.get("solves", 0)))
+
+
+def counted(solves: int) -> str:
+    """Write a number of solves."""
+    return "1 solve" if solves == 1 else f"{solves:,} solves"
+
+
 def unit_of(path: str) -> str:
     """SI unit of a number of the model, by its path; "1" for ratios and for models of other programs."""
     block, _, name = path.partition(".")
@@ -43,6 +53,16 @@ def unit_of(path: str) -> str:
     if path.endswith(".density"):
         return "kg/m³"
     return {"displacements": "m", "loads": "Pa"}.get(block, "1")
+
+
+def unit_of_constant(name: str) -> str:
+    """SI unit of a constant of a material, or of a number of a model by its path."""
+    return unit_of(name if "." in name else f"material.{name}")
+
+
+def named(name: str, unit: str) -> str:
+    """Write the unit after a name, if it has one."""
+    return name if unit == "1" else f"{name} ({unit})"
 
 
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:

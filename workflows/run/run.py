@@ -842,10 +842,8 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
         for output, slopes in summary.get("local_per_range", {}).items():
             shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
             lines.append(f"{output}: derivative × range of the parameter: {shown}")
-    from workflows.report.tables import solves
-
     failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
-    lines.append(f"{solves(summary)} in {summary['wall_seconds']:.1f} s, {failed}")
+    lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
     if "stability" in summary:
         lines.append(words.stability(summary["stability"]))
     if "note" in summary:

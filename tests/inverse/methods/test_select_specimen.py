@@ -22,7 +22,7 @@ from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import LogNormal
 from workflows.__main__ import main
 from workflows.config.study import StudyError, dump, load, parse
-from workflows.report.selection_report import meshes
+from workflows.report.sections.finer_meshes import meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 

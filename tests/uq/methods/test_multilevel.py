@@ -19,6 +19,7 @@ from uq.inputs.sampling import random_points
 from uq.methods.multilevel import MultilevelMonteCarlo, bias, optimal, rate
 from workflows.config.study import StudyError, load, parse
 from workflows.report import plots
+from workflows.report.plots.multilevel import _sampling
 from workflows.run.plan import plan
 
 INPUTS = Inputs({"a": Uniform(lower=0.5, upper=1.5), "b": Uniform(lower=0.0, upper=1.0)})
@@ -172,7 +173,7 @@ def test_coarse_meshes_get_the_samples():
     data = MultilevelMonteCarlo(tolerance=0.003, levels=4, control="none").run(INPUTS, hierarchy(4))
     counts = data["mesh_samples"].to_numpy()
     variances = data["difference_variance"].isel(output=0).to_numpy()
-    costs = plots._sampling(data, "f")[1]
+    costs = _sampling(data, "f")[1]
     best = np.sqrt(variances / costs)
     assert (np.diff(counts) < 0).all()
     assert counts[1] / counts[0] == pytest.approx(best[1] / best[0], rel=0.4)

@@ -17,7 +17,8 @@ from uq.estimators.indices import field_indices
 from uq.evaluation.evaluate import SerialEvaluate
 from workflows.config.study import dump, parse
 from workflows.report import bodies, plots, words
-from workflows.report.page import NO_BODY, compare, write_report
+from workflows.report.page import compare, write_report
+from workflows.report.sections.body import NO_BODY
 from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, summarise, write_dataset
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])

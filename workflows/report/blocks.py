@@ -1,0 +1,118 @@
+"""What sections of a report are made of: plain values, each drawn by the macro of its name in report.html.jinja."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from workflows.report import plots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+HALF = 8.0  # inches: wider pictures are not legible on half a page
+
+
+@dataclass(frozen=True)
+class Block:
+    """Something that stands on the page."""
+
+    macro: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class Heading(Block):
+    """A heading; level 1 is the title of the page."""
+
+    macro = "heading"
+    text: str
+    level: Literal[1, 2, 3] = 2
+
+
+@dataclass(frozen=True)
+class Text(Block):
+    """A paragraph."""
+
+    macro = "text"
+    text: str
+    tone: Literal["", "lead", "warning", "error"] = ""
+
+
+@dataclass(frozen=True)
+class Pairs(Block):
+    """Words, each with the lines that explain it."""
+
+    macro = "pairs"
+    items: Sequence[tuple[str, Sequence[str]]]
+
+
+@dataclass(frozen=True)
+class Table(Block):
+    """A table; the columns `text` are flushed left, and those of them in `long` are wrapped."""
+
+    macro = "table"
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    text: frozenset[int] = frozenset({0})
+    long: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG in base64 with what it shows; `wide` is one of many panels, which needs all of the page."""
+
+    data: str
+    caption: str
+    wide: bool = False
+
+    @classmethod
+    def of(cls, png: bytes, caption: str) -> Picture:
+        """Show a PNG file."""
+        return cls(base64.b64encode(png).decode(), caption)
+
+    @classmethod
+    def drawn(cls, ax: Axes, caption: str) -> Picture:
+        """Show the figure of axes."""
+        wide = ax.figure.get_figure(root=True).get_size_inches()[0] > HALF
+        return cls(base64.b64encode(plots.png(ax)).decode(), caption, wide=wide)
+
+
+@dataclass(frozen=True)
+class Pictures(Block):
+    """Pictures side by side; `small` ones stand three in a row."""
+
+    macro = "pictures"
+    items: Sequence[Picture]
+    small: bool = False
+
+
+@dataclass(frozen=True)
+class Code(Block):
+    """Text as it is in a file."""
+
+    macro = "code"
+    text: str
+
+
+@dataclass(frozen=True)
+class Folded(Block):
+    """Blocks that are seen when their title is clicked."""
+
+    macro = "folded"
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Html(Block):
+    """Markup that stands on the page as it is, and what it needs: style and script are in the page once.
+
+    Whoever makes it escapes what is not markup (`html.escape`). Reports are one file: nothing may be fetched.
+    """
+
+    macro = "html"
+    markup: str
+    style: str = ""
+    script: str = ""

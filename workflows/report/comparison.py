@@ -1,0 +1,65 @@
+"""Several studies side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from forward.words import NONE, duration, number, with_unit
+from workflows.report import plots
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.section import Results
+
+
+def applies(results: Results) -> bool:
+    """Whether a study estimates outputs of one model."""
+    return "nominal" in results.dataset
+
+
+def content(studies: Mapping[str, Results]) -> Iterator[Block]:
+    """Costs, and then the estimates of each output."""
+    yield costs(studies)
+    yield Text("± is one standard error.")
+    for output in dict.fromkeys(output for results in studies.values() for output in results.outputs):
+        yield Heading(output)
+        yield estimates(studies, output)
+        datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
+        if datasets:
+            captions: dict[plots.Estimated, str] = {
+                "mean": f"Mean of {output}, with 95 % confidence intervals.",
+                "std": f"Standard deviation of {output}, likewise.",
+            }
+            yield Pictures(
+                [
+                    Picture.drawn(plots.comparison(datasets, output, estimated), caption)
+                    for estimated, caption in captions.items()
+                ]
+            )
+
+
+def costs(studies: Mapping[str, Results]) -> Table:
+    """Methods and costs of several studies."""
+    rows = [
+        (
+            name,
+            results.summary["method"],
+            f"{results.summary['evaluations']:,}",
+            f"{results.summary['failed']:,}",
+            duration(results.summary["cpu_seconds"]),
+            duration(results.summary["wall_seconds"]),
+        )
+        for name, results in studies.items()
+    ]
+    return Table(("study", "method", "solves", "failed", "CPU time", "wall time"), rows, text=frozenset({0, 1}))
+
+
+def estimates(studies: Mapping[str, Results], output: str) -> Table:
+    """Estimates of an output by several studies."""
+    rows: list[tuple[str, ...]] = []
+    for name, results in studies.items():
+        if output not in results.outputs:
+            rows.append((name, NONE, NONE, NONE))
+            continue
+        central = number(float(results.dataset["nominal"].sel(output=output)), 6)
+        shown = [results.estimate(output, n) if n in results.dataset else NONE for n in ("mean", "std")]
+        rows.append((name, *shown, with_unit(central, results.unit(output))))
+    return Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)

@@ -1,0 +1,88 @@
+"""What pictures are drawn on: figures that need no display, their axes, colours and words."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+PLAIN, CONTROLLED, DARK = "#8a97a6", "#0b6bb8", "#1d2733"
+LOW, HIGH = "#0b6bb8", "#d1622b"
+COLOURS = ("#0b6bb8", "#d1622b", "#2f8f4e", "#8e5bb5", "#8a97a6", "#b5962d", "#1d2733", "#c2477f")  # of models
+
+
+def png(ax: Axes) -> bytes:
+    """Return the whole figure of axes as a PNG file."""
+    file = io.BytesIO()
+    whole = ax.get_figure(root=True)
+    assert whole is not None
+    whole.savefig(file, format="png", dpi=130)
+    return file.getvalue()
+
+
+def axes(height: float = 3.2, width: float = 5.4) -> Axes:
+    """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    ax: Axes = figure.add_subplot()
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def grid(count: int, columns: int, height: float = 3.0, width: float = 2.8) -> list[Axes]:
+    """Return axes side by side on a new figure as of `axes`; height and width (inches) are those of each."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    return [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+
+
+def quantity(dataset: xr.Dataset, output: str) -> str:
+    """Name and unit of an output."""
+    unit = str(dataset["unit"].sel(output=output).item())
+    return text_of(output) + ("" if unit == "1" else f" ({unit})")
+
+
+def text_of(name: str) -> str:
+    """Keep matplotlib from reading a name as a formula."""
+    return name.replace("$", r"\$")
+
+
+def count_axis(ax: Axes, first: int, n: int) -> None:
+    """Make the x axis one of numbers of samples, logarithmic."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    ax.set_xscale("log")
+    ax.set_xlim(first, max(n, first + 1))
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if n < 3000 else (1,)))
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_xlabel("samples")
+
+
+def span(values: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
+
+    A point far out with next to no weight, as of a wide prior, moves no end.
+    """
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order]) / weights.sum()
+    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
+    low, high = float(values[order[first]]), float(values[order[last]])
+    mean = weights @ values / weights.sum()
+    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
+    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
+    margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
+    return low - margin, high + margin

@@ -1,0 +1,294 @@
+"""Pictures of one data set that was inverted: ``one = dataset.isel(data_set=0)``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span
+from workflows.report.words import named, unit_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+MARGINALS = 12  # parameters whose densities are drawn
+RESOLUTION = 80  # points along the edge of a slice
+SEEN = 1.0  # λ above which the data say more of a direction than the prior
+Density = tuple[FloatArray, FloatArray]
+_FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A plane across the body, with what it takes to draw fields on it.
+
+    Attributes
+    ----------
+    axis, level
+        The plane: a coordinate, and its value (m).
+    along
+        The other two axes.
+    lines
+        Coordinates (m) of the points along each of these.
+    vertices, weights
+        Numbers (n, 4) of the nodes around each point, and weights; NaN outside the body.
+    """
+
+    axis: int
+    level: float
+    along: tuple[int, int]
+    lines: tuple[FloatArray, FloatArray]
+    vertices: NDArray[np.int64]
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, one: xr.Dataset) -> Cut:
+        """Cut across y where truth or recovered field stand out."""
+        from scipy.spatial import Delaunay
+
+        places = one["node_position"].to_numpy()
+        shown = one["stiffness_true"] if np.isfinite(one["stiffness_true"]).all() else one["stiffness_mean"]
+        far = np.abs(shown.to_numpy() - np.median(shown))
+        weights = np.where(far >= 0.7 * far.max(), far, 0.0) + 1e-300
+        level = float(weights @ places[:, 1] / weights.sum())
+        first, second = (np.linspace(places[:, a].min(), places[:, a].max(), RESOLUTION) for a in (0, 2))
+        x, z = np.meshgrid(first, second, indexing="xy")
+        points = np.column_stack([x.ravel(), np.full(x.size, level), z.ravel()])
+        mesh = Delaunay(places)
+        found = mesh.find_simplex(points, tol=1e-9)
+        map_ = mesh.transform[found]
+        inner = np.einsum("nij,nj->ni", map_[:, :3], points - map_[:, 3])
+        shares = np.column_stack([inner, 1 - inner.sum(axis=1)])
+        shares[found < 0] = np.nan
+        return cls(1, level, (0, 2), (first, second), mesh.simplices[found], shares)
+
+    def values(self, field: FloatArray) -> FloatArray:
+        """Return a field (N,) at the points of the plane."""
+        return np.asarray((field[self.vertices] * self.weights).sum(axis=1).reshape(RESOLUTION, RESOLUTION))
+
+
+def panels(one: xr.Dataset) -> dict[str, FloatArray]:
+    """Return the fields (N,) of ln stiffness that are drawn on a plane, by what they are."""
+    found = {}
+    if np.isfinite(one["stiffness_true"]).all():
+        found["true"] = one["stiffness_true"].to_numpy()
+    found["recovered"] = one["stiffness_mean"].to_numpy()
+    found["standard deviation"] = one["stiffness_std"].to_numpy()
+    found["prior standard deviation"] = one["stiffness_prior_std"].to_numpy()
+    return found
+
+
+def slices(one: xr.Dataset, cut: Cut) -> Axes:
+    """Draw truth, mean and standard deviations of ln stiffness on a plane."""
+    drawn = panels(one)
+    shown = [values for name, values in drawn.items() if "deviation" not in name]
+    ends = min(float(v.min()) for v in shown), max(float(v.max()) for v in shown)
+    widest = max(float(values.max()) for name, values in drawn.items() if "deviation" in name)
+    found = grid(len(drawn), columns=2)
+    for ax, (name, values) in zip(found, drawn.items(), strict=True):
+        spread = "deviation" in name
+        limits = (0.0, widest) if spread else ends
+        _draw(ax, cut, values, name, "plasma" if spread else "viridis", limits)
+    return found[0]
+
+
+def direction_slices(one: xr.Dataset, cut: Cut) -> Axes:
+    """Draw directions of a field on a plane."""
+    shown = [i for i, n in enumerate(one["shown_number"].to_numpy()) if n >= 0]
+    found = grid(len(shown), columns=4, height=2.7, width=2.1)
+    for ax, i in zip(found, shown, strict=True):
+        values = one["direction_stiffness"].isel(shown=i).to_numpy()
+        n = int(one["shown_number"][i])
+        largest = float(np.abs(values).max())
+        label = f"{n + 1}: λ = {float(one['eigenvalue'][n]):.3g}"
+        _draw(ax, cut, values, label, "RdBu_r", (-largest, largest))
+    for part in found[0].figure.axes:
+        part.tick_params(labelsize="x-small")
+    return found[0]
+
+
+def alone_slices(one: xr.Dataset, cut: Cut) -> Axes:
+    """Draw the standard deviation by each load case alone, and by all, on a plane."""
+    drawn = {str(case): one["alone_stiffness_std"].sel(case=case).to_numpy() for case in one.case.values}
+    drawn["all together"] = one["stiffness_std"].to_numpy()
+    widest = float(one["stiffness_prior_std"].max())
+    found = grid(len(drawn), columns=2)
+    for ax, (name, values) in zip(found, drawn.items(), strict=True):
+        _draw(ax, cut, values, name, "plasma", (0.0, widest))
+    return found[0]
+
+
+def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends: tuple[float, float]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = ends if ends[1] > ends[0] else (ends[0] - 1e-3, ends[1] + 1e-3)
+    drawn = ax.pcolormesh(*cut.lines, cut.values(values), cmap=colours, vmin=low, vmax=high, shading="gouraud")
+    ax.set_aspect("equal")
+    ax.set_title(title, fontsize="medium")
+    ax.set_xlabel(f"{'xyz'[cut.along[0]]} (m)")
+    ax.set_ylabel(f"{'xyz'[cut.along[1]]} (m)")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(3))
+    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.9)
+    bar.ax.xaxis.set_major_locator(MaxNLocator(4))
+
+
+def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw λ of all load cases and of each alone."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax = ax or axes()
+    rows = {"all together": one["eigenvalue"].to_numpy()}
+    rows |= {str(case): one["alone_eigenvalue"].sel(case=case).to_numpy() for case in one.case.values}
+    for i, (name, row) in enumerate(rows.items()):
+        values = row[np.isfinite(row) & (row > 1e-6 * rows["all together"][0])]
+        colour = DARK if i == 0 else COLOURS[i - 1]
+        ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=name, linewidth=1, markersize=4)
+    ax.axhline(SEEN, color=PLAIN, linestyle="--", linewidth=1)
+    ax.set_yscale("log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("direction")
+    ax.set_ylabel("λ")
+    ax.legend(fontsize="small", frameon=False)
+    return ax
+
+
+def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
+    """Draw prior and posterior densities of the parameters, of many those that the data narrow most."""
+    narrowed = (one["std"] / one["prior_std"]).to_numpy()
+    chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
+    names = [str(one.parameter.values[i]) for i in chosen]
+    found = grid(len(names), columns=min(len(names), 2), height=2.2)
+    for ax, name in zip(found, names, strict=True):
+        of = one.sel(parameter=name)
+        draws = of["draw"].to_numpy()
+        draws = draws[np.isfinite(draws)]
+        mean, std = float(of["mode"]), float(of["laplace_std"])
+        low, high = _span(draws, mean, min(std, 3 * float(of["std"])), float(of["true"]))
+        values, density = before[name]
+        x = np.linspace(max(low, values[0]), min(high, values[-1]), 300)
+        ax.fill_between(x, _smooth(draws, float(of["std"]), _worth(one), x), **_FILLED)
+        ax.plot(x, _bell(x, mean, std), color=DARK, linewidth=1, label="Laplace")
+        ax.plot(x, np.interp(x, values, density), color=PLAIN, linestyle="--", label="prior")
+        if np.isfinite(of["true"]):
+            ax.axvline(float(of["true"]), color=HIGH, label="truth")
+        _finish(ax, named(name, unit_of(name)), x)
+    _legend(found)
+    return found[0]
+
+
+def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[float, float]:
+    """Ends of an axis that holds a posterior, its Gaussian, and the truth unless that is far away."""
+    low, high = mode - 4 * std, mode + 4 * std
+    if len(draws):
+        ends = span(draws, np.ones(len(draws)))
+        low, high = min(low, ends[0]), max(high, ends[1])
+    wide = high - low
+    if low - 2 * wide < true < high + 2 * wide:
+        low, high = min(low, true - 0.1 * wide), max(high, true + 0.1 * wide)
+    return low, high
+
+
+def _worth(one: xr.Dataset) -> float:
+    """How many independent draws the draws are worth."""
+    return float(one["chain_effective"] if int(one["chains"]) else one["effective"])
+
+
+def _smooth(draws: FloatArray, std: float, worth: float, x: FloatArray) -> FloatArray:
+    """Density at x of draws that are worth so many independent ones, by normal kernels (Silverman's width)."""
+    width = max(std, 1e-300) * (4 / (3 * max(min(worth, len(draws)), 2.0))) ** 0.2
+    z = (x[:, None] - draws) / width
+    return np.asarray(np.exp(-(z**2) / 2).mean(axis=1) / (width * np.sqrt(2 * np.pi)))
+
+
+def _finish(ax: Axes, label: str, x: FloatArray) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(bottom=0)
+    ax.set_yticks([])
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.set_xlabel(label, fontsize="small")
+    ax.tick_params(labelsize="small")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _legend(found: list[Axes]) -> None:
+    handles, labels = found[0].get_legend_handles_labels()
+    found[0].figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
+
+
+def node_marginals(one: xr.Dataset) -> Axes:
+    """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, that which is known least."""
+    mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
+    before = one["stiffness_prior_std"].to_numpy()
+    centre = float(one["prior_mean"][0])
+    nodes = list(dict.fromkeys((int(mean.argmin()), int(mean.argmax()), int((std / before).argmax()))))
+    found = grid(len(nodes), columns=len(nodes), height=2.6, width=2.2)
+    for ax, node in zip(found, nodes, strict=True):
+        x = np.linspace(*_span(np.zeros(0), mean[node], std[node], float(one["stiffness_true"][node])), 300)
+        ax.fill_between(x, _bell(x, mean[node], std[node]), **_FILLED)
+        ax.plot(x, _bell(x, centre, before[node]), color=PLAIN, linestyle="--", label="prior")
+        if np.isfinite(one["stiffness_true"][node]):
+            ax.axvline(float(one["stiffness_true"][node]), color=HIGH, label="truth")
+        place = ", ".join(f"{x + 0.0:.3g}" for x in one["node_position"].to_numpy()[node].round(9))
+        _finish(ax, f"ln stiffness at\n({place}) m", x)
+        ax.xaxis.label.set_fontsize("x-small")
+    _legend(found)
+    return found[0]
+
+
+def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:
+    return np.asarray(np.exp(-(((x - mean) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi)))
+
+
+def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw errors of the parameters whose truth is known, over their standard deviations."""
+    names = [str(name) for name in one.parameter.values if np.isfinite(one["true"].sel(parameter=name))]
+    ax = ax or axes(height=1.2 + 0.35 * len(names))
+    known = one.sel(parameter=names)
+    z = ((known["mean"] - known["true"]) / known["std"]).to_numpy()
+    places = np.arange(len(names))[::-1]
+    ax.axvspan(-1.96, 1.96, color=DARK, alpha=0.08, linewidth=0)
+    ax.errorbar(z, places, xerr=1, fmt="o", color=CONTROLLED, capsize=4)
+    ax.axvline(0, color=HIGH, linewidth=1)
+    ax.set_yticks(places, names)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    farthest = max(3.0, float(np.abs(z).max()) + 1.3)
+    ax.set_xlim(-farthest, farthest)
+    ax.set_xlabel("(mean − truth)/standard deviation")
+    return ax
+
+
+def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw |r|² of each load case beside what is expected."""
+    ax = ax or axes()
+    names = [str(case) for case in one.case.values]
+    places = np.arange(len(names))
+    degrees = one["misfit_degrees"].to_numpy()
+    ax.bar(places, one["misfit"].to_numpy(), color=CONTROLLED, width=0.55)
+    ax.errorbar(places, degrees, yerr=2 * np.sqrt(2 * degrees), fmt="_", color=DARK, markersize=18, capsize=5)
+    ax.set_xticks(places, names)
+    ax.set_ylabel("|r|²")
+    return ax
+
+
+def coverage(one: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw errors at the nodes over their standard deviations."""
+    ax = ax or axes()
+    std = np.maximum(one["stiffness_std"].to_numpy(), 1e-12)
+    z = (one["stiffness_mean"].to_numpy() - one["stiffness_true"].to_numpy()) / std
+    edges = np.linspace(-5, 5, 41)
+    ax.hist(np.clip(z, -5, 5), bins=edges.tolist(), density=True, color=CONTROLLED, alpha=0.45)
+    x = np.linspace(-5, 5, 200)
+    ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=DARK)
+    for end in (-2, 2):
+        ax.axvline(end, color=PLAIN, linestyle="--", linewidth=1)
+    ax.set_xlabel(f"error/standard deviation; {100 * (np.abs(z) < 2).mean():.0f} % of the nodes within 2")
+    ax.set_ylabel("density")
+    return ax

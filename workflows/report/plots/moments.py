@@ -1,0 +1,182 @@
+"""Densities and moments of outputs against the number of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uq.estimators.moments import Coefficient, Moments, estimate, half_width, monomials
+from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, count_axis, quantity, text_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+Estimated = Literal["mean", "std"]
+FIRST_SHOWN = 8  # estimates from fewer samples say nothing
+MOST_BINS = 200
+
+
+def running_estimates(
+    dataset: xr.Dataset, output: str, counts: Sequence[int], *, controlled: bool = False
+) -> list[Moments]:
+    """Estimate the moments of an output from the first samples that have an answer, for several numbers of them.
+
+    Parameters
+    ----------
+    dataset
+        Results of a Monte Carlo study.
+    output
+        Name of the output.
+    counts
+        Numbers of samples, each at least 2.
+    controlled
+        With the tangent at the mean parameters as control variate (for the mean; the standard deviation is then not
+        to be used), or plain.
+    """
+    ok = dataset["ok"].to_numpy()
+    nominal = np.asarray(dataset["nominal"].sel(output=output).to_numpy())
+    deviations = dataset["values"].sel(output=output).to_numpy()[ok] - nominal
+    if not controlled:
+        sums = monomials(deviations, None).cumsum(axis=1)
+        return [estimate(sums[:, n - 1], n, nominal) for n in counts]
+    steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
+    sums = monomials(deviations, steps @ dataset["derivative"].sel(output=output).to_numpy()).cumsum(axis=1)
+    coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
+    unused = np.zeros_like(nominal)  # the variance of the control, which the mean does not depend on
+    return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
+
+
+def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the running mean of an output with its 95 % confidence band, plain and controlled."""
+    ax = ax or axes()
+    series = _series(dataset, output)
+    for label, colour, counts, mean, error in series:
+        half = half_width(dataset) * error
+        ax.fill_between(counts, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
+        ax.plot(counts, mean, color=colour, label=label)
+    count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
+    ax.set_ylabel(f"running mean of {quantity(dataset, output)}")
+    ax.legend(title="mean, 95 % band")
+    return ax
+
+
+def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the standard error of the mean of an output against the number of samples, plain and controlled."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    ax = ax or axes()
+    series = _series(dataset, output)
+    for label, colour, counts, _, error in series:
+        ax.plot(counts, error, color=colour, label=label)
+        ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
+    ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
+    count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
+    if any((error > 0).any() for *_, error in series):  # an output that does not vary has none
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
+        ax.yaxis.set_minor_locator(NullLocator())
+    ax.set_ylabel(f"standard error of {quantity(dataset, output)}")
+    ax.legend()
+    return ax
+
+
+def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
+    """Draw the density of an output, of its expansion or else of its samples, with its mean and quantiles."""
+    ax = ax or axes()
+    if "density" in dataset:
+        density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
+        ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
+    else:
+        values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
+        spread = np.ptp(values) > 1e-12 * np.abs(values).max()
+        ax.hist(
+            values, bins=_bins(values) if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white"
+        )
+    ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
+    for i, probability in enumerate(dataset["quantile"].to_numpy()):
+        place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
+        ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
+        ax.annotate(
+            f"{100 * probability:g} %",
+            (place, 1),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize="small",
+            color=HIGH,
+        )
+    ax.set_xlabel(quantity(dataset, output))
+    unit = str(dataset["unit"].sel(output=output).item())
+    ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
+    ax.legend()
+    return ax
+
+
+def _bins(values: NDArray[np.float64]) -> int:
+    """Return the number of bins of NumPy's "auto", but no more than can be drawn: one value far off makes millions."""
+    quarter, three_quarters = np.percentile(values, [25, 75])
+    width = 2 * (three_quarters - quarter) / len(values) ** (1 / 3)
+    fewest = np.log2(len(values)) + 1
+    return int(np.ceil(min(max(fewest, np.ptp(values) / width if width > 0 else 0), MOST_BINS)))
+
+
+def comparison(
+    datasets: Mapping[str, xr.Dataset], output: str, estimated: Estimated = "mean", ax: Axes | None = None
+) -> Axes:
+    """Draw an estimate of several studies, each with its 95 % confidence interval.
+
+    Parameters
+    ----------
+    datasets
+        Results by the name that stands beside them.
+    output
+        Name of the output; studies without an estimate of it are left out.
+    estimated
+        The mean or the standard deviation.
+    ax
+        Where to draw.
+    """
+    shown = {name: d.sel(output=output) for name, d in datasets.items() if "mean" in d and output in d.output.values}
+    ax = ax or axes(height=1.2 + 0.42 * len(shown))
+    places = np.arange(len(shown))[::-1]
+    values = [float(d[estimated]) for d in shown.values()]
+    errors = [half_width(d) * float(d[f"{estimated}_error"]) for d in shown.values()]
+    ax.errorbar(values, places, xerr=errors, fmt="o", color=CONTROLLED, ecolor=DARK, capsize=4)
+    ax.set_yticks(places, [text_of(name) for name in shown])
+    ax.set_ylim(-0.6, len(shown) - 0.4)
+    ax.locator_params(axis="x", nbins=6)
+    word = {"mean": "mean", "std": "standard deviation"}[estimated]
+    quantities = {quantity(datasets[name], output) for name in shown}
+    ax.set_xlabel(f"{word} of {' or '.join(sorted(quantities)) or output}, 95 % interval")
+    return ax
+
+
+def _series(
+    dataset: xr.Dataset, output: str
+) -> list[tuple[str, str, NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Label, colour, numbers of samples, running mean and its standard error of each estimator that the study has."""
+    if "running_mean" in dataset:
+        mean, error = (dataset[f"running_{name}"].sel(output=output).to_numpy() for name in ("mean", "mean_error"))
+        return [("scrambled Sobol' points", CONTROLLED, dataset["round"].to_numpy(), mean, error)]
+    n = int(dataset["ok"].sum())
+    counts = np.unique(np.geomspace(_first(n), n, 160).round().astype(np.int64))
+    kinds = [("plain", PLAIN, False)]
+    if "variance_ratio" in dataset:
+        kinds.append(("with sensitivity derivatives", CONTROLLED, True))
+    series = []
+    for label, colour, controlled in kinds:
+        running = running_estimates(dataset, output, counts.tolist(), controlled=controlled)
+        mean, error = np.array([m.mean for m in running]), np.array([m.mean_error for m in running])
+        series.append((label, colour, counts, mean, error))
+    return series
+
+
+def _first(n: int) -> int:
+    """Return the number of samples where running estimates of n samples begin."""
+    return max(2, min(FIRST_SHOWN, n // 2))

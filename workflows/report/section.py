@@ -1,0 +1,163 @@
+"""A part of a report: when it applies, and what stands in it. A report is all sections that apply, in their order.
+
+The program's own sections are in `workflows.report.sections`, one file each, named here in the order of the page.
+Others come from a module beside the study, which names them (``report = { sections = ["my_sections.Wear"] }``), or
+from an installed package, by an entry point ``section.NAME`` of the group ``tissuq``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from forward.registry import KindError, Kinds
+from forward.settings import nearest
+from forward.words import with_error, with_unit
+from workflows.report.words import solves
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from workflows.report.blocks import Block
+
+ROWS = 40  # parameters that a table lists
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a results directory holds.
+
+    Attributes
+    ----------
+    dataset
+        results.nc.
+    summary
+        summary.json.
+    study
+        The study, of whichever kind: a section that applies to the results knows which one.
+    """
+
+    dataset: xr.Dataset
+    summary: Mapping[str, Any]
+    study: Any
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the outputs."""
+        return [str(name) for name in self.dataset["output"].values]
+
+    @property
+    def parameters(self) -> list[str]:
+        """Names of the parameters."""
+        return [str(name) for name in self.dataset["parameter"].values]
+
+    def leading(self, effects: xr.DataArray) -> list[str]:
+        """Names of the parameters, or of those with the largest effects (parameter,) where there are many."""
+        if len(self.parameters) <= ROWS:
+            return self.parameters
+        largest = (-abs(effects)).argsort().to_numpy()[:ROWS]
+        return [str(name) for name in effects["parameter"].to_numpy()[largest]]
+
+    def estimate(self, output: str, name: str) -> str:
+        """One estimate of an output with its error and unit."""
+        of_output = self.dataset.sel(output=output)
+        text = with_error(float(of_output[name]), float(of_output[f"{name}_error"]))
+        return with_unit(text, self.unit(output))
+
+    def unit(self, output: str) -> str:
+        """SI unit of an output."""
+        return str(self.dataset["unit"].sel(output=output).item())
+
+    @property
+    def solves(self) -> int:
+        """Number of solves."""
+        return solves(self.summary)
+
+
+class Section(ABC):
+    """A part of a report.
+
+    Attributes
+    ----------
+    before
+        Which of the program's own sections one from outside stands before.
+    """
+
+    before: ClassVar[str] = "failures"
+
+    @abstractmethod
+    def applies(self, results: Results) -> bool:
+        """Whether there is something to say of these results."""
+
+    @abstractmethod
+    def content(self, results: Results) -> Iterator[Block]:
+        """Headings, sentences, tables and pictures, from top to bottom."""
+
+
+_HERE = "workflows.report.sections"
+SECTIONS = Kinds(
+    "section",
+    {
+        "header": f"{_HERE}.header:Header",
+        "findings": f"{_HERE}.findings:Findings",
+        "synthetic-data": f"{_HERE}.synthetic_data:SyntheticData",
+        "model": f"{_HERE}.model:Model",
+        "nominal": f"{_HERE}.nominal:Nominal",
+        "error-against-cost": f"{_HERE}.error_against_cost:ErrorAgainstCost",
+        "moments": f"{_HERE}.moments:Moments",
+        "total-errors": f"{_HERE}.total_errors:TotalErrors",
+        "quantiles": f"{_HERE}.quantiles:Quantiles",
+        "meshes": f"{_HERE}.meshes:Meshes",
+        "expansion": f"{_HERE}.expansion:Expansion",
+        "levels": f"{_HERE}.levels:Levels",
+        "sobol": f"{_HERE}.sobol:SobolIndices",
+        "sobol-field": f"{_HERE}.sobol_field:SobolField",
+        "derivative-based": f"{_HERE}.derivative_based:DerivativeBased",
+        "distribution": f"{_HERE}.distribution:Distribution",
+        "body": f"{_HERE}.body:Body",
+        "local-sensitivities": f"{_HERE}.local_sensitivities:LocalSensitivities",
+        "evidences": f"{_HERE}.evidences:Evidences",
+        "finer-meshes": f"{_HERE}.finer_meshes:FinerMeshes",
+        "dependence": f"{_HERE}.dependence:Dependence",
+        "criticism": f"{_HERE}.criticism:Criticism",
+        "held-out": f"{_HERE}.held_out:HeldOut",
+        "curves": f"{_HERE}.curves:Curves",
+        "averages": f"{_HERE}.averages:Averages",
+        "constants": f"{_HERE}.constants:Constants",
+        "batch": f"{_HERE}.batch:Batch",
+        "posterior": f"{_HERE}.posterior:Posterior",
+        "priors": f"{_HERE}.priors:Priors",
+        "failures": f"{_HERE}.failures:Failures",
+        "run-time": f"{_HERE}.run_time:RunTime",
+        "provenance": f"{_HERE}.provenance:Provenance",
+    },
+    Section,
+)
+
+
+def sections(more: Sequence[str] = ()) -> list[tuple[str, Section]]:
+    """Return all sections by name, in the order of the page.
+
+    Parameters
+    ----------
+    more
+        Names of those that a study asks for: dotted paths to modules beside it.
+
+    Raises
+    ------
+    KindError
+        If one of them is not there, or is to stand before one that is not.
+    """
+    own: dict[str, Section] = {name: SECTIONS[name]() for name in SECTIONS.own}
+    others: dict[str, Section] = {name: SECTIONS[name]() for name in (*SECTIONS.names, *more) if name not in own}
+    for name, section in others.items():
+        if section.before not in own:
+            message = f"the section '{name}' is to stand before an unknown one; {nearest(section.before, tuple(own))}"
+            raise KindError(message)
+    placed: list[tuple[str, Section]] = []
+    for name, section in own.items():
+        placed += [(label, other) for label, other in others.items() if other.before == name]
+        placed.append((name, section))
+    return placed

@@ -1,0 +1,60 @@
+"""Predictions averaged over the models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.words import number, with_unit
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+UNITS = {"stress": "Pa", "displacement": "m"}
+
+
+class Averages(Section):
+    """Predictions averaged over the models."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether models were compared."""
+        return "probability" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Averaged predictions")
+        yield Text(
+            "At the far end of each test, or where most was measured to move, without the errors of measurement."
+        )
+        yield averages(results.dataset)
+
+
+def averages(dataset: xr.Dataset) -> Table:
+    """Predictions averaged over the models at the end of each test, with both parts of their variance."""
+    rows = []
+    quantity = str(dataset.attrs["quantity"])
+    tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
+    for group, test in dict.fromkeys(tests):
+        members = [i for i, pair in enumerate(tests) if pair == (group, test)]
+        at = dataset["output_at"].values[members]
+        # Data of displacements have numbers only: there, what moved most.
+        far = np.abs(at - at[0]) if quantity == "stress" else np.abs(dataset["measured"].values[members])
+        one = dataset.isel(output=members[int(np.argmax(far))])
+        stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))
+        rows.append(
+            (
+                str(group),
+                str(test),
+                number(float(one["output_at"])),
+                with_unit(number(float(one["measured"])), UNITS[quantity]),
+                with_unit(number(float(one["average_mean"])), UNITS[quantity]),
+                *(with_unit(number(std, 3), UNITS[quantity]) for std in stds),
+            )
+        )
+    place = "at" if quantity == "stress" else "datum"
+    head = ("group", "test", place, "measured", "averaged prediction", "std within models", "std between models")
+    return Table(head, rows, text=frozenset({0, 1}))

@@ -1,0 +1,63 @@
+"""All data sets that were inverted, a row each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.words import number, with_error
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+from workflows.report.words import named, unit_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
+
+
+class Batch(Section):
+    """All data sets that were inverted, a row each."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether several data sets were inverted."""
+        return "alone_eigenvalue" in results.dataset and results.dataset.sizes["data_set"] > 1
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("All data sets")
+        yield Text(
+            "± is one posterior standard deviation; the same, with more digits, is in batch.csv. The first that could "
+            "be inverted follow one by one."
+        )
+        yield batch(results.dataset)
+
+
+def batch(dataset: xr.Dataset) -> Table:
+    """A row for each data set."""
+    names = [str(name) for name in dataset.parameter.values]
+    rows = []
+    for label in dataset.data_set.values:
+        one = dataset.sel(data_set=label)
+        if not bool(one["ok"]):
+            rows.append((str(label), "", "failed", *[""] * (len(names) + 3)))
+            continue
+        values = [
+            with_error(float(one["mean"].sel(parameter=name)), float(one["std"].sel(parameter=name))) for name in names
+        ]
+        rows.append(
+            (
+                str(label),
+                f"{int(np.isfinite(one['measured']).sum()):,}",
+                TRUSTED[int(one["trust"])],
+                *values,
+                number(float(one["determined"]), 3),
+                number(float(one["residual_probability"]), 2),
+                number(float(one["log_evidence"]), 6),
+            )
+        )
+    units = [named(name, unit_of(name)) for name in names]
+    head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
+    return Table(head, rows, text=frozenset({0, 2}))

@@ -1,0 +1,75 @@
+"""Sensitivity from derivatives: bounds on total indices, active subspaces."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from forward.words import NONE, number, with_error
+from workflows.report import plots
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.section import Results, Section
+
+
+class DerivativeBased(Section):
+    """Bounds on total indices, and active subspaces."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are some."""
+        return "total_bound" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """Tables and pictures of each output."""
+        dataset = results.dataset
+        yield Heading("Sensitivity from derivatives")
+        yield Text(
+            "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
+            "distribution over the variance of the output. The active subspace is made of the directions along which "
+            "the output changes most, in parameters over their standard deviations."
+        )
+        for output in results.outputs:
+            yield Heading(output, level=3)
+            yield bounds(results, output)
+            yield active_subspace(results, output)
+            summary = f"{output} against its leading direction: a curve, if that direction is all that matters."
+            spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
+            yield Pictures(
+                [
+                    Picture.drawn(plots.active_summary(dataset, output), summary),
+                    Picture.drawn(plots.spectrum(dataset, output), spectrum),
+                ]
+            )
+
+
+def bounds(results: Results, output: str) -> Table:
+    """Derivative-based measures of an output and the bounds on total indices, beside local and total indices."""
+    of_output = results.dataset.sel(output=output)
+    rows = []
+    for name in results.parameters:
+        of = of_output.sel(parameter=name)
+        squared = with_error(float(of["dgsm"]), float(of["dgsm_error"]))
+        total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
+        bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
+        rows.append((name, number(float(of["local_share"])), squared, number(float(of["poincare"])), total, bound))
+    head = (
+        "parameter",
+        "share of the local variance",
+        "mean squared derivative",
+        "Poincaré constant",
+        "total index (expansion)",
+        "is at most",
+    )
+    return Table(head, rows)
+
+
+def active_subspace(results: Results, output: str) -> Table:
+    """Eigenvalues of the mean of ∇ψ∇ψᵀ of an output, and the leading direction."""
+    of_output = results.dataset.sel(output=output)
+    values = [of_output[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")]
+    directions = zip(of_output["active_direction"], of_output["active_direction_error"], strict=True)
+    rows = [
+        (name, with_error(float(component), float(error)), str(i), number(value), f"{number(lower)} to {number(upper)}")
+        for i, (name, (component, error), value, lower, upper) in enumerate(
+            zip(results.parameters, directions, *values, strict=True), start=1
+        )
+    ]
+    return Table(("parameter", "leading direction", "number", "eigenvalue", "95 % range"), rows)

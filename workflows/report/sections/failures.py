@@ -1,0 +1,51 @@
+"""Solves that failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from forward.words import number, with_unit
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+from workflows.report.words import counted, unit_of
+
+
+class Failures(Section):
+    """Which solves failed, and why."""
+
+    def applies(self, results: Results) -> bool:
+        """Return whether it does: always."""
+        return True
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """How many failed, at which parameters, and why."""
+        failed, listed = results.summary["failed"], len(results.summary["failures"])
+        yield Heading("Failed solves")
+        if not listed:
+            yield Text("none failed")
+            return
+        line = f"{failed:,} of {counted(results.solves)} failed."
+        yield Text(line if listed == failed else f"{line} These are the first {listed}; evaluations.h5 holds all.")
+        yield failures(results)
+
+
+def failures(results: Results) -> Table:
+    """The solves that failed: the model where there are several, parameters and reason.
+
+    The coefficients of random fields are left out.
+    """
+    found = results.summary["failures"]
+    every = dict.fromkeys(name for failure in found for name in failure["parameters"])
+    names = [name for name in every if not name.startswith("fields.")]
+    models = any("model" in failure for failure in found)
+    rows = [
+        (
+            *([failure.get("model", "")] if models else []),
+            *(with_unit(number(failure["parameters"].get(name), 6), unit_of(name)) for name in names),
+            failure["reason"],
+        )
+        for failure in found
+    ]
+    head = (*(["model"] if models else []), *names, "reason")
+    last = len(head) - 1
+    return Table(head, rows, text=frozenset({last, *([0] if models else [])}), long=frozenset({last}))

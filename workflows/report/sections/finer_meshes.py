@@ -1,0 +1,48 @@
+"""What a finer mesh of each candidate moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.words import NONE
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class FinerMeshes(Section):
+    """What a finer mesh of each candidate moves."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether meshes were looked at."""
+        return "probability" in results.dataset and "mesh_checked" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("What a finer mesh moves", level=3)
+        yield Text(
+            "One solve of each candidate, at its mode on a finer mesh with thinner cells at the faces that are held, "
+            "and what follows from it by the model that is linear there."
+        )
+        yield meshes(results.dataset)
+
+
+def meshes(dataset: xr.Dataset) -> Table:
+    """What a finer mesh does to data, evidence and unknowns of each candidate."""
+    rows = []
+    for model in dataset.model.values:
+        one = dataset.sel(model=model).isel(group=0)
+        if not bool(one["mesh_checked"]):
+            rows.append((str(model), NONE, NONE, NONE, f"not checked: {one['mesh_why'].item()}"))
+            continue
+        error, shift = one["mesh_error"].to_numpy(), one["mesh_shift"].dropna("parameter")
+        listed = [f"{name} {float(shift.sel(parameter=name)):+.2g}" for name in shift.parameter.values]
+        size, most = (f"{value:.2g}" for value in (float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(abs(error)))))
+        rows.append((str(model), f"{float(one['mesh_log_evidence']):+.3g}", size, most, ", ".join(listed)))
+    head = ("model", "ln Z", "data, over the errors", "at most", "unknowns, in deviations of the posterior")
+    return Table(head, rows, text=frozenset({0, 4}), long=frozenset({4}))

@@ -1,0 +1,73 @@
+"""What parameters change to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from forward.words import number, per, with_unit
+from workflows.report import plots
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.section import Results, Section
+from workflows.report.words import unit_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class LocalSensitivities(Section):
+    """What parameters change to first order."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there are derivatives."""
+        return "derivative" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """Tables of each output and of the displacement field, and tornado charts."""
+        dataset = results.dataset
+        yield Heading("Local sensitivities")
+        yield Text("Derivatives at the mean parameters: what a parameter changes to first order.")
+        for output in results.outputs:
+            yield Heading(output, level=3)
+            yield sensitivities(results, output)
+        if "field_derivative_rms" in dataset:
+            yield Heading("Displacement field", level=3)
+            yield Text(
+                "Root mean square of the derivative of the displacement over the body: its L² norm over the root of "
+                "the volume."
+            )
+            yield field_norms(results)
+        captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.outputs}
+        yield Pictures([Picture.drawn(plots.tornado(dataset, o), caption) for o, caption in captions.items()])
+
+
+def sensitivities(results: Results, output: str) -> Table:
+    """Derivatives of an output, in physical units and times the spread of the parameter."""
+    unit, slopes = results.unit(output), results.dataset.sel(output=output)
+    rows = []
+    for name in results.leading(slopes["derivative_per_std"]):
+        of_parameter = slopes.sel(parameter=name)
+        slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
+        scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
+        rows.append((name, slope, *(with_unit(number(value), unit) for value in scaled)))
+    return Table(("parameter", "derivative", "× standard deviation", "× range"), rows)
+
+
+def field_norms(results: Results) -> Table:
+    """Root mean squares over the body of the derivatives of the displacement field."""
+    dataset = results.dataset
+    rows = []
+    for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
+        of_parameter = dataset.sel(parameter=name)
+        size, std, wide = (
+            float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
+        )
+        slope = with_unit(number(size, 5), per("m", unit_of(name)))
+        rows.append((name, slope, with_unit(number(size * std), "m"), with_unit(number(size * wide), "m")))
+    return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
+
+
+def largest_of(dataset: xr.Dataset) -> str:
+    """Say that bars are not drawn of all parameters."""
+    count = dataset.sizes["parameter"]
+    return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""

@@ -1,0 +1,45 @@
+"""What was believed before the data."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from forward.words import settings
+from workflows.report.blocks import Block, Heading, Table
+from workflows.report.section import Results, Section
+from workflows.report.words import unit_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Priors(Section):
+    """What was believed before the data."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether data were inverted."""
+        return "alone_eigenvalue" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Priors")
+        yield priors(results.dataset)
+
+
+def priors(dataset: xr.Dataset) -> Table:
+    """What was believed before."""
+    config = tomllib.loads(dataset.attrs["config"])
+    rows = [
+        (path, f"{block['kind']}: {settings(block, 'kind')}", unit_of(path))
+        for path, block in config.get("parameters", {}).items()
+    ]
+    rows += [
+        (f"fields.{block.get('name') or block['of']}", f"log-normal field: {settings(block, 'of', 'name')}", "1")
+        for block in config["model"].get("fields", ())
+    ]
+    noise = config["method"].get("noise")
+    if noise is not None:
+        rows.append(("factor on all sigma", f"{noise['kind']}: {settings(noise, 'kind')}", "1"))
+    return Table(("unknown", "prior", "unit"), rows, text=frozenset(range(3)))

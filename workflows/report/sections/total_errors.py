@@ -1,0 +1,35 @@
+"""Errors of estimates by where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from forward.words import number, with_unit
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+
+
+class TotalErrors(Section):
+    """Errors of means and standard deviations by where they come from."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether that of the mesh is known."""
+        return "total_error" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One table."""
+        yield Heading("Total errors", level=3)
+        yield Text("That of the mesh is estimated from the differences between meshes.")
+        yield total_errors(results)
+
+
+def total_errors(results: Results) -> Table:
+    """Errors of means and standard deviations by where they come from."""
+    rows = []
+    for output in results.outputs:
+        of_output = results.dataset.sel(output=output)
+        for word, first in (("mean", ""), ("standard deviation", "std_")):
+            names = (f"{first or 'mean_'}error", f"{first}bias_error", f"{first}total_error")
+            errors = [with_unit(number(float(of_output[name]), 2), results.unit(output)) for name in names]
+            rows.append((f"{word} of {output}", *errors))
+    return Table(("estimate", "sampling", "mesh", "total"), rows)
