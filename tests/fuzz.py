@@ -143,3 +143,67 @@ def mutations(documents, count, seed=0):
     for _ in range(count):
         name = chance.choice(names)
         yield name, *mutated(documents[name], chance)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+CELLS = ["", " ", "nan", "inf", "1e400", "-1e308", "0", "-1", "x", "1,5", '"', "\x00", "é漢🎈", "\u202e", "1_000"]
+CELLS += ["0x10", "x" * 5000, "1e-320", "\ufeff", "#", "{}%s"]
+
+
+def damaged_table(text, chance):
+    """Bytes of a table of comma-separated values with one to three mistakes, and what was done."""
+    lines, done = text.splitlines(), []
+    for _ in range(chance.choice([1, 1, 2, 3])):
+        body = [i for i, line in enumerate(lines) if not line.startswith("#")]
+        if not body:
+            break
+        i, kind = (
+            chance.choice(body),
+            chance.choice(["cell", "cell", "head", "cut", "twice", "sign", "end", "line", "column"]),
+        )
+        done.append((kind, i))
+        cells = lines[i].split(",")
+        match kind:
+            case "cell":
+                cells[chance.randrange(len(cells))] = chance.choice(CELLS)
+                lines[i] = ",".join(cells)
+            case "head":
+                head = lines[body[0]].split(",")
+                head[chance.randrange(len(head))] = chance.choice([*CELLS, *head])
+                lines[body[0]] = ",".join(head)
+            case "cut":
+                lines[i] = ",".join(cells[: chance.randrange(len(cells))])
+            case "twice":
+                lines.insert(i, lines[i])
+            case "sign":
+                lines = [line.replace(",", chance.choice([";", "\t", " ", ",,"])) for line in lines]
+            case "end":
+                whole = "\n".join(lines)
+                lines = whole[: chance.randrange(len(whole) + 1)].splitlines()
+            case "line":
+                lines.insert(chance.randrange(len(lines) + 1), chance.choice([*CELLS, "# truth.x = ", ",,,,,,"]))
+            case "column":
+                k = chance.randrange(len(cells))
+                lines = [",".join(c for j, c in enumerate(line.split(",")) if j != k) for line in lines]
+    return "\n".join(lines).encode(), done
+
+
+def damaged_bytes(whole, chance):
+    """Bytes with some that are cut off, left out, put in or flipped, or with another number."""
+    found = bytearray(whole)
+    i, kind = chance.randrange(len(found)), chance.choice(["cut", "flip", "number", "drop", "insert"])
+    match kind:
+        case "cut":
+            del found[i:]
+        case "flip":
+            found[i] ^= 1 << chance.randrange(8)
+        case "number":
+            digits = [k for k, byte in enumerate(found) if 48 <= byte <= 57] or [i]
+            i = chance.choice(digits)
+            found[i : i + 1] = chance.choice([b"9", b"-1", b"99999", b"nan", b"1e309", b"x"])
+        case "drop":
+            del found[i : i + chance.randrange(1, 200)]
+        case "insert":
+            found[i:i] = chance.randbytes(chance.randrange(1, 40))
+    return bytes(found), (kind, i)

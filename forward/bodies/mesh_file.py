@@ -7,6 +7,7 @@ the file is not; a hash says whether it is the same file.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -24,7 +25,7 @@ from pydantic import Field, model_validator
 
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
-from forward.settings import Settings, nearest
+from forward.settings import Settings, nearest, one_line
 
 if TYPE_CHECKING:
     import meshio
@@ -340,11 +341,12 @@ def _digest(file: str) -> str:
         whole = Path(file).read_bytes()
         if file.endswith(".xdmf"):
             others = sorted(set(re.findall(rb"([^\s<>\"]+\.h5):", whole)))
-            whole += b"".join(path.read_bytes() for path in (Path(file).parent / other.decode() for other in others))
+            whole += b"".join(
+                path.read_bytes() for path in (Path(file).parent / os.fsdecode(other) for other in others)
+            )
         return hashlib.sha256(whole).hexdigest()
     except OSError as error:
-        message = f"file: {error.filename or file}: cannot be read: {error.strerror}"
-        raise ModelError(message) from None
+        raise ModelError(one_line(f"file: {error.filename or file}: cannot be read: {error.strerror}")) from None
 
 
 @lru_cache(maxsize=1)
@@ -353,8 +355,7 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     import meshio
 
     def refuse(problem: str) -> NoReturn:
-        message = f"file: {file}: {problem}"
-        raise ModelError(message)
+        raise ModelError(one_line(f"file: {file}: {problem}"))
 
     printed = StringIO()
     try:
@@ -380,8 +381,8 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     numbers = _numbers(mesh, tags, refuse)
     words = _words(mesh, file, names, numbers, refuse)
     _check_groups(mesh, refuse)
-    cells, region_numbers = _gathered(mesh, numbers, next(k for k, v in _MESHIO.items() if v == cell))
-    facets, facet_numbers = _gathered(mesh, numbers, _SURFACES[cell])
+    cells, region_numbers = _gathered(mesh, numbers, next(k for k, v in _MESHIO.items() if v == cell), refuse)
+    facets, facet_numbers = _gathered(mesh, numbers, _SURFACES[cell], refuse)
     used, cells = np.unique(cells, return_inverse=True)
     cells = cells.reshape(-1, len(_CORNERS) if cell == "hexahedron" else 4)
     points = unit * np.asarray(mesh.points, dtype=float)[used]
@@ -475,13 +476,16 @@ def _named_groups(mesh: meshio.Mesh) -> list[tuple[str, Any]]:
     return [(name, values) for name, values in mesh.field_data.items() if np.size(values) == 2]
 
 
-def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str) -> tuple[IntArray, IntArray]:
+def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str, refuse: Any) -> tuple[IntArray, IntArray]:
     """Put the cells of a kind together, with their numbers."""
     parts = [(block.data, n) for block, n in zip(mesh.cells, numbers, strict=True) if block.type == kind]
     if not parts:
         return np.zeros((0, 4 if kind == "quad" else 3), dtype=np.int64), np.zeros(0, dtype=np.int64)
-    cells, found = zip(*parts, strict=True)
-    return np.concatenate(cells).astype(np.int64), np.concatenate(found)
+    blocks, found = zip(*parts, strict=True)
+    cells = np.concatenate(blocks).astype(np.int64)
+    if cells.size and not 0 <= cells.min() <= cells.max() < len(mesh.points):
+        refuse(f"has cells with corners that are none of its {len(mesh.points)} points")
+    return cells, np.concatenate(found)
 
 
 def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.settings import nearest
+from forward.settings import nearest, one_line
 
 TABLES = (".csv", ".txt")
 MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
@@ -413,7 +413,7 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
             mesh = meshio.read(path)
     except (Exception, SystemExit) as error:
         reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
-        raise DataError(f"{path.name}: cannot be read as {path.suffix}: {' '.join(reason.split())}") from None
+        raise DataError(one_line(f"{path.name}: cannot be read as {path.suffix}: {' '.join(reason.split())}")) from None
     fields = {case: f"displacement_{case}" for case in cases}
     if len(cases) == 1 and fields[cases[0]] not in mesh.point_data:
         fields[cases[0]] = "displacement"

@@ -25,6 +25,7 @@ from uq.inputs.quadrature import Cut, panels
 PositiveFloat = Annotated[float, Gt(0)]
 RARE = 1e-4  # probability of what is beyond the range of a distribution with a tail
 TAIL = 1e-16  # nearest to 0 and 1 that a probability is taken to a quantile
+EXTREME = 1e60  # fourth powers of numbers beyond it, or below its inverse, leave the range of doubles
 NARROW = 1e-10  # standard deviation over the mean below which rounding of the parameter shows in results
 WIDE = 10.0  # ratio of the quantiles at 10⁻⁴ and 1 − 10⁻⁴ from which polynomials are of the logarithm
 
@@ -161,6 +162,14 @@ class _Distribution(Settings):
     def _sound(self) -> _Distribution:
         self.check_numbers()
         mean, std = self.moments
+        if np.isfinite(mean) and not (
+            max(abs(mean), std) < EXTREME and std > 1 / EXTREME and std < EXTREME * abs(mean or std)
+        ):
+            message = (
+                f"mean {mean:.6g} and standard deviation {std:.3g}: too large, small or wide for double precision, "
+                f"expected numbers between {1 / EXTREME:g} and {EXTREME:g} in units of their own"
+            )
+            raise ValueError(message)
         if not (np.isfinite(mean) and np.isfinite(std) and std > NARROW * abs(mean)):
             message = (
                 f"mean {mean:.6g} and standard deviation {std:.3g}: too narrow for double precision, expected "

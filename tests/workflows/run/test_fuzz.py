@@ -5,10 +5,15 @@ import re
 import tomllib
 from pathlib import Path
 
+import meshio
 import pytest
 import tomli_w
+from pydantic import ValidationError
 
-from tests.fuzz import mutations
+from forward.bodies.mesh_file import OwnMesh
+from inverse.data.observations import DataError, read
+from tests.forward.bodies.test_mesh_file import box, numbered
+from tests.fuzz import damaged_bytes, damaged_table, mutations
 from workflows.__main__ import main
 from workflows.config.study import StudyError, parse
 from workflows.run import run as study_runs
@@ -152,3 +157,65 @@ def test_bytes_that_are_no_study(tmp_path, capsys):
         path.write_bytes(bytes(damaged))
         assert main(["check", str(path)]) == 2
         assert_said_plainly(2, capsys.readouterr().err, bytes(damaged))
+
+
+@pytest.mark.parametrize("name", ["inclusion", "brain"])
+def test_tables_with_mistakes(tmp_path, capsys, name):
+    study = tmp_path / "study.toml"
+    study.write_bytes((CONFIGS / f"{name}.toml").read_bytes())
+    table = tmp_path / "data" / f"{name}.csv"
+    table.parent.mkdir()
+    lines = (CONFIGS / "data" / f"{name}.csv").read_text().splitlines()
+    head = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    text = "\n".join([*lines[: head + 1], *lines[head + 1 :: 20]])
+    chance = random.Random(1)
+    for _ in range(25):
+        data, done = damaged_table(text, chance)
+        table.write_bytes(data)
+        code, said = main(["check", str(study)]), capsys.readouterr().err
+        if code:
+            assert_said_plainly(code, said, (name, done))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("name", "how"), [("a.vtu", {"binary": False}), ("a.vtu", {}), ("a.xdmf", {}), ("a.vtk", {})])
+def test_meshes_with_mistakes(tmp_path, name, how):
+    """As bodies, and as files of displacements."""
+    whole = numbered(box())
+    whole.point_data["displacement"] = whole.points / 100
+    meshio.write(tmp_path / name, whole, **how)
+    path = tmp_path / name
+    good, chance = path.read_bytes(), random.Random(2)
+    for _ in range(60):
+        data, done = damaged_bytes(good, chance)
+        path.write_bytes(data)
+        said = []
+        try:
+            OwnMesh(file=str(path))
+        except ValidationError as error:
+            said += [str(mistake["msg"]) for mistake in error.errors()]
+        try:
+            read(path, ("one",))
+        except DataError as error:
+            said += error.args
+        for line in said:
+            assert line.isprintable(), (line, done)
+            assert len(line) <= LONGEST, (line, done)
+
+
+@pytest.mark.parametrize("corner", [-1, 10**6])
+def test_corners_that_are_no_points(tmp_path, corner):
+    """Those below zero once counted from the end, and were another mesh."""
+    whole = numbered(box())
+    whole.cells[0].data[0, 0] = corner
+    meshio.write(tmp_path / "a.vtk", whole)
+    with pytest.raises(ValidationError, match="corners that are none of its"):
+        OwnMesh(file=str(tmp_path / "a.vtk"))
+
+
+@pytest.mark.parametrize("numbers", ["mean = 1e300, std = 1", "mean = 1, std = 1e100", "mean = 1e-200, std = 1e-201"])
+@pytest.mark.parametrize("kind", ["normal", "log-normal"])
+def test_numbers_whose_powers_are_none(capsys, kind, numbers):
+    given = f"parameters.density={{ kind = '{kind}', {numbers} }}"
+    code = main(["check", str(CONFIGS / "beam.toml"), "--set", given])
+    assert_said_plainly(code, capsys.readouterr().err, given)
