@@ -38,12 +38,13 @@ import sys, time
 import numpy as np
 from mpi4py import MPI
 from forward.model import FunctionModel
-from uq.evaluation.ensemble import Ensemble, _counter
+from uq.evaluation.ensemble import Ensemble
+from uq.evaluation.turns import counter as shared_counter
 from uq.evaluation.evaluate import Request
 
 mode, world = sys.argv[1], MPI.COMM_WORLD
 if mode == "counter":
-    with _counter(world) as counter:
+    with shared_counter(world) as counter:
         world.barrier()
         begin = time.perf_counter()
         if world.rank == world.size - 1:

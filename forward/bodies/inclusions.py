@@ -187,3 +187,12 @@ def derived(
         columns = np.broadcast_to(factor, (len(points), len(places))).T
         found |= {f"stiffness.{i}": np.array(column) for i, column in enumerate(columns)}
     return found
+
+
+def log_factor(
+    inclusions: Sequence[Sphere | Ellipsoid], parameters: Sequence[str], points: FloatArray, places: FloatArray
+) -> FloatArray:
+    """Return ln of what inclusions multiply the stiffness by (n, k) at places (k, 3); arguments as of `derived`."""
+    found = derived(inclusions, parameters, points, places)
+    columns = [values for path, values in found.items() if path.startswith("stiffness.")]
+    return np.log(np.column_stack(columns)) if inclusions else np.zeros((len(points), len(places)))

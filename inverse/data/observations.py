@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.settings import nearest, one_line
+from inverse.data.neighbours import Neighbours, neighbours
 
 TABLES = (".csv", ".txt")
 MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
@@ -186,6 +187,15 @@ class Components:
     cases: NDArray[np.int64]
     values: FloatArray
     sigma: FloatArray
+
+    @property
+    def described(self) -> dict[str, FloatArray]:
+        """Places and axes, by their names in results."""
+        return {"place": self.places, "datum_axis": self.axes.astype(float)}
+
+    def neighbours(self) -> Neighbours:
+        """Return pairs of data of the same component and load case that stand beside each other."""
+        return neighbours(self.places, 3 * self.cases + self.axes)
 
 
 def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:

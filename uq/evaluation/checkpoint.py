@@ -24,8 +24,9 @@ import numpy as np
 from forward.machine import write_whole
 from forward.model import WORK, ModelError, Stability
 from uq.evaluation.evaluate import Evaluations, Failure
+from uq.evaluation.hdf5 import creation, image, in_memory
 
-_HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
+HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
 
 
 class DamagedError(OSError):
@@ -43,6 +44,13 @@ class Code(Protocol):
 
     def objection(self, note: str) -> str | None:
         """Say why a block with a note is no longer valid, if it is not."""
+
+
+class Block(Protocol):
+    """A finished piece of work that is not evaluations."""
+
+    def image(self, note: str) -> bytes:
+        """Return the bytes of an HDF5 file, `HEAD` of which are left free, with an attribute `note`."""
 
 
 class Checkpoint:
@@ -76,7 +84,7 @@ class Checkpoint:
         ModelError
             If a file of the user's from which it follows has changed.
         """
-        path = self._path(key)
+        path = self.path(key)
         if not path.exists():
             return False
         try:
@@ -93,26 +101,29 @@ class Checkpoint:
             raise ModelError(message)
         return True
 
-    def save(self, key: str, block: Evaluations) -> None:
+    def save(self, key: str, block: Evaluations | Block) -> None:
         """Write a finished block and rename it into place."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        _write(self._path(key), {"/": block}, key, "" if self._code is None else self._code.note())
+        note = "" if self._code is None else self._code.note()
+        body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
+        _write(self.path(key), body, key)
 
     def load(self, key: str) -> Evaluations:
-        """Read a finished block, as `has` has found it."""
-        return _read(self._path(key), "/")
+        """Read evaluations, as `has` has found them."""
+        return read(self.path(key))
 
     def drop(self, keys: Iterable[str]) -> None:
         """Remove blocks that are no longer needed, since what follows from them is kept."""
         for key in keys:
-            self._path(key).unlink(missing_ok=True)
+            self.path(key).unlink(missing_ok=True)
 
-    def _path(self, key: str) -> Path:
+    def path(self, key: str) -> Path:
+        """Return the file of a block."""
         return self._folder / f"{key}.h5"
 
     def consolidate(self, evaluations: Mapping[str, Evaluations]) -> None:
         """Write all evaluations as `evaluations.h5`, each under its name; the blocks stay until `clear`."""
-        _write(self._directory / "evaluations.h5", evaluations)
+        _write(self._directory / "evaluations.h5", _image(evaluations))
 
     def clear(self) -> None:
         """Remove the files of the blocks: the study is finished."""
@@ -139,51 +150,37 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(repr(value).encode())
 
 
-def _write(
-    path: Path,
-    blocks: Mapping[str, Evaluations],
-    key: str = "",
-    note: str = "",
-) -> None:
-    creation = h5py.h5p.create(h5py.h5p.FILE_CREATE)
-    creation.set_userblock(_HEAD)
-    with in_memory(creation) as file:
+def _image(blocks: Mapping[str, Evaluations], note: str = "") -> bytes:
+    """Return the bytes of a file of evaluations, each in a group of this name, without the head."""
+    with in_memory(creation(HEAD)) as file:
         for name, block in blocks.items():
             group = file.require_group(name)
-            group["points"] = block.points
-            group["outputs"] = block.outputs
-            group["seconds"] = block.seconds
-            group["work"] = block.work
-            group["work"].attrs["columns"] = list(WORK)
-            group["residuals"] = block.residuals
-            group["converged"] = block.converged
-            group["stability"] = block.stability
-            group["stability"].attrs["values"] = [known.name.lower().replace("_", " ") for known in Stability]
-            group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
-            if block.tangents is not None:
-                group["tangents"] = block.tangents
-            if block.fields.size:
-                group["fields"] = block.fields
+            write(group, block)
             group.attrs["note"] = note
-        body = image(file)  # without the head
-    write_whole(path, _checksum(BytesIO(body), key).encode().ljust(_HEAD, b"\0") + body)
+        return image(file)
 
 
-def in_memory(creation: Any = None) -> h5py.File:
-    """Return a new HDF5 file in memory: one on disk that cannot be written to the end kills its process.
+def write(group: h5py.Group, block: Evaluations) -> None:
+    """Write evaluations into a group of a file."""
+    group["points"] = block.points
+    group["outputs"] = block.outputs
+    group["seconds"] = block.seconds
+    group["work"] = block.work
+    group["work"].attrs["columns"] = list(WORK)
+    group["residuals"] = block.residuals
+    group["converged"] = block.converged
+    group["stability"] = block.stability
+    group["stability"].attrs["values"] = [known.name.lower().replace("_", " ") for known in Stability]
+    group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
+    if block.tangents is not None:
+        group["tangents"] = block.tangents
+    if block.fields.size:
+        group["fields"] = block.fields
 
-    `creation` is the list of properties that the file is created with.
-    """
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
-    access.set_fapl_core(2**20, backing_store=False)
-    return h5py.File(h5py.h5f.create(b"memory", fcpl=creation, fapl=access))
 
-
-def image(file: h5py.File) -> bytes:
-    """Return the bytes of a file in memory."""
-    file.flush()
-    return bytes(file.id.get_file_image())
+def _write(path: Path, body: bytes, key: str = "") -> None:
+    """Write a file, with its checksum before it, and rename it into place."""
+    write_whole(path, _checksum(BytesIO(body), key).encode().ljust(HEAD, b"\0") + body)
 
 
 def _checksum(file: BinaryIO, key: str) -> str:
@@ -195,7 +192,7 @@ def _check(path: Path, key: str) -> None:
     """Raise `DamagedError` unless all is as it was written, before HDF5, which a bit can crash, sees it."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD)
+            head = file.read(HEAD)
             if _checksum(file, key).encode() == head[:64]:
                 return
             if not key and head.startswith(b"\x89HDF"):  # of a version that wrote none
@@ -223,10 +220,11 @@ def load(path: Path, name: str = "/") -> Evaluations:
         If there is none.
     """
     _check(path, "")
-    return _read(path, name)
+    return read(path, name)
 
 
-def _read(path: Path, name: str) -> Evaluations:
+def read(path: Path, name: str = "/") -> Evaluations:
+    """Read evaluations from a file whose checksum is known to be right."""
     try:
         with h5py.File(path, "r") as whole:
             file = whole[name]

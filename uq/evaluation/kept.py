@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Reference, Solution
-from uq.evaluation.evaluate import BlockSolver, Evaluations, Request, merge
+from forward.model import FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
+from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, Request, merge
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -45,6 +46,8 @@ class KeptEvaluate:
         What the model is of beside the study.
     progress
         Told the numbers of points that were done and that failed since it was last told.
+    log
+        Every evaluation is added to it, without derivatives and fields.
 
     Attributes
     ----------
@@ -57,6 +60,7 @@ class KeptEvaluate:
     checkpoint: Checkpoint
     label: str
     progress: Callable[[int, int], None]
+    log: list[Evaluations] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
     def on(self, model: int) -> KeptEvaluate:
@@ -104,7 +108,9 @@ class KeptEvaluate:
             else:
                 self.progress(len(kept.points), len(kept.failures))
             found.append(kept)
-        return merge(found, request.fields)
+        whole = merge(found, request.fields)
+        self.log.append(replace(whole, tangents=None, fields=whole.fields[:0]))
+        return whole
 
     def _asked(self, block: Request) -> _Asked:
         start = np.asarray(getattr(block.start, "point", np.zeros(0)), dtype=float)
@@ -138,6 +144,8 @@ class KeptModel:
     ----------
     model, group, checkpoint, label
         As of `KeptEvaluate`.
+    log
+        Every solve is added to it, without its point: that may be of as many numbers as the mesh has nodes.
 
     Attributes
     ----------
@@ -149,6 +157,7 @@ class KeptModel:
     group: Any
     checkpoint: Checkpoint
     label: str
+    log: list[Evaluations] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
     @property
@@ -181,22 +190,36 @@ class KeptModel:
         """Return the solution at parameters (d,), from its state if that is kept; errors as of the model."""
         key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
         self.keys.append(key)
-        state = None
+        kept = None
         if self.group.rank == 0 and self.checkpoint.has(key):
-            state = self.checkpoint.load(key).fields
-        state = self.group.bcast(state)
-        if state is not None:
-            return self.model.solve(parameters, self.model.scatter(state)[0], reference, iterations)
-        solution = self.model.solve(parameters, start, reference, iterations)
+            kept = self.checkpoint.load(key)
+        kept = self.group.bcast(kept)
+        if kept is not None:
+            self._note(kept)
+            return self.model.solve(parameters, self.model.scatter(kept.fields)[0], reference, iterations)
+        begin = time.process_time()
+        try:
+            solution = self.model.solve(parameters, start, reference, iterations)
+        except SolveError as error:
+            self._note(_failed(self.outputs, error, time.process_time() - begin))
+            raise
+        seconds = np.array([time.process_time() - begin])
         whole = self.model.gather(np.asarray(solution.state)[None])
-        if self.group.rank == 0 and whole is not None:
-            work = solution.work.as_array()[None]
-            good, none = np.ones(1, dtype=bool), np.zeros(1)
-            outputs = np.asarray(solution.outputs)[None]
-            known = np.array([solution.stability], dtype=np.int8)
-            block = Evaluations(np.asarray(parameters)[None], outputs, None, (), none, work, none, good, known, whole)
+        work = solution.work.as_array()[None]
+        residual, converged = np.array([solution.residual]), np.array([solution.converged])
+        outputs = np.asarray(solution.outputs)[None]
+        known = np.array([solution.stability], dtype=np.int8)
+        state = np.zeros((0, 0)) if whole is None else whole
+        block = Evaluations(
+            np.asarray(parameters)[None], outputs, None, (), seconds, work, residual, converged, known, state
+        )
+        if self.group.rank == 0:
             self.checkpoint.save(key, block)
+        self._note(block)
         return solution
+
+    def _note(self, block: Evaluations) -> None:
+        self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """As of the model."""
@@ -211,3 +234,20 @@ class KeptModel:
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()
+
+
+def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:
+    """A solve without an answer."""
+    failure = Failure(0, (), error.reason, error.history, isinstance(error, InadmissibleError))
+    return Evaluations(
+        np.zeros((1, 0)),
+        np.full((1, len(outputs)), np.nan),
+        None,
+        (failure,),
+        np.array([seconds]),
+        error.work.as_array()[None],
+        np.array([np.nan]),
+        np.zeros(1, dtype=bool),
+        np.array([error.stability], dtype=np.int8),
+        np.zeros((0, 0)),
+    )

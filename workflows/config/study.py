@@ -30,8 +30,9 @@ from uq.surrogates.linearisation import LocalSensitivity
 from workflows.config.priors import findings_of_draws, mistakes_of_materials
 
 if TYPE_CHECKING:
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
     from workflows.studies.selection import Comparison
+    from workflows.studies.synthesis import Synthesis
 
     AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
 
@@ -375,9 +376,10 @@ def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, by which editors complete and check it."""
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
     from workflows.studies.selection import DataFile, Selection
     from workflows.studies.specimen_selection import DisplacementFile, SpecimenSelection
+    from workflows.studies.synthesis import Synthesis
 
     adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection | SpecimenSelection | Inversion | Synthesis)
     found = adapter.json_schema(ref_template="#/$defs/{model}")

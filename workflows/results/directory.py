@@ -30,27 +30,9 @@ def write_text(path: Path, text: str) -> None:
 
 def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> None:
     """Write a netCDF-4 file, with groups, and rename it into place; equal datasets give equal bytes."""
-    import h5netcdf
-    import h5py
-    from xarray.backends import H5NetCDFStore
+    from uq.evaluation.hdf5 import netcdf
 
-    from uq.evaluation.checkpoint import image, in_memory
-
-    # HDF5 stamps groups with the time unless it is told not to; netCDF-4 needs the order of creation.
-    of_file, of_group = (h5py.h5p.create(kind) for kind in (h5py.h5p.FILE_CREATE, h5py.h5p.GROUP_CREATE))
-    order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
-    for creation in (of_file, of_group):
-        creation.set_obj_track_times(False)
-        creation.set_link_creation_order(order)
-        creation.set_attr_creation_order(order)
-    with in_memory(of_file) as file:
-        for name in groups or {}:
-            h5py.h5g.create(file.id, name.encode(), gcpl=of_group)
-        with h5netcdf.File(file, "a") as netcdf:
-            dataset.dump_to_store(H5NetCDFStore(netcdf))  # type: ignore[no-untyped-call]
-            for name, part in (groups or {}).items():
-                part.dump_to_store(H5NetCDFStore(netcdf.groups[name]))  # type: ignore[no-untyped-call]
-        write_whole(path, image(file))
+    write_whole(path, netcdf(dataset, groups))
 
 
 def read_dataset(directory: Path) -> xr.Dataset:
@@ -102,7 +84,7 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 def summarise(dataset: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
     if "alone_eigenvalue" in dataset:
-        from workflows.studies.inversion import summary as of_inversion
+        from workflows.studies.inversion_results import summary as of_inversion
 
         return of_inversion(dataset)
     if "clean" in dataset:

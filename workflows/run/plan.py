@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from forward.fem.locking import Decision
     from forward.specimen import Specimen
     from workflows.config.study import AnyStudy
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
     from workflows.studies.selection import Comparison
+    from workflows.studies.synthesis import Synthesis
 
 
 def memory(study: AnyStudy) -> float:
@@ -45,7 +46,8 @@ def memory(study: AnyStudy) -> float:
     """
     if isinstance(study, Study):
         return sum(_of_body(one, 2) for one in study.models if isinstance(one, Hyperelastic))
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion | Synthesis):
         return _of_specimen(study.model)
@@ -228,7 +230,8 @@ def _external(study: Study) -> list[str]:
 
 
 def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion):
         return _inversion(study)

@@ -8,23 +8,19 @@ import platform
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import Stability
 from uq.estimators import branch
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.findings import add, findings
 from uq.inputs.sampling import random_points
 from workflows.config.study import Study, StudyError, differences, document, dump
@@ -49,30 +45,23 @@ from workflows.results.norms import node_volumes
 from workflows.run import own_code
 from workflows.run.plan import memory, of_program, shortage
 from workflows.run.progress import Progress
-from workflows.studies import findings_selection
-from workflows.studies.findings_inversion import judged
 from workflows.studies.findings_solves import findings_of_solves, measured
+from workflows.studies.job import Job, MethodJob
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
-    from forward.fem.finer import FinerMesh
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
-    from forward.specimen import SpecimenModel
-    from inverse.criticism.finer import Finer
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.tasks import Outcome
     from uq.inputs.random_parameters import Inputs
     from workflows.config.study import AnyStudy
-    from workflows.studies.inversion import Inversion, Synthesis
-    from workflows.studies.selection import Comparison
 
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 REALISATIONS = 3  # of random fields, to look at
 _STOPPED = {"select": "all evidences found", "invert": "all data sets inverted", "synthesize": "all data made"}
-BATCH = "batch.csv"
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
@@ -147,19 +136,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
         job = ensemble.together(lambda: _job(study, ensemble, name, directory, checkpoint))
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
-        kept = checkpoint if job.costly else None
-        dataset = ensemble.run(
-            job.model,
-            job.task,
-            others=job.others,
-            checkpoint=kept,
-            progress=progress,
-            # A data set is a block: finished ones are kept, and shown, one by one.
-            blocks=study.parallel.blocks if job.counted else max(study.parallel.blocks, study.planned),
-            arrived=job.arrived,
-            counted=job.counted,
-            node_volumes=job.node_volumes,
-        )
+        dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
     except BaseException:
         if world.rank == 0:
             _withdraw(directory)
@@ -170,14 +147,15 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
     add(dataset, *study.findings)
     dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
-    evaluations = {label: merge(recorder.log) for label, recorder in job.recorders.items()}
+    evaluations = job.evaluations
     own_code.keep(directory, study, loaded)
-    add(dataset, *(findings_of_solves(evaluations.values(), dataset) if _explains(study) else ()))
+    add(dataset, *(findings_of_solves(evaluations.values()) if _explains(study) else ()))
     if isinstance(study, Study):
         dataset = _with_stability(study, dataset, evaluations["/"])
-    summary = _summary(study, name, dataset, evaluations, world.size, ensemble.groups, time.monotonic() - begin)
+    wall = time.monotonic() - begin
+    summary = _summary(study, name, dataset, evaluations, job.outcomes, world.size, ensemble.groups, wall)
     if isinstance(study, Study) and len(study.meshes) > 1:
-        summary["meshes"] = _meshes(study, job.recorders["/"])
+        summary["meshes"] = _meshes(study, job)
     _leave(directory, dataset, evaluations, summary, checkpoint, job)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
@@ -235,7 +213,7 @@ def _leave(
     evaluations: dict[str, Evaluations],
     summary: dict[str, Any],
     checkpoint: Checkpoint,
-    job: _Job,
+    job: Job,
 ) -> None:
     """Write all results, in an order that a kill cannot spoil."""
     write_dataset(directory / "results.nc", dataset, job.groups(dataset))
@@ -257,58 +235,26 @@ def _report(directory: Path) -> None:
     write_report(directory)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What the ranks do for a study.
-
-    Attributes
-    ----------
-    model, others
-        Models number 0, and 1, 2, …
-    task
-        Runs the method on rank 0.
-    recorders
-        What was evaluated, by the name that it is kept under.
-    labelled
-        Adds to the results what the method does not know.
-    costly
-        Whether solves are worth a file: where they are not, an interrupted study begins again.
-    groups
-        Groups of results.nc beside its own variables.
-    texts
-        Further files of the directory, by name.
-    arrived
-        Told of each finished block of the first model, see `Ensemble.run`.
-    counted
-        Whether points of requests are solves; if not, they are counted where they are made.
-    node_volumes
-        Of the nodes of the first model, see `Evaluate`; on rank 0, if a method asks.
-    """
-
-    model: ForwardModel
-    others: list[Callable[[], ForwardModel]]
-    task: Callable[[Evaluate], xr.Dataset]
-    recorders: dict[str, Recorder]
-    labelled: Callable[[xr.Dataset], xr.Dataset]
-    costly: bool = True
-    groups: Callable[[xr.Dataset], Mapping[str, xr.Dataset]] = field(default=lambda _: {})
-    texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
-    arrived: Callable[[Evaluations, bool], None] = field(default=lambda block, kept: None)
-    counted: bool = True
-    node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
-
-
-def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> _Job:
+def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
     if isinstance(study, Study):
         return _sampling(study, ensemble)
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion):
-        return _inversion(study, ensemble, directory, checkpoint)
-    return _synthesis(study, ensemble, name) if isinstance(study, Synthesis) else _selection(study, ensemble)
+        from workflows.studies import inversion_job
+
+        return inversion_job.job(study, ensemble, directory, checkpoint)
+    if isinstance(study, Synthesis):
+        from workflows.studies import synthesis
+
+        return synthesis.job(study, ensemble, name)
+    from workflows.studies import selection_job
+
+    return selection_job.job(study, ensemble)
 
 
-def _sampling(study: Study, ensemble: Ensemble) -> _Job:
+def _sampling(study: Study, ensemble: Ensemble) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
     recorders: dict[str, Recorder] = {}
@@ -322,7 +268,7 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
     ]
     if study.body is None:
         function = study.model.build(ensemble.group, inputs.names)
-        return _Job(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+        return MethodJob(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
 
     spec = study.body
     model = spec.build(ensemble.group, inputs.names)
@@ -339,259 +285,7 @@ def _sampling(study: Study, ensemble: Ensemble) -> _Job:
         return with_random_fields(found, factors, model.variance_kept)
 
     volumes = partial(node_volumes, model.layout.coordinates, cells)
-    return _Job(model, others, task, recorders, labelled, node_volumes=volumes)
-
-
-def _selection(study: Comparison, ensemble: Ensemble) -> _Job:
-    """The candidates, each for each group of data; making them is collective over the group."""
-    from inverse.criticism.finer import Finer
-    from uq.evaluation.evaluate import SerialEvaluate
-    from workflows.studies.selection import groups
-
-    pairs = study.pairs
-    makers = [cache(partial(study.build, *pair, ensemble.group)) for pair in pairs]
-    recorders: dict[str, Recorder] = {}
-    why = study.unchecked
-    checked = [number for number, (name, _) in enumerate(pairs) if not why.get(name, "none")]
-
-    def task(evaluate: Evaluate) -> xr.Dataset:
-        def recorded(name: str, group: str) -> Evaluate:
-            recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
-            return recorders[f"{name}/{group}"]
-
-        def free(name: str, group: str) -> Evaluate:
-            # What nested sampling solves is too much, and too cheap, to keep.
-            return SerialEvaluate(study.build(name, group), ensemble.count)
-
-        def finer(name: str, group: str) -> Finer:
-            number = pairs.index((name, group))
-            if number not in checked:
-                return Finer(None, why[name])
-            return _by(recorders[f"{name}/{group}"].on(len(pairs) + checked.index(number)))
-
-        return study.method.run(study.models, study.groups, recorded, free, finer if why else None)
-
-    def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = found.assign_attrs(quantity=study.quantity)
-        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
-        doubts = findings_selection.doubts_of_selection(found, candidates, study.method.noise.factor)
-        add(found, *findings_selection.findings(found), *doubts)
-        return findings_selection.trusted_on_meshes(found)
-
-    others: list[Callable[[], ForwardModel]] = [*makers[1:]]
-    others += [partial(_once_on_finer_mesh, makers[number]) for number in checked]
-    return _Job(makers[0](), others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)
-
-
-@dataclass(frozen=True)
-class _Specimen:
-    """What inversions of a specimen need of it; making it is collective over the group.
-
-    Attributes
-    ----------
-    model
-        The specimen.
-    vertices
-        Places (N, 3) of its vertices, cells, and VTK's number of their kind.
-    look
-        Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices.
-    mesh
-        The specimen on a finer mesh, or `why` there is none.
-    """
-
-    model: SpecimenModel
-    vertices: tuple[FloatArray, NDArray[np.int64], int]
-    look: Callable[[FloatArray], FloatArray]
-    mesh: FinerMesh | None
-    why: str
-
-    @classmethod
-    def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
-        model = study.specimen.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
-        vertices = (model.vertices.coordinates, *model.vertices.cells())
-
-        def look(points: FloatArray) -> FloatArray:
-            return study.stiffness(vertices[0], points) + model.log_fields(points)
-
-        mesh, why = _finer(model) if study.method.mesh_check else (None, "method.mesh_check = false")
-        return cls(model, vertices, look, mesh, why)
-
-
-def _inversion(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> _Job:
-    """One data set, whose solves all groups share, or data sets side by side; collective over the group."""
-    if study.together:
-        return _inversion_by_all(study, ensemble)
-    from forward.model import SolveError
-    from inverse.criticism.finer import Finer
-    from inverse.fields.field_posterior import FieldPosterior
-    from inverse.methods.inversion import Inversions, Vertices, invert_by_group, invert_field
-    from uq.evaluation.evaluate import Request
-    from uq.evaluation.kept import KeptEvaluate, KeptModel
-    from workflows.studies import inversion
-
-    method, errors = study.method, study.data.errors
-    specimen = _Specimen.of(study, ensemble)
-    model, vertices = specimen.model, specimen.vertices
-    layout = study.variables
-    prior = study.model.fields[0].prior(study.model.body) if study.field else None
-    recorders: dict[str, Recorder] = {}
-
-    done: list[KeptEvaluate | KeptModel] = []
-    rows = inversion.Rows(study, vertices, lambda text: write_text(directory / BATCH, text))
-
-    def arrived(block: Evaluations, kept: bool) -> None:
-        solves = rows.add(block)
-        if kept:
-            ensemble.count(solves, 0)
-
-    def invert(parameters: FloatArray) -> FloatArray:
-        number = int(parameters[0])
-        if study.measurements[number] is None:
-            raise SolveError(study.data.sets[number].refused)
-        data = study.measurements[number].observations.components()
-        try:
-            observed = model.observing(data.places, data.axes, data.cases)
-        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
-            raise SolveError(str(error)) from None
-        finer = Finer(None if specimen.mesh is None else partial(specimen.mesh.outputs, observed), specimen.why)
-        if done:
-            done.pop().forget()  # what follows from these solves is kept by now
-        name = study.data.sets[number].name
-        if prior is None:
-            kept = KeptEvaluate(observed, ensemble.group, checkpoint, name, ensemble.count)
-            done.append(kept)
-            found = invert_by_group(study.inputs, observed, data, method, specimen.look, errors, finer, kept)
-            return layout.pack(found)
-        solved = KeptModel(observed, ensemble.group, checkpoint, name)
-        done.append(solved)
-        posterior = FieldPosterior(solved, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
-        offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
-        return layout.pack(invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer))
-
-    def many(evaluate: Evaluate) -> xr.Dataset:
-        recorders["/"] = Recorder(evaluate)
-        found = recorders["/"](Request(np.arange(len(study.data.sets), dtype=float)[:, None]))
-        reasons = {failure.index: failure.reason for failure in found.failures}
-        if len(reasons) == len(study.data.sets):
-            raise SolveError("; ".join(f"{study.data.sets[k].name}: {reason}" for k, reason in reasons.items()))
-        return inversion.dataset(study, found.outputs, reasons, vertices)
-
-    return _Job(
-        Inversions(invert, ("data_set",), layout.names),
-        [],
-        many,
-        recorders,
-        lambda found: judged(found, study),
-        groups=partial(inversion.groups, study),
-        texts=lambda found: {BATCH: inversion.batch_table(found)},
-        arrived=arrived,
-        counted=False,
-    )
-
-
-def _inversion_by_all(study: Inversion, ensemble: Ensemble) -> _Job:
-    """One data set, whose solves all groups share; collective over the group."""
-    from inverse.criticism.finer import Finer
-    from inverse.methods.inversion import invert_by_all
-    from workflows.studies import inversion
-
-    specimen = _Specimen.of(study, ensemble)
-    data = study.measurements[0].observations.components()
-    observed = specimen.model.observing(data.places, data.axes, data.cases)
-    recorders: dict[str, Recorder] = {}
-    others: list[Callable[[], ForwardModel]] = []
-    if specimen.mesh is not None:
-        others = [partial(_on_finer_mesh, observed, partial(specimen.mesh.outputs, observed))]
-
-    def task(evaluate: Evaluate) -> xr.Dataset:
-        recorders["/"] = Recorder(evaluate)
-        finer = _by(recorders["/"].on(1)) if others else Finer(None, specimen.why)
-        errors = study.data.errors
-        found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
-        return inversion.dataset(study, study.variables.pack(found)[None], {}, specimen.vertices)
-
-    return _Job(
-        observed,
-        others,
-        task,
-        recorders,
-        lambda found: judged(found, study),
-        groups=partial(inversion.groups, study),
-        texts=lambda found: {BATCH: inversion.batch_table(found)},
-    )
-
-
-def _finer(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
-    """Return a specimen on a finer mesh, or why there is none."""
-    from forward.fem.finer import FinerMesh
-
-    try:
-        return FinerMesh(model), ""
-    except ValueError as error:  # a mesh that is not divided, or would be too large
-        return None, str(error)
-
-
-def _on_finer_mesh(observed: SpecimenModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
-    """Return a model of what is observed on a finer mesh; where that cannot be made, its solves fail."""
-    from forward.model import FunctionModel, SolveError
-
-    def solve(point: FloatArray) -> FloatArray:
-        try:
-            return outputs(point)
-        except ValueError as error:  # as on all ranks of the group
-            raise SolveError(str(error)) from None
-
-    return FunctionModel(solve, observed.parameters, observed.outputs)
-
-
-def _once_on_finer_mesh(make: Callable[[], ForwardModel]) -> ForwardModel:
-    """Return a model on a finer mesh of a specimen, which is made for each solve: there is one for each candidate."""
-    from forward.fem.finer import FinerMesh
-    from forward.specimen import SpecimenModel
-
-    specimen = make()
-    assert isinstance(specimen, SpecimenModel)
-    return _on_finer_mesh(specimen, lambda point: FinerMesh(specimen).outputs(specimen, point))
-
-
-def _by(evaluate: Evaluate) -> Finer:
-    """Let all groups of ranks solve on a finer mesh."""
-    from forward.model import SolveError
-    from inverse.criticism.finer import Finer
-    from uq.evaluation.evaluate import Request
-
-    def outputs(point: FloatArray) -> FloatArray:
-        found = evaluate(Request(point[None]))
-        for failure in found.failures:
-            raise SolveError(failure.reason)
-        return np.asarray(found.outputs[0])
-
-    return Finer(outputs)
-
-
-def _synthesis(study: Synthesis, ensemble: Ensemble, name: str) -> _Job:
-    """The specimen that is known; collective over the group."""
-    from workflows.studies import inversion
-
-    model = study.specimen.build(ensemble.group, study.inputs.names)
-    places, points = model.models[0].layout.coordinates, inversion.points_of(model)
-    factor = np.ones((len(study.method.fraction), 1))
-    if study.model.fields and ensemble.index == 0:
-        drawn = model.models[0].factors(study.method.truths(study.inputs)[:, model.positions[0]])
-        for one in (random for random in study.model.fields if random.of == "stiffness" and ensemble.group.rank == 0):
-            factor = factor * drawn[one.label]
-    recorders: dict[str, Recorder] = {}
-
-    def task(evaluate: Evaluate) -> xr.Dataset:
-        recorders["/"] = Recorder(evaluate)
-        return study.method.run(study.inputs, recorders["/"], model.cases, points)
-
-    def texts(found: xr.Dataset) -> dict[str, str]:
-        made = inversion.synthetic_files(study, name, found, (points, model.cases, model.axes, model.places))
-        return {f"data/{file}": text for file, text in made.items()}
-
-    labelled = partial(inversion.with_factor, study, places=places, fields=factor)
-    return _Job(model, [], task, recorders, labelled, texts=texts)
+    return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes)
 
 
 def _identity(study: AnyStudy) -> dict[str, Any]:
@@ -708,6 +402,7 @@ def _summary(
     name: str,
     dataset: xr.Dataset,
     evaluations: dict[str, Evaluations],
+    outcomes: Sequence[Outcome],
     ranks: int,
     groups: int,
     wall: float,
@@ -715,39 +410,21 @@ def _summary(
     from forward.model import WORK
 
     every = evaluations.values()
-    explains = _explains(study)
-    names = {label: _parameters(study, label) for label in evaluations}
-    unlikely = sum(failure.inadmissible for found in every for failure in found.failures) if explains else 0
-    failed = sum(len(found.failures) for found in every) - unlikely
-    if "zero_likelihood" in dataset and names["/"] == ("data_set",):  # whose solves were counted by each
-        unlikely += int(np.nansum(dataset["zero_likelihood"]))
+    done = _of_tasks(outcomes, every) if outcomes else _of_solves(study, evaluations)
+    seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
     stability = branch.counts(every)
     return {
         "study": name,
         "method": study.method.kind,
-        "status": "partial" if failed else "complete",
+        "status": "partial" if done["failed"] else "complete",
         "stopped": dataset.attrs.get("stopped", _STOPPED.get(study.method.kind, "one linearisation")),
         **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
         "findings": [one._asdict() for one in findings(dataset)],
-        "evaluations": sum(len(found.points) for found in every),
-        "failed": failed,
-        **({"zero_likelihood": unlikely} if explains else {}),
-        "failures": [
-            {**({} if label == "/" else {"model": label}), "parameters": point, "reason": reason}
-            for label, point, reason in islice(
-                (
-                    (label, dict(zip(names[label], f.parameters, strict=True)), f.reason)
-                    for label, found in evaluations.items()
-                    for f in found.failures
-                    if not (explains and f.inadmissible)
-                ),
-                LISTED,
-            )
-        ],
+        **done,
         **({"stability": stability} if stability else {}),
         "wall_seconds": wall,
-        "cpu_seconds": float(sum(found.seconds.sum() for found in every)) * study.parallel.ranks_per_model,
+        "cpu_seconds": seconds * study.parallel.ranks_per_model,
         "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
         **summarise(dataset),
         "provenance": {
@@ -763,13 +440,55 @@ def _summary(
     }
 
 
+def _of_solves(study: AnyStudy, evaluations: Mapping[str, Evaluations]) -> dict[str, Any]:
+    """Number of solves, and which failed."""
+    explains = _explains(study)
+    failed = [
+        (label, failure)
+        for label, found in evaluations.items()
+        for failure in found.failures
+        if not (explains and failure.inadmissible)
+    ]
+    return {
+        "evaluations": sum(len(found.points) for found in evaluations.values()),
+        "failed": len(failed),
+        **({"zero_likelihood": _unlikely(evaluations.values())} if explains else {}),
+        "failures": [
+            {
+                **({} if label == "/" else {"model": label}),
+                "parameters": dict(zip(_parameters(study, label), failure.parameters, strict=True)),
+                "reason": failure.reason,
+            }
+            for label, failure in failed[:LISTED]
+        ],
+    }
+
+
+def _of_tasks(outcomes: Sequence[Outcome], evaluations: Iterable[Evaluations]) -> dict[str, Any]:
+    """Number of data sets that were inverted side by side, and which failed."""
+    failed = [(number, one.reason) for number, one in enumerate(outcomes) if one.dataset is None]
+    return {
+        "evaluations": len(outcomes),
+        "failed": len(failed),
+        "zero_likelihood": _unlikely(evaluations),
+        "failures": [{"parameters": {"data_set": float(k)}, "reason": reason} for k, reason in failed[:LISTED]],
+    }
+
+
+def _unlikely(evaluations: Iterable[Evaluations]) -> int:
+    """Number of solves at parameters for which there is no model."""
+    return sum(failure.inadmissible for found in evaluations for failure in found.failures)
+
+
 def _explains(study: AnyStudy) -> bool:
     """Whether data are explained: then parameters without a model have no likelihood, which is an answer too."""
     return not isinstance(study, Study) and study.method.kind != "synthesize"
 
 
-def _meshes(study: Study, recorder: Recorder) -> list[dict[str, Any]]:
+def _meshes(study: Study, job: Job) -> list[dict[str, Any]]:
     """What was solved on each mesh, and what it took."""
+    assert isinstance(job, MethodJob)
+    recorder = job.recorders["/"]
     found = []
     for number in sorted(set(recorder.models)):
         parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
@@ -783,10 +502,11 @@ def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
     """Names of the parameters of a model by the name that its evaluations are kept under."""
     if isinstance(study, Study):
         return study.inputs.names
-    from workflows.studies.inversion import Inversion, Synthesis
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion | Synthesis):
-        return study.inputs.names if isinstance(study, Synthesis) or study.together else ("data_set",)
+        return study.inputs.names
     return tuple(study.candidates[label.partition("/")[0]].parameters)
 
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from forward.model import Finding, SolveError
 from forward.words import number, with_unit
 from workflows.config.study import ranges
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from forward.fem.model import HyperelasticModel
     from uq.evaluation.evaluate import Evaluations
     from workflows.config.study import Study
@@ -46,19 +42,10 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     return [Finding("warning", text)]
 
 
-def findings_of_solves(evaluations: Iterable[Evaluations], dataset: xr.Dataset) -> list[Finding]:
-    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail.
-
-    Of data sets that are inverted side by side the results know.
-    """
+def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
+    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail."""
     every = list(evaluations)
     lost = [failure for found in every for failure in found.failures if failure.inadmissible]
-    if not lost and "zero_likelihood" in dataset and (count := int(np.nansum(dataset["zero_likelihood"]))):
-        text = (
-            f"{count:,} of {int(np.nansum(dataset['solves'])):,} solves were of parameters for which there is no "
-            "model: their likelihood is zero, and they count as answered."
-        )
-        return [Finding("note", text)]
     if not lost:
         return []
     solves = sum(len(found.points) for found in every)

@@ -14,7 +14,8 @@ from inverse.fields.newton_cg import find_mode
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.inversion import Invert, invert_by_group
+from inverse.methods.invert import Invert
+from inverse.methods.invert_few import invert_by_group
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs

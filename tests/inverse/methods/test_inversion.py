@@ -11,27 +11,20 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import inverse.methods.inversion
+import inverse.methods.invert_field
 from forward.model import FunctionModel
 from inverse.criticism.chains import weigh_field
 from inverse.data.observations import Components
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
-from inverse.methods.inversion import (
-    Inversions,
-    Invert,
-    Synthesize,
-    Variables,
-    Vertices,
-    invert_by_all,
-    invert_by_group,
-    invert_field,
-    sentence,
-    variables,
-)
+from inverse.methods.invert import Invert
+from inverse.methods.invert_few import invert_by_all, invert_by_group
+from inverse.methods.invert_field import Vertices, invert_field
+from inverse.methods.record import as_dataset, stacked
+from inverse.methods.synthesize import Synthesize
 from tests.launch import TISSUQ, run, run_script
 from tests.problems import curved
-from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import StudyError, document, load, parse, schema
@@ -39,21 +32,22 @@ from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.run.run import run as run_study
 from workflows.starter import starter
-from workflows.studies.inversion import _volumes, groups
+from workflows.studies.inversion_results import _volumes, groups
 
 ROOT = Path(__file__).parent.parent.parent.parent
 
 # --- records ---------------------------------------------------------------------------------------------------------
 
 
-def test_records_are_vectors():
-    found = Variables({"a": ("x",), "b": (), "c": ("y", "x")}, {"x": 3, "y": 2})
-    row = found.pack({"a": np.array([1.0, 2.0]), "b": np.array(5.0), "c": np.ones((2, 4))})
-    assert len(found.names) == len(row) == 3 + 1 + 6
-    record = found.unpack(row[None])
-    np.testing.assert_array_equal(record["a"], [[1, 2, np.nan]])
-    np.testing.assert_array_equal(record["b"], [5])
-    np.testing.assert_array_equal(record["c"], np.ones((1, 2, 3)))
+def test_what_is_left_of_several_data_sets_is_filled_up():
+    one = {"mode": np.array([1.0, 2.0]), "log_evidence": np.array(5), "why": "because", "residual": np.ones(3)}
+    other = one | {"residual": np.ones(4)}
+    found = stacked([as_dataset(one), None, as_dataset(other)], {"iteration": 7})
+    assert set(found) == {"mode", "log_evidence", "residual"}
+    np.testing.assert_array_equal(found["mode"][1], [[1, 2], [np.nan, np.nan], [1, 2]])
+    np.testing.assert_array_equal(found["log_evidence"][1], [5, np.nan, 5])
+    assert found["residual"][0] == ("data_set", "datum")
+    np.testing.assert_array_equal(np.isnan(found["residual"][1]).sum(axis=1), [1, 4, 0])
 
 
 # --- few parameters, by closed forms ---------------------------------------------------------------------------------
@@ -106,7 +100,7 @@ def test_linear_models_have_the_exact_posterior():
         assert record["misfit"][k] == pytest.approx((record["residual"][rows] ** 2).sum())
     assert (record["alone_eigenvalue"] <= record["eigenvalue"]).all()
     assert record["misfit_degrees"].sum() == pytest.approx(record["residual_degrees"])
-    assert sentence(record["why"]).startswith("Laplace's Gaussian can be trusted")
+    assert record["why"].item().startswith("Laplace's Gaussian can be trusted")
 
 
 def test_the_noise_can_be_unknown():
@@ -132,7 +126,7 @@ def test_what_is_left_is_of_chains_that_have_mixed(kind):
     np.testing.assert_allclose(record["std"], std, rtol=0.1)
     np.testing.assert_allclose((record["upper"] - record["lower"]) / std, 2 * 1.96, rtol=0.1)
     assert len(np.unique(record["draw"], axis=0)) > 200  # of 32 points there would be no more
-    r = (record["draw"][0] @ MATRIX.T - DATA.values) / 0.1
+    r = (record["draw"][0].to_numpy() @ MATRIX.T - DATA.values) / 0.1
     np.testing.assert_allclose(record["draw_log_likelihood"][0], -(r**2) / 2 - np.log(0.1 * np.sqrt(2 * np.pi)))
 
 
@@ -154,8 +148,8 @@ def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
     np.testing.assert_array_equal(plain["stiffness_mean"], plain["stiffness_mode"])
     assert abs(plain["log_evidence"] - plain["laplace_log_evidence"]) > 1e-6
     assert 0 < plain["log_evidence_error"] < 0.5
-    verdict = inverse.methods.inversion.Verdict("corrected", "")
-    monkeypatch.setattr(inverse.methods.inversion, "verdict_on_field", lambda *_: verdict)
+    verdict = inverse.methods.invert_field.Verdict("corrected", "")
+    monkeypatch.setattr(inverse.methods.invert_field, "verdict_on_field", lambda *_: verdict)
     record = invert_field(posterior, data, method, vertices)
     mode = find_mode(posterior)
     weighed = weigh_field(mode.point, LowRankPosterior.at(mode.point), 512)
@@ -163,26 +157,8 @@ def test_what_is_left_of_a_field_is_what_is_to_be_trusted(monkeypatch):
     np.testing.assert_allclose(record["stiffness_std"], weighed.std, rtol=1e-6)
     assert record["mean"][0] == pytest.approx(0.1 + weighed.mean.mean())
     assert record["lower"][0] < record["mean"][0] < record["upper"][0]
-    distance = np.abs(record["stiffness_draw"][:, None] - 0.1 - weighed.values).max(axis=2).min(axis=1)
+    distance = np.abs(record["stiffness_draw"].to_numpy()[:, None] - 0.1 - weighed.values).max(axis=2).min(axis=1)
     assert distance.max() < 1e-6
-
-
-def test_inversions_are_evaluations():
-    """Two data sets, one of which has no answer: the other's record is that of the inversion alone."""
-    method = Invert(samples=32, starts=1)
-    names = ("a", "b", "c")
-    layout = variables(names, field=False, cases=2, data=14, nodes=1, method=method)
-
-    def look(points):
-        return points[:, :1]
-
-    def invert(parameters):
-        return layout.pack(invert_by_group(Inputs(PRIORS), linear(), DATA, method, look))
-
-    found = SerialEvaluate(Inversions(invert, ("data_set",), layout.names))(Request(np.array([[0.0], [1.0]])))
-    record = layout.unpack(found.outputs)
-    np.testing.assert_array_equal(record["mode"][0], record["mode"][1])
-    np.testing.assert_array_equal(np.isnan(record["measured"][0]), np.arange(14) >= 12)
 
 
 def test_synthetic_data_have_the_errors_that_were_asked():

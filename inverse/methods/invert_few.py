@@ -1,0 +1,263 @@
+"""Inversion for few parameters: the mode from several starts, Laplace's Gaussian, weighted points that correct it.
+
+The posterior is that of `inverse.low_dimensional.posterior`. One function has a group of ranks work by itself, the
+other has all groups solve at different points of one posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, assert_never
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Reference, SolveError
+from inverse.criticism.chains import Chains, chains_of_few, ensemble, verdict_on_few
+from inverse.criticism.comparison import quantiles
+from inverse.criticism.finer import NOT_LOOKED, Finer, parameters_moved
+from inverse.criticism.predictive import examine, spectrum_of
+from inverse.criticism.weights import FEWEST, resampled
+from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from inverse.fields.low_rank import Spectrum
+from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
+from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.invert import Invert
+from inverse.methods.record import (
+    ENDS,
+    TRUST,
+    Data,
+    Record,
+    as_dataset,
+    of_chains,
+    of_data,
+    of_mesh,
+    of_prior,
+    of_test,
+)
+from uq.evaluation.evaluate import Evaluate, Recorder, Request, SerialEvaluate, Start
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.surrogates.linearisation import linearise
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+DRAWS = 4096  # of Laplace's Gaussian, for what it says of physical parameters
+Look = Callable[[FloatArray], FloatArray]  # parameters (n, d) → ln of the stiffness factor (n, N) at the vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """A linear prediction of the state from a solution that this group of ranks has; a `Start`."""
+
+    point: FloatArray
+    state: FloatArray
+    slopes: FloatArray
+
+    @classmethod
+    def at(cls, model: ForwardModel, point: FloatArray) -> Nearby:
+        """Solve at parameters (d,); collective."""
+        solution = model.solve(point)
+        return cls(point, np.array(solution.state), solution.state_tangent(np.eye(len(point))))
+
+    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
+        """Return the function parameters (d,) → predicted state (U_local,), and its reference."""
+        return lambda point: self.state + (point - self.point) @ self.slopes, Reference(self.point, self.state)
+
+
+def invert_by_group(
+    inputs: Inputs,
+    model: ForwardModel,
+    data: Data,
+    method: Invert,
+    look: Look | None,
+    errors: NormalErrors | StudentErrors = NORMAL,
+    finer: Finer = NOT_LOOKED,
+    evaluate: Evaluate | None = None,
+) -> xr.Dataset:
+    """Invert a data set on the model of one group of ranks, or by an evaluation of it; collective over the group.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer where the search needs one.
+    """
+    solve = evaluate or SerialEvaluate(model)
+    return _invert(inputs, solve, data, method, look, errors, finer, lambda point: Nearby.at(model, point))
+
+
+def invert_by_all(
+    inputs: Inputs,
+    evaluate: Evaluate,
+    data: Data,
+    method: Invert,
+    look: Look | None,
+    errors: NormalErrors | StudentErrors = NORMAL,
+    finer: Finer = NOT_LOOKED,
+) -> xr.Dataset:
+    """Invert a data set with all groups of ranks, each of which solves at other points; raises as the other."""
+    return _invert(
+        inputs,
+        evaluate,
+        data,
+        method,
+        look,
+        errors,
+        finer,
+        lambda point: linearise(inputs, evaluate, point).prediction,
+    )
+
+
+def _invert(
+    inputs: Inputs,
+    evaluate: Evaluate,
+    data: Data,
+    method: Invert,
+    look: Look | None,
+    errors: NormalErrors | StudentErrors,
+    finer: Finer,
+    start: Callable[[FloatArray], Start | None],
+) -> xr.Dataset:
+    counted = Recorder(evaluate)
+    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, errors=errors)
+    d = len(inputs.names)
+    with suppress(SolveError):  # or else every solve begins at zero
+        posterior = replace(posterior, start=start(inputs.mean))
+    gaussian = laplace(posterior, starts=method.starts, seed=method.seed)
+    best = posterior.physical(gaussian.mode[None])[0]
+    posterior = replace(posterior, start=start(best[:d]))
+    found = evidence(posterior, gaussian, method.solves(field=False) or LEAST, seed=method.seed)
+    at = posterior.at(gaussian.mode[None], derivatives=True)
+    spectrum = spectrum_of(posterior, at)
+    scale = data.sigma * (best[-1] if method.noise is not None else 1.0)
+    raw = (at.outputs[0] - data.values) / scale
+    residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
+    test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
+    chains = _chains(posterior, gaussian, found, method)
+    verdict = verdict_on_few(gaussian, found, test, chains)
+    if chains is not None and chains.mixed:
+        points = chains.flat
+        weights = np.full(len(points), 1 / len(points))
+        draws = _thinned(chains, method.draws)
+        outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs
+    else:
+        weights, points = found.weights, posterior.physical(found.density.x)
+        chosen = resampled(weights, method.draws, method.seed)
+        draws, outputs = points[chosen], found.density.outputs[chosen]
+    moments = _moments(posterior, gaussian, weights, points, look)
+    std = np.asarray(moments["std"])
+    gap, why = finer.gap(best[:d], at.outputs[0])
+    shift = np.full(len(best), np.nan)
+    if gap is not None:
+        A = spectrum.images.T @ spectrum.vectors
+        shift[:d] = parameters_moved(posterior, gaussian, A, root * gap / scale) / std[:d]
+    record: Record = {
+        **of_data(data, at.outputs[0], residual, scale / root, spectrum),
+        **of_test(test),
+        **of_prior(gaussian.mode[:d], spectrum),
+        **of_mesh(gap, why, scale, shift),
+        **moments,
+        **_alone(posterior, gaussian, spectrum, data),
+        **_draws(draws, outputs, data, method, errors),
+        **of_chains(chains),
+        "mode": best,
+        "log_evidence": np.array(found.log_evidence),
+        "log_evidence_error": np.array(found.error),
+        "laplace_log_evidence": np.array(gaussian.log_evidence),
+        "effective": np.array(found.effective),
+        "tail": np.array(found.tail),
+        "converged": np.array(gaussian.converged),
+        "trust": np.array(TRUST.index(verdict.trust)),
+        "why": str(verdict),
+        "solves": np.array(counted.solves),
+        "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
+        "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in gaussian.steps]).reshape(-1, 4),
+        "start_mode": posterior.physical(gaussian.modes),
+        "start_log_posterior": gaussian.ends,
+        "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),
+    }
+    return as_dataset(record)
+
+
+def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert) -> Chains | None:
+    match method.chains:
+        case None:
+            return None
+        case "emcee":
+            return ensemble(posterior, gaussian, seed=method.seed)
+        case "pcn":
+            # Fewer points than that say little of a covariance.
+            enough = found.effective >= max(FEWEST, 4 * len(gaussian.mode))
+            return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
+        case _:
+            assert_never(method.chains)
+
+
+def _moments(
+    posterior: Posterior, gaussian: Laplace, weights: FloatArray, points: FloatArray, look: Look | None
+) -> Record:
+    """Moments and quantiles of the parameters and of the stiffness, by weighted points; widths of the Gaussian."""
+    used = weights > 0
+    w, points = weights[used], points[used]
+    mean = w @ points
+    gaps = points - mean
+    ends = np.array([quantiles(column, w, ENDS) for column in points.T])
+    z = _normals(0, DRAWS, len(gaussian.mode))
+    drawn = posterior.physical(gaussian.mode + z @ gaussian.root.T)
+    d = len(posterior.inputs.names)
+    record: Record = {
+        "mean": mean,
+        "std": np.sqrt(w @ gaps**2),
+        "lower": ends[:, 0],
+        "upper": ends[:, 1],
+        "covariance": (w[:, None] * gaps).T @ gaps,
+        "laplace_std": drawn.std(axis=0),
+    }
+    if look is None:
+        return record
+    stiffness = look(points[:, :d])
+    average = w @ stiffness
+    return record | {
+        "stiffness_mode": look(posterior.physical(gaussian.mode[None])[:, :d])[0],
+        "stiffness_mean": average,
+        "stiffness_std": np.sqrt(np.maximum(w @ (stiffness - average) ** 2, 0)),
+    }
+
+
+def _normals(seed: int, count: int, dimension: int) -> FloatArray:
+    from scipy.special import ndtri
+
+    return np.asarray(ndtri(sobol_points(seed, 0, 0, count, dimension)))
+
+
+def _thinned(chains: Chains, count: int) -> FloatArray:
+    """At most `count` draws (n, k), chain after chain and as many of each."""
+    each = max(count // len(chains.draws), 1)
+    steps = np.linspace(0, chains.draws.shape[1] - 1, each).round().astype(int)
+    return chains.draws[:, steps].reshape(-1, chains.draws.shape[2])[:count]
+
+
+def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Data) -> Record:
+    """Standard deviations (c,) by the model linearised at the mode, of all load cases and of each alone."""
+    d, c = len(posterior.inputs.names), len(posterior.names)
+    slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
+    A = spectrum.images.T @ spectrum.vectors
+
+    def widths(rows: FloatArray) -> FloatArray:
+        covariance = slopes @ np.linalg.inv(np.eye(d) + rows.T @ rows) @ slopes.T
+        return np.concatenate([np.sqrt(np.diag(covariance)), np.full(c - d, np.nan)])
+
+    cases = range(int(data.cases.max()) + 1)
+    return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
+
+
+def _draws(
+    draws: FloatArray, outputs: FloatArray, data: Data, method: Invert, errors: NormalErrors | StudentErrors
+) -> Record:
+    """Draws of equal weight with what the data say of each."""
+    scale = data.sigma * (draws[:, -1:] if method.noise is not None else 1.0)
+    gaps = (outputs - data.values) / scale
+    return {"draw": draws, "draw_log_likelihood": -errors.minus_log(gaps) - np.log(scale)}

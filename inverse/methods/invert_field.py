@@ -1,0 +1,230 @@
+"""Inversion for a field: mode by conjugate gradients, low-rank Gaussian, and what corrects it.
+
+The posterior is that of `inverse.fields.field_posterior`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.criticism.chains import (
+    Chains,
+    FieldWeights,
+    Verdict,
+    chains_of_field,
+    verdict_on_field,
+    weigh_field,
+)
+from inverse.criticism.comparison import quantiles
+from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.criticism.predictive import examine
+from inverse.criticism.weights import resampled
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import Mode, find_mode
+from inverse.fields.noise import infer_noise
+from inverse.methods.invert import Invert
+from inverse.methods.record import (
+    COLUMNS,
+    ENDS,
+    SHOWN,
+    TRUST,
+    Data,
+    Record,
+    as_dataset,
+    of_chains,
+    of_data,
+    of_mesh,
+    of_prior,
+    of_test,
+    ritz,
+)
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """What makes values at the vertices a stiffness.
+
+    Attributes
+    ----------
+    offset
+        ln of the factor (N,) where the values are zero.
+    volumes
+        Of the vertices (N,), in m³.
+    """
+
+    offset: FloatArray
+    volumes: FloatArray
+
+
+def invert_field(
+    posterior: FieldPosterior, data: Data, method: Invert, vertices: Vertices, finer: Finer = NOT_LOOKED
+) -> xr.Dataset:
+    """Invert a data set for a field; collective over the group of ranks that has the model.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the centre of the prior.
+    """
+    settings = {"cutoff": method.cutoff, "rank": method.rank}
+    factor, log_std, log_evidence = 1.0, 0.0, None
+    if method.noise is None:
+        mode = find_mode(posterior)
+        found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
+        converged = mode.converged
+    else:
+        inferred = infer_noise(posterior, method.noise, **settings)  # type: ignore[arg-type]
+        mode, found, converged = inferred.mode, inferred.found, inferred.converged
+        factor, log_std, log_evidence = inferred.factor, inferred.log_std, inferred.log_evidence
+    spectrum = found.spectrum
+    errors, root = posterior.errors, mode.point.root
+    residual = errors.normal_scores(mode.point.gaps)
+    test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
+    samples = method.solves(field=True)
+    weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
+    g = vertices.volumes / vertices.volumes.sum()
+    chains = whole = None
+    if method.chains is not None:
+        # Chains are judged by the mean over the body: that all vertices have mixed would ask for far more draws.
+        whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
+        chains = replace(whole, names=("mean",), draws=whole.draws[:, :, :1])
+    drawn = None if whole is None else whole.flat[:, 1:]
+    verdict = verdict_on_field(replace(mode, converged=converged), found, weighed, test, chains, drawn)
+    error = np.nan
+    if log_evidence is None and weighed is not None and weighed.trusted:
+        log_evidence, error = weighed.log_evidence, weighed.error
+    scale = data.sigma * factor
+    cases = int(data.cases.max()) + 1
+    inferred_noise = (factor, log_std) if method.noise is not None else None
+    values, weights = _corrected(verdict, weighed, chains, drawn)
+    predicted = np.asarray(mode.point.solution.outputs)
+    mean, stiffness = (
+        _of_mean(found, vertices, inferred_noise, values, weights),
+        _of_stiffness(found, vertices, method, values, weights),
+    )
+    gap, why = finer.gap(mode.point.values, predicted)
+    moved, shift = np.full(len(found.mean), np.nan), np.full(np.size(mean["mode"]), np.nan)
+    if gap is not None:
+        moved = -(spectrum.images @ (root * gap / scale) / (1 + spectrum.values)) @ found.directions
+        shift[0] = g @ moved / np.asarray(mean["std"])[0]
+    record: Record = {
+        **of_data(data, predicted, residual, scale / root, spectrum),
+        **of_test(test),
+        **of_prior(mode.point.noise, spectrum),
+        **of_mesh(gap, why, scale, shift),
+        **mean,
+        **stiffness,
+        "stiffness_mesh_shift": moved / np.maximum(np.asarray(stiffness["stiffness_std"]), 1e-300),
+        **_directions(found),
+        **of_chains(chains),
+        "log_evidence": np.array(found.log_evidence if log_evidence is None else log_evidence),
+        "log_evidence_error": np.array(error),
+        "laplace_log_evidence": np.array(found.log_evidence),
+        "effective": np.array(np.nan if weighed is None else weighed.effective),
+        "tail": np.array(np.nan if weighed is None else weighed.tail),
+        "converged": np.array(converged),
+        "trust": np.array(TRUST.index(verdict.trust)),
+        "why": str(verdict),
+        "solves": np.array(posterior.counts.solves),
+        "products": np.array(mode.products + spectrum.products),
+        "step": _steps(mode),
+        "stiffness_mode": vertices.offset + found.mean,
+        "alone_stiffness_std": np.array([_alone_std(found, data.cases == k) for k in range(cases)]),
+        "neglected": np.array(spectrum.neglected),
+        "information": np.array(found.information),
+    }
+    return as_dataset(record)
+
+
+def _corrected(
+    verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, drawn: FloatArray | None
+) -> tuple[FloatArray | None, FloatArray]:
+    """Values (n, N) of the field with weights (n,) that correct the Gaussian where it is not to be trusted."""
+    if verdict.trust != "corrected":
+        return None, np.zeros(0)
+    if chains is not None and drawn is not None and chains.mixed:
+        return drawn, np.full(len(drawn), 1 / len(drawn))
+    assert weighed is not None
+    return weighed.values, weighed.weights
+
+
+def _of_stiffness(
+    found: LowRankPosterior, vertices: Vertices, method: Invert, values: FloatArray | None, weights: FloatArray
+) -> Record:
+    """Mean, standard deviation and draws of ln stiffness."""
+    count = -(-method.draws // 10)
+    if values is None:
+        noise = np.random.default_rng(method.seed).standard_normal((count, len(found.mean)))
+        mean, std, draws = found.mean, found.std, found.samples(noise)
+    else:
+        mean = weights @ values
+        std = np.sqrt(weights @ (values - mean) ** 2)
+        draws = values[resampled(weights, count, method.seed)]
+    return {
+        "stiffness_mean": vertices.offset + mean,
+        "stiffness_std": std,
+        "stiffness_draw": vertices.offset + draws,
+    }
+
+
+def _steps(mode: Mode) -> FloatArray:
+    return np.array(
+        [[r.misfit, r.penalty, r.gradient, r.pairs, r.products, r.length, r.solves] for r in mode.iterations]
+    ).reshape(-1, len(COLUMNS["field"]))
+
+
+def _of_mean(
+    found: LowRankPosterior,
+    vertices: Vertices,
+    noise: tuple[float, float] | None,
+    values: FloatArray | None,
+    weights: FloatArray,
+) -> Record:
+    """Posterior of the mean of the logarithm over the body, and of the noise."""
+    g = vertices.volumes / vertices.volumes.sum()
+    offset = float(g @ vertices.offset)
+    at, std = found.marginal(g)
+    mode, mean = np.array([at + offset]), np.array([at + offset])
+    lower, upper = mode - 1.96 * std, mode + 1.96 * std
+    if values is not None:
+        means = values @ g + offset
+        mean = np.array([weights @ means])
+        std = float(np.sqrt(weights @ (means - mean) ** 2))
+        lower, upper = quantiles(means, weights, ENDS)[:, None]
+    widths = np.array([std])
+    if noise is not None:
+        factor, log_std = noise
+        mode, mean, widths = np.append(mode, factor), np.append(mean, factor), np.append(widths, factor * log_std)
+        lower = np.append(lower, factor * np.exp(-1.96 * log_std))
+        upper = np.append(upper, factor * np.exp(1.96 * log_std))
+    covariance = np.diag(widths**2)
+    return {"mode": mode, "mean": mean, "std": widths, "lower": lower, "upper": upper, "covariance": covariance}
+
+
+def _directions(found: LowRankPosterior) -> Record:
+    """The directions that the data constrain most, and the last that were found."""
+    count = len(found.spectrum.values)
+    first = np.arange(min(SHOWN, count))
+    last = np.arange(max(count - SHOWN, len(first)), count)
+    shown = np.concatenate([first, np.full(SHOWN - len(first), -1), last, np.full(SHOWN - len(last), -1)])
+    vectors = np.full((len(shown), len(found.mean)), np.nan)
+    for row, number in enumerate(shown):
+        if number >= 0:
+            vectors[row] = found.directions[number]
+    return {"direction_stiffness": vectors, "shown_number": shown}
+
+
+def _alone_std(found: LowRankPosterior, rows: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviations (N,) by one load case alone."""
+    values, turn = ritz(found.spectrum, rows)
+    share = values / (1 + values)
+    return np.asarray(np.sqrt(np.maximum(found.prior.variance - share @ (turn @ found.directions) ** 2, 0)))

@@ -1,0 +1,248 @@
+"""What an inversion leaves: its dataset, and the parts of it that few parameters and fields have in common.
+
+The rows of A, the derivative of the normalised data by the whitened unknowns at the mode, also tell what one load case
+alone would say: λ of A_kᵀA_k of its rows, without another solve. For fields these are the Ritz values in the directions
+that all cases together constrain, exact to the first λ that was left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.criticism.chains import Chains
+from inverse.criticism.predictive import ResidualTest
+from inverse.data.neighbours import Neighbours
+from inverse.fields.low_rank import Spectrum
+from inverse.methods.invert import Invert
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+ENDS = (0.025, 0.975)  # of credible intervals
+SHOWN = 4  # directions of a field that are kept from each end of the spectrum
+STEPS = 256  # rows of the table of iterations, or more where there are more
+TRUST = ("laplace", "corrected", "neither")
+COLUMNS = {
+    "parameters": ("start", "log_posterior", "decrement", "damping"),
+    "field": ("misfit", "penalty", "gradient", "pairs", "products", "length", "solves"),
+}
+Record = dict[str, FloatArray | str]
+
+DIMS: dict[str, tuple[str, ...]] = {
+    # of both
+    "mode": ("parameter",),
+    "mean": ("parameter",),
+    "std": ("parameter",),
+    "lower": ("parameter",),
+    "upper": ("parameter",),
+    "covariance": ("parameter", "partner"),
+    "log_evidence": (),
+    "log_evidence_error": (),
+    "laplace_log_evidence": (),
+    "effective": (),
+    "tail": (),
+    "chains": (),
+    "chain_rhat": (),
+    "chain_effective": (),
+    "converged": (),
+    "trust": (),
+    "why": (),
+    "solves": (),
+    "eigenvalue": ("direction",),
+    "determined": (),
+    "alone_eigenvalue": ("case", "direction"),
+    "alone_determined": ("case",),
+    "misfit": ("case",),
+    "misfit_degrees": ("case",),
+    "misfit_count": ("case",),
+    "residual_square": (),
+    "residual_degrees": (),
+    "residual_probability": (),
+    "agreement_probability": (),
+    "prior_square": (),
+    "prior_degrees": (),
+    "mesh_checked": (),
+    "mesh_why": (),
+    "mesh_error": ("datum",),
+    "mesh_shift": ("parameter",),
+    "step": ("iteration", "column"),
+    "place": ("datum", "axis"),
+    "datum_axis": ("datum",),
+    "datum_case": ("datum",),
+    "measured": ("datum",),
+    "sigma": ("datum",),
+    "predicted": ("datum",),
+    "predicted_std": ("datum",),
+    "residual": ("datum",),
+    "resolution": ("datum",),
+    "stiffness_mode": ("node",),
+    "stiffness_mean": ("node",),
+    "stiffness_std": ("node",),
+    # of few parameters
+    "laplace_std": ("parameter",),
+    "direction_parameter": ("direction", "parameter"),
+    "together_std": ("parameter",),
+    "alone_std": ("case", "parameter"),
+    "start_mode": ("start", "parameter"),
+    "start_log_posterior": ("start",),
+    "zero_likelihood": (),
+    "draw": ("sample", "parameter"),
+    "draw_log_likelihood": ("sample", "datum"),
+    # of a field
+    "direction_stiffness": ("shown", "node"),
+    "shown_number": ("shown",),
+    "alone_stiffness_std": ("case", "node"),
+    "stiffness_mesh_shift": ("node",),
+    "stiffness_draw": ("sample", "node"),
+    "neglected": (),
+    "information": (),
+    "products": (),
+}
+
+
+class Data(Protocol):
+    """Measured data (m,) of one data set."""
+
+    @property
+    def values(self) -> FloatArray:
+        """What was measured (m,)."""
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations (m,) of the errors."""
+
+    @property
+    def cases(self) -> NDArray[np.int64]:
+        """Numbers (m,) of the parts (load cases, outputs) of which it is asked what each alone would say."""
+
+    @property
+    def described(self) -> dict[str, FloatArray]:
+        """What else is known of the data, by its name in results."""
+
+    def neighbours(self) -> Neighbours:
+        """Return pairs of data that are expected to agree if the model is wrong."""
+
+
+def as_dataset(record: Record) -> xr.Dataset:
+    """Return what an inversion leaves as a dataset, of numbers and of sentences."""
+    import xarray as xr
+
+    held = {name: (DIMS[name], record[name]) for name in DIMS if name in record}
+    return xr.Dataset(
+        {
+            name: (dims, value if isinstance(value, str) else np.asarray(value, float))
+            for name, (dims, value) in held.items()
+        }
+    )
+
+
+def stacked(
+    found: Sequence[xr.Dataset | None], least: Mapping[str, int]
+) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
+    """Put the numbers of several data sets on top of each other, with the dimension `data_set`.
+
+    Parameters
+    ----------
+    found
+        Datasets, some of which may be missing.
+    least
+        Smallest sizes of dimensions, by name; what is shorter is filled up with NaN.
+    """
+    there = [one for one in found if one is not None]
+    sizes = dict(least)
+    for dataset in there:
+        sizes |= {str(dim): max(size, sizes.get(str(dim), 0)) for dim, size in dataset.sizes.items()}
+    rows: dict[str, tuple[tuple[str, ...], FloatArray]] = {}
+    for name in (name for name in DIMS if any(name in one and one[name].dtype.kind == "f" for one in there)):
+        whole = np.full((len(found), *(sizes[dim] for dim in DIMS[name])), np.nan)
+        for k, one in enumerate(found):
+            if one is not None:
+                values = one[name].to_numpy()
+                whole[(k, *map(slice, values.shape))] = values
+        rows[name] = (("data_set", *DIMS[name]), whole)
+    return rows
+
+
+def usual_sizes(method: Invert, *, field: bool) -> dict[str, int]:
+    """Return sizes of dimensions that are the same for all data sets of a method, unless one needs more."""
+    of_field = {"direction": method.rank, "sample": -(-method.draws // 10)}
+    return {"iteration": STEPS} | (of_field if field else {"sample": method.draws})
+
+
+def of_data(data: Data, predicted: FloatArray, residual: FloatArray, scale: FloatArray, spectrum: Spectrum) -> Record:
+    """Data, residuals over the errors `scale`, and resolution, and what each load case has of them."""
+    values, cases = spectrum.values, int(data.cases.max()) + 1
+    resolution = (spectrum.images**2 / (1 + values[:, None])).sum(axis=0)
+    per_case = [data.cases == k for k in range(cases)]
+    alone = [ritz(spectrum, rows)[0] for rows in per_case]
+    return {
+        **data.described,
+        "datum_case": data.cases,
+        "measured": data.values,
+        "sigma": data.sigma,
+        "predicted": predicted,
+        "predicted_std": scale * np.sqrt(resolution),  # S is the covariance of what the model predicts, over the errors
+        "residual": residual,
+        "resolution": resolution,
+        "misfit": np.array([(residual[rows] ** 2).sum() for rows in per_case]),
+        "misfit_degrees": np.array([(1 - resolution[rows]).sum() for rows in per_case]),
+        "misfit_count": np.array([rows.sum() for rows in per_case]),
+        "eigenvalue": values,
+        "determined": (values / (1 + values)).sum(),
+        "alone_eigenvalue": np.array(alone).reshape(cases, -1),
+        "alone_determined": np.array([(found / (1 + found)).sum() for found in alone]),
+    }
+
+
+def ritz(spectrum: Spectrum, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Return λ (r,) of A_kᵀA_k in the span of the pairs, falling, and the coordinates (r, r) of the directions."""
+    images = spectrum.images[:, rows]
+    values, vectors = np.linalg.eigh(images @ images.T)
+    return np.maximum(values[::-1], 0), vectors[:, ::-1].T
+
+
+def of_test(test: ResidualTest) -> Record:
+    """What residuals say of the model."""
+    return {
+        "residual_square": np.array(test.square),
+        "residual_degrees": np.array(test.degrees),
+        "residual_probability": np.array(test.probability),
+        "agreement_probability": np.array(test.agreement_probability),
+    }
+
+
+def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
+    """How far the mode x (N,) is from the centre of the prior, in the directions that the data say more of than it.
+
+    There x has the variance λ/(1+λ) where the truth is drawn from the prior: the squares are of χ².
+    """
+    seen = spectrum.values > 1
+    values = spectrum.values[seen]
+    squares = (spectrum.vectors[seen] @ x) ** 2 * (1 + values) / values
+    return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
+
+
+def of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArray) -> Record:
+    """What a finer mesh adds to the data, over their errors, and to the unknowns."""
+    return {
+        "mesh_checked": np.array(float(gap is not None)),
+        "mesh_why": why,
+        "mesh_error": np.full(len(scale), np.nan) if gap is None else gap / scale,
+        "mesh_shift": shift,
+    }
+
+
+def of_chains(chains: Chains | None) -> Record:
+    """What chains are worth, and how many have mixed: none where there are none."""
+    if chains is None:
+        return {"chains": np.array(0.0), "chain_rhat": np.array(np.nan), "chain_effective": np.array(np.nan)}
+    return {
+        "chains": np.array(float(len(chains.draws) if chains.mixed else 0)),
+        "chain_rhat": np.array(chains.rhat.max()),
+        "chain_effective": np.array(chains.worth),
+    }

@@ -1,0 +1,117 @@
+"""The method `synthesize`: data of a specimen that is known, with errors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from forward.model import FloatArray, SolveError
+from forward.settings import Settings
+from uq.evaluation.evaluate import Evaluate, Request
+from uq.inputs.random_parameters import Inputs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class SyntheticNoise(Settings):
+    """Independent normal errors of all components.
+
+    Parameters
+    ----------
+    relative
+        Standard deviation over the root mean square of the displacements of the load case.
+    absolute
+        Standard deviation (m).
+    """
+
+    relative: Annotated[float, Field(gt=0)] | None = None
+    absolute: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> SyntheticNoise:
+        if (self.relative is None) == (self.absolute is None):
+            message = "expected either relative or absolute"
+            raise ValueError(message)
+        return self
+
+
+class Synthesize(Settings):
+    """Synthetic data: displacements of a specimen that is known, with errors.
+
+    Parameters
+    ----------
+    noise
+        The errors.
+    fraction
+        Share of the points that each data set has: there are as many data sets as numbers.
+    missing
+        Share of the components that are lost beside that.
+    seed
+        Of the errors, of the points, and of parameters that have distributions.
+    """
+
+    kind: Literal["synthesize"] = "synthesize"
+    noise: SyntheticNoise
+    fraction: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(default=(1.0,), min_length=1)
+    missing: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def truths(self, inputs: Inputs) -> FloatArray:
+        """Draw parameters (n, d) for every data set."""
+        count, d = len(self.fraction), len(inputs.names)
+        normals = np.random.default_rng(self.seed).standard_normal((count, d))
+        return inputs.from_normals(normals)[0] if d else np.zeros((count, 0))
+
+    def run(
+        self, inputs: Inputs, evaluate: Evaluate, cases: NDArray[np.int64], points: NDArray[np.int64]
+    ) -> xr.Dataset:
+        """Solve for every data set, and measure.
+
+        Parameters
+        ----------
+        inputs
+            What is drawn afresh for every data set; may be nothing.
+        evaluate
+            The specimen.
+        cases, points
+            Number of the load case, and of the point, of each output (m,).
+
+        Raises
+        ------
+        SolveError
+            If the specimen has no equilibrium.
+        """
+        import xarray as xr
+
+        count, m = len(self.fraction), len(evaluate.outputs)
+        rng = np.random.default_rng([self.seed, 1])
+        truths = self.truths(inputs)
+        found = evaluate(Request(truths))
+        for failure in found.failures:
+            message = f"data set {failure.index}: {failure.reason}"
+            raise SolveError(message, failure.history)
+        sigma = np.empty((count, m))
+        for case in np.unique(cases):
+            of_case = cases == case
+            size = np.sqrt((found.outputs[:, of_case] ** 2).mean(axis=1, keepdims=True))
+            relative, absolute = self.noise.relative, self.noise.absolute
+            sigma[:, of_case] = size * relative if relative is not None else absolute
+        values = found.outputs + sigma * rng.standard_normal((count, m))
+        for k, share in enumerate(self.fraction):
+            kept = np.zeros(points.max() + 1, dtype=bool)
+            number = max(round(share * len(kept)), 1)
+            kept[np.sort(rng.permutation(len(kept))[:number])] = True
+            values[k, ~kept[points] | (rng.uniform(size=m) < self.missing)] = np.nan
+        return xr.Dataset(
+            {
+                "clean": (("data_set", "output"), found.outputs),
+                "values": (("data_set", "output"), values),
+                "sigma": (("data_set", "output"), sigma),
+                "truth": (("data_set", "parameter"), truths),
+            },
+            {"output": list(evaluate.outputs), "parameter": list(inputs.names)},
+        )

@@ -1,0 +1,85 @@
+"""HDF5 and netCDF-4 files made in memory: one on disk that cannot be written to the end kills its process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+File = h5py.File
+
+
+def in_memory(creation: Any = None) -> h5py.File:
+    """Return a new HDF5 file in memory; `creation` is the list of properties that it is created with."""
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
+    access.set_fapl_core(2**20, backing_store=False)
+    return h5py.File(h5py.h5f.create(b"memory", fcpl=creation, fapl=access))
+
+
+def image(file: h5py.File) -> bytes:
+    """Return the bytes of a file in memory, without those that `head` leaves free."""
+    file.flush()
+    return bytes(file.id.get_file_image())
+
+
+def creation(head: int = 0, *, ordered: bool = False) -> Any:
+    """Return the properties of a file with so many bytes before those of HDF5, and without times.
+
+    `ordered` ones keep the order in which things were created, which netCDF-4 needs.
+    """
+    properties = h5py.h5p.create(h5py.h5p.FILE_CREATE)
+    if head:
+        properties.set_userblock(head)
+    return _ordered(properties) if ordered else properties
+
+
+def netcdf(
+    dataset: xr.Dataset,
+    groups: Mapping[str, xr.Dataset] | None = None,
+    head: int = 0,
+    more: Callable[[h5py.File], None] = lambda file: None,
+) -> bytes:
+    """Return the bytes of a netCDF-4 file with groups; equal datasets give equal bytes.
+
+    Parameters
+    ----------
+    dataset, groups
+        Its variables, and those of its groups by their names.
+    head
+        Bytes before those of HDF5.
+    more
+        Writes what is not netCDF into groups of the file.
+    """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    with in_memory(creation(head, ordered=True)) as file:
+        for name in groups or {}:
+            h5py.h5g.create(file.id, name.encode(), gcpl=_ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE)))
+        with h5netcdf.File(file, "a") as whole:
+            dataset.dump_to_store(H5NetCDFStore(whole))  # type: ignore[no-untyped-call]
+            for name, part in (groups or {}).items():
+                part.dump_to_store(H5NetCDFStore(whole.groups[name]))  # type: ignore[no-untyped-call]
+        more(file)
+        return image(file)
+
+
+def _ordered(properties: Any) -> Any:
+    """Properties of a file or group that keeps the order of its parts, and no time, with which HDF5 stamps groups."""
+    order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
+    properties.set_obj_track_times(False)
+    properties.set_link_creation_order(order)
+    properties.set_attr_creation_order(order)
+    return properties
+
+
+def holds(path: Path, group: str) -> bool:
+    """Whether a file has a group."""
+    with h5py.File(path, "r") as file:
+        return group in file

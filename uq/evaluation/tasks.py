@@ -1,0 +1,169 @@
+"""A map over tasks of which each gives a dataset, shared by groups of ranks and kept like blocks of evaluations.
+
+Each group takes the next task when it is free; all of its ranks work on it together. What came of a task, a dataset or
+the reason why there is none, is a file of its own as soon as it is there (`uq.evaluation.checkpoint`): an interrupted
+map goes on with the others. The outcome of a task does not depend on who made it, nor on the others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from forward.model import SolveError
+from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, read, write
+from uq.evaluation.evaluate import Evaluations, merge
+from uq.evaluation.hdf5 import File, holds, netcdf
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.turns import Progress
+
+_SOLVED = "evaluations"  # group of a file
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a task.
+
+    Attributes
+    ----------
+    dataset
+        What it gave; None where it failed.
+    reason
+        Why it failed; empty where it did not.
+    evaluations
+        What was solved for it; None where nothing was.
+    seconds
+        Processor time of its group's first rank.
+    """
+
+    dataset: xr.Dataset | None
+    reason: str
+    evaluations: Evaluations | None
+    seconds: float
+
+    @property
+    def solves(self) -> int:
+        """Number of solves."""
+        return 0 if self.evaluations is None else len(self.evaluations.points)
+
+    def image(self, note: str) -> bytes:
+        """Return the bytes of a netCDF-4 file, with what was solved as a group of HDF5."""
+        import xarray as xr
+
+        dataset = xr.Dataset() if self.dataset is None else self.dataset
+        about = {"note": note, "reason": self.reason, "seconds": self.seconds}
+
+        def more(file: File) -> None:
+            if self.evaluations is not None:
+                write(file.require_group(_SOLVED), self.evaluations)
+
+        return netcdf(dataset.assign_attrs(dataset.attrs | about), head=HEAD, more=more)
+
+    @classmethod
+    def read(cls, path: Path) -> Outcome:
+        """Read an outcome from a file whose checksum is known to be right.
+
+        Raises
+        ------
+        DamagedError
+            If that holds something else.
+        """
+        import xarray as xr
+
+        try:
+            dataset = xr.load_dataset(path, engine="h5netcdf")
+            reason, seconds = str(dataset.attrs.pop("reason")), float(dataset.attrs.pop("seconds"))
+            del dataset.attrs["note"]
+            solved = holds(path, _SOLVED)
+        except (OSError, KeyError, ValueError) as error:
+            raise DamagedError(path) from error
+        return cls(None if reason else dataset, reason, read(path, _SOLVED) if solved else None, seconds)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What decides on an outcome, beside the study."""
+
+    number: int
+    name: str
+
+
+def run_tasks(
+    ensemble: Ensemble,
+    names: Sequence[str],
+    work: Callable[[int, list[Evaluations]], xr.Dataset],
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress = lambda done, failed: None,
+    arrived: Callable[[int, Outcome], None] = lambda number, outcome: None,
+    kept: Callable[[], None] = lambda: None,
+) -> list[Outcome] | None:
+    """Do tasks, each on one group of ranks; collective over all ranks.
+
+    Parameters
+    ----------
+    ensemble
+        The groups.
+    names
+        Of the tasks, by which finished ones are found again.
+    work
+        Does a task, by its number, and appends what it has solved to a list; collective over a group. A task that
+        raises `SolveError` has failed, and the others go on.
+    checkpoint
+        Where finished tasks are kept and found.
+    progress
+        On rank 0: told the numbers of solves that tasks have counted (`Ensemble.count`), and of those that failed.
+    arrived
+        On rank 0: told of each finished task as soon as it is there, in any order.
+    kept
+        In the group that has done a task: called when its file is there.
+
+    Returns
+    -------
+    list
+        The outcomes in the order of the names, on rank 0; None on the other ranks.
+    """
+    from uq.evaluation.turns import abort_all
+
+    world, group = ensemble.world, ensemble.group
+    keys = [] if checkpoint is None else [checkpoint.key(_Task(number, name)) for number, name in enumerate(names)]
+    outcomes: dict[int, Outcome] = {}
+
+    def do(number: int) -> Outcome:
+        begin = time.process_time()
+        solved: list[Evaluations] = []
+        dataset, reason = None, ""
+        try:
+            dataset = work(number, solved)
+        except SolveError as error:
+            reason = error.reason or "no reason was given"
+        evaluations = merge(solved) if solved else None
+        outcome = Outcome(dataset, reason, evaluations, time.process_time() - begin)
+        if group.rank == 0 and checkpoint is not None:
+            checkpoint.save(keys[number], outcome)
+        kept()
+        return outcome
+
+    def receive(number: int, outcome: Outcome, theirs: bool = False) -> None:
+        outcomes[number] = outcome
+        arrived(number, outcome)
+
+    with ensemble.turns(progress) as turns, abort_all(world):
+        if world.rank == 0 and checkpoint is not None:
+            for number, key in enumerate(keys):
+                if checkpoint.has(key):
+                    receive(number, Outcome.read(checkpoint.path(key)))
+                    ensemble.count(outcomes[number].solves, 0)
+        pending = world.bcast([number for number in range(len(names)) if number not in outcomes])
+        if world.rank > 0:
+            turns.follow(pending, do)
+            return None
+        turns.lead(pending, do, receive)
+    return [outcomes[number] for number in range(len(names))]

@@ -1,0 +1,210 @@
+"""Numbered pieces of work that groups of ranks take as they become free; rank 0 receives what comes of each.
+
+A group takes the next piece from a counter in rank 0's memory (an MPI window), so that no one waits for a slow
+neighbour. Rank 0 works too, and receives the results of others while it does.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from forward.machine import reason_to_stop
+from forward.model import ModelError, SolveError
+
+T = TypeVar("T")
+Progress = Callable[[int, int], None]  # told how many solves were done, and failed, since it was last told
+_RESULT = 1
+SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results
+
+
+class Turns:
+    """The turns of the groups of one world; made and used by all of its ranks together.
+
+    Parameters
+    ----------
+    world, group, index
+        All ranks, those of this rank's group, and the number of that group.
+    progress
+        On rank 0, told of what `count` counts in any group.
+    """
+
+    def __init__(self, world: Any, group: Any, index: int, progress: Progress, counters: Sequence[Counter]) -> None:
+        self._world, self._group, self._index = world, group, index
+        self._turn, *tallied = counters
+        self._tally = _Tally(tallied, progress if world.rank == 0 else None)
+        self._drain: Callable[[], None] = lambda: None  # on rank 0: receive what is there
+
+    @classmethod
+    @contextmanager
+    def of(cls, world: Any, group: Any, index: int, progress: Progress) -> Iterator[Turns]:
+        """Make the counters, and give them back; collective."""
+        with counter(world) as turn, counter(world) as solves, counter(world) as failures:
+            yield cls(world, group, index, progress, (turn, solves, failures))
+
+    def count(self, done: int, failed: int) -> None:
+        """Count solves on the first rank of a group; rank 0 hears of them at its own next count."""
+        if self._group.rank == 0:
+            self._tally(done, failed)
+            self._drain()
+
+    def drain(self) -> None:
+        """Rank 0: receive the results that have come."""
+        self._drain()
+
+    def restart(self) -> None:
+        """Rank 0: begin with the first piece again, before the others are told of new pieces."""
+        self._turn.reset()
+
+    def lead(self, pending: Sequence[int], work: Callable[[int], T], receive: Callable[[int, T, bool], None]) -> None:
+        """Rank 0: work on pieces until all are done, here or elsewhere.
+
+        Parameters
+        ----------
+        pending
+            Numbers of the pieces.
+        work
+            Makes what comes of a piece; collective over the group.
+        receive
+            Takes a number, what came of it, and whether another group made it; in any order.
+        """
+        world, missing = self._world, set(pending)
+
+        def accept(i: int, found: T, *, theirs: bool) -> None:
+            missing.discard(i)
+            receive(i, found, theirs)
+
+        def drain() -> None:
+            while world.iprobe(tag=_RESULT):
+                accept(*world.recv(tag=_RESULT), theirs=True)
+
+        self._drain = drain
+        for i, found in self._taken(pending, work):
+            accept(i, found, theirs=False)
+        heard = time.monotonic()
+        while missing:
+            # Waiting as `recv` does, but other groups' solves go on being counted.
+            while not world.iprobe(tag=_RESULT):
+                time.sleep(0)
+                if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
+                    self.count(0, 0)
+                    heard = time.monotonic()
+            accept(*world.recv(tag=_RESULT), theirs=True)
+        # Only when everyone has seen that no turn is left may the counter start again for the next pieces.
+        world.barrier()
+        self.count(0, 0)
+
+    def follow(self, pending: Sequence[int], work: Callable[[int], T]) -> None:
+        """Other ranks: work on pieces until none is left, and send to rank 0 what comes of them."""
+        sent: list[Any] = []
+        for result in self._taken(pending, work):
+            if self._group.rank == 0 and self._index > 0:
+                sent.append(self._world.isend(result, dest=0, tag=_RESULT))
+                sent = [request for request in sent if not request.test()[0]]
+        for request in sent:
+            request.wait()
+        self._world.barrier()
+
+    def _taken(self, pending: Sequence[int], work: Callable[[int], T]) -> Iterator[tuple[int, T]]:
+        """Take pieces until none is left."""
+        group = self._group
+        while True:
+            turn = self._turn.take() if group.rank == 0 else 0
+            if group.size > 1:
+                turn = group.bcast(turn)
+            if turn >= len(pending):
+                return
+            yield pending[turn], work(pending[turn])
+
+
+class Counter:
+    """A number in rank 0's memory that any rank can read and raise in one step."""
+
+    def __init__(self, world: Any) -> None:
+        self._world = world
+        size = MPI.INT64_T.Get_size()
+        self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
+        if world.rank == 0:
+            self.reset()  # what the memory held before is anything
+        world.barrier()
+
+    def reset(self) -> None:
+        """Start from zero again (rank 0, while no one takes)."""
+        zero = np.zeros(1, dtype=np.int64)
+        self._window.Lock(0, MPI.LOCK_EXCLUSIVE)
+        self._window.Put(zero, 0)
+        self._window.Unlock(0)
+
+    def take(self) -> int:
+        """Return the number and raise it by one."""
+        return self.add(1)
+
+    def add(self, count: int) -> int:
+        """Raise the number by a count, and return what it was before."""
+        value = np.empty(1, dtype=np.int64)
+        self._window.Lock(0, MPI.LOCK_SHARED)
+        self._window.Fetch_and_op(np.array([count], dtype=np.int64), value, 0, op=MPI.SUM)
+        self._window.Unlock(0)
+        return int(value[0])
+
+    def free(self) -> None:
+        """Give the window back; collective."""
+        self._window.Free()
+
+
+class _Tally:
+    """Solves of all groups, in rank 0's memory; rank 0 tells its progress what the others have added."""
+
+    def __init__(self, counters: Sequence[Counter], progress: Progress | None) -> None:
+        self._counters = counters
+        self._progress = progress
+        self._told = [0, 0]
+
+    def __call__(self, done: int, failed: int) -> None:
+        """Count solves of this group."""
+        now = [counter.add(count) + count for counter, count in zip(self._counters, (done, failed), strict=True)]
+        if self._progress is not None:
+            new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
+            self._progress(*new)
+
+
+@contextmanager
+def counter(world: Any) -> Iterator[Counter]:
+    """A counter of a world of ranks; collective."""
+    made = Counter(world)
+    try:
+        yield made
+    finally:
+        made.free()
+
+
+@contextmanager
+def abort_all(world: Any) -> Iterator[None]:
+    """An exception that only one rank knows of would leave the others waiting for ever: print it and stop them all."""
+    try:
+        yield
+    except BaseException as error:
+        if world.size == 1:
+            raise
+        end_job(world, error)
+        raise
+
+
+def end_job(world: Any, error: BaseException) -> None:
+    """End the job of all ranks with exit code 1 for an exception of this rank, in one line where it has a reason."""
+    reason = str(error) if isinstance(error, ModelError | SolveError) else reason_to_stop(error)
+    # Where all ranks fail alike, the first one to speak ends the others.
+    time.sleep(min(0.1 * world.rank, 1.0))
+    if reason is None:
+        traceback.print_exception(error)
+    else:
+        sys.stderr.write(f"{'' if isinstance(error, KeyboardInterrupt) else 'failed: '}{reason}\n")
+    sys.stderr.flush()
+    world.Abort(1)

@@ -1,0 +1,301 @@
+"""What is known after inversions: the dataset of all data sets, summary.json, batch.csv, ArviZ's groups."""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.bodies.inclusions import derived, log_factor
+from inverse.low_dimensional.posterior import NOISE
+from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
+from workflows.studies.findings_inversion import judged
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import FloatArray
+    from uq.evaluation.tasks import Outcome
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.measured import Measurement
+
+BATCH = "batch.csv"
+PRIOR_DRAWS = 1024
+
+
+def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Any) -> xr.Dataset:
+    """Put what inversions of all data sets have left into a dataset, with what is known beside it.
+
+    Parameters
+    ----------
+    study
+        What was asked.
+    outcomes
+        Of the inversions.
+    vertices
+        Places (N, 3) of the vertices, cells (n_cells, k), and VTK's number of their kind.
+    """
+    import xarray as xr
+
+    each = [one.dataset for one in outcomes]
+    places, cells, kind = vertices
+    record = stacked(each, usual_sizes(study.method, field=study.field))
+    held: dict[str, Any] = dict(record)
+    held["why"] = (
+        "data_set",
+        [one.reason if one.dataset is None else str(one.dataset["why"].item()) for one in outcomes],
+    )
+    held["mesh_why"] = ("data_set", ["" if one is None else str(one["mesh_why"].item()) for one in each])
+    held["ok"] = ("data_set", [one is not None for one in each])
+    found = list(study.measurements)
+    count = len(found)
+    held["points_moved"] = ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found])
+    held["largest_move"] = ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found])
+    mean, std, stiffness_std = prior_moments(study, places)
+    held["prior_mean"], held["prior_std"] = ("parameter", mean), ("parameter", std)
+    held["stiffness_prior_std"] = ("node", stiffness_std)
+    true = np.full((count, len(study.names)), np.nan)
+    for k, m in enumerate(found):
+        for name, value in ({} if m is None else m.truth).items():
+            if name in study.names:
+                true[k, study.names.index(name)] = value
+    held["true"] = (("data_set", "parameter"), true)
+    held |= _volumes(study, {name: values for name, (_, values) in record.items()}, found)
+    held["stiffness_true"] = (("data_set", "node"), np.array([_true_at(study, m, places) for m in found]))
+    held["node_position"] = (("node", "axis"), places)
+    held["cell_nodes"] = (("cell", "corner"), cells, {"vtk_cell_type": kind})
+    coordinates = {
+        "data_set": [item.name for item in study.data.sets],
+        "parameter": list(study.names),
+        "partner": list(study.names),
+        "case": [case.name for case in study.model.cases],
+        "axis": ["x", "y", "z"],
+        "column": list(COLUMNS["field" if study.field else "parameters"]),
+    }
+    return xr.Dataset(held, coordinates)
+
+
+def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
+    """Posterior of the volumes (m³) of inclusions whose radii are unknown, by the draws that are kept."""
+    names = study.inputs.names
+    before = derived(study.model.inclusions, names, prior_draws(study)) if not study.field else {}
+    labels = [label for label, values in before.items() if np.ptp(values) > 0]
+    if not labels:
+        return {}
+
+    def of(points: FloatArray, inclusions: tuple[Any, ...] = study.model.inclusions) -> FloatArray:
+        values = derived(inclusions, names if points.shape[1] else (), points)
+        return np.column_stack([values.get(label, np.full(len(points), np.nan)) for label in labels])
+
+    draws = np.array([of(rows[:, : len(names)]) for rows in record["draw"]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of data sets that could not be inverted there are none
+        lower, upper = np.nanquantile(draws, ENDS, axis=1)
+        mean, std = np.nanmean(draws, axis=1), np.nanstd(draws, axis=1)
+    true = np.array([of(np.zeros((1, 0)), m.inclusions if m is not None else ())[0] for m in found])
+    here = {"mode": of(record["mode"][:, : len(names)]), "mean": mean, "std": std, "lower": lower, "upper": upper}
+    prior = np.column_stack([before[label] for label in labels])
+    return {
+        **{f"volume_{name}": (("data_set", "inclusion"), values) for name, values in here.items()},
+        "volume_true": (("data_set", "inclusion"), true),
+        "volume_prior_mean": ("inclusion", prior.mean(axis=0)),
+        "volume_prior_std": ("inclusion", prior.std(axis=0)),
+        "inclusion": ("inclusion", [label.split(".")[1] for label in labels]),
+    }
+
+
+def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean and standard deviation (c,) of the parameters before the data, and that of ln stiffness (N,) at places."""
+    if study.field:
+        field = study.model.fields[0]
+        prior = field.prior(study.model.body)
+        volumes = prior.matern.mass
+        g = volumes / volumes.sum()
+        width = float(np.linalg.norm(prior.root_transposed(g)))
+        moments = [(float(np.log(field.mean) - field.log_std**2 / 2), width)]
+        stiffness_std = np.sqrt(prior.variance)
+    else:
+        moments = list(zip(study.inputs.mean, study.inputs.std, strict=True))
+        stiffness_std = study.stiffness(places, prior_draws(study)).std(axis=0)
+    if study.method.noise is not None:
+        moments.append(study.method.noise.moments)
+    mean, std = np.array(moments).T
+    return mean, std, stiffness_std
+
+
+def prior_draws(study: Inversion) -> FloatArray:
+    """Draws (n, d) of the parameters before the data."""
+    rng = np.random.default_rng(study.method.seed)
+    kept = np.zeros((0, len(study.inputs.names)))
+    while len(kept) < PRIOR_DRAWS:
+        points = study.inputs.from_normals(rng.standard_normal((PRIOR_DRAWS, len(study.inputs.names))))[0]
+        kept = np.concatenate([kept, points[study.inputs.allowed(points)]])
+    return kept[:PRIOR_DRAWS]
+
+
+def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArray) -> FloatArray:
+    """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is not known."""
+    if measurement is None:
+        return np.full(len(places), np.nan)
+    if measurement.inclusions:
+        return np.asarray(log_factor(measurement.inclusions, (), np.zeros((1, 0)), places)[0])
+    if len(measurement.places):
+        from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+        linear = LinearNDInterpolator(measurement.places, measurement.stiffness)(places)
+        nearest = NearestNDInterpolator(measurement.places, measurement.stiffness)(places)
+        return np.asarray(np.where(np.isfinite(linear), linear, nearest))  # beyond the hull, by rounding
+    return np.full(len(places), np.nan)
+
+
+def summary(found: xr.Dataset) -> dict[str, Any]:
+    """Return the part of summary.json that follows from the results; that of the only data set stands above it."""
+    sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
+    only = next(iter(sets.values())) if len(sets) == 1 else {}
+    return {**only, "solves": int(np.nansum(found["solves"])), "data_sets": sets}
+
+
+def _one(found: xr.Dataset) -> dict[str, Any]:
+    if not bool(found["ok"]):
+        return {"failed": str(found["why"].item())}
+    numbers = ("log_evidence", "log_evidence_error", "determined", "residual_probability")
+    return {
+        "posterior": {
+            str(name): {key: _number(found[key].sel(parameter=name)) for key in ("mode", "std", "lower", "upper")}
+            for name in found.parameter.values
+        },
+        **{key: _number(found[key]) for key in numbers},
+        "verdict": str(found["why"].item()),
+    }
+
+
+def _number(value: Any) -> float | None:
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+STATISTICS = ("mode", "mean", "std", "lower", "upper", "true")
+NUMBERS = ("log_evidence", "log_evidence_error", "determined", "residual_square", "residual_degrees")
+
+
+def batch_table(found: xr.Dataset) -> str:
+    """Return a table of comma-separated values with a row for each data set."""
+    names, cases = ([str(name) for name in found[key].values] for key in ("parameter", "case"))
+    return _table([_head(names, cases), *(_row(found.sel(data_set=label)) for label in found.data_set.values)])
+
+
+def _table(rows: Iterable[Sequence[Any]]) -> str:
+    file = io.StringIO()
+    csv.writer(file, lineterminator="\n").writerows(rows)
+    return file.getvalue()
+
+
+def _head(names: Sequence[str], cases: Sequence[str]) -> list[str]:
+    of_parameters = [f"{name} {key}" for name in names for key in STATISTICS]
+    of_cases = [f"misfit {case}" for case in cases]
+    return [
+        "data_set",
+        "ok",
+        "data",
+        "points_moved",
+        *of_parameters,
+        *NUMBERS,
+        "residual_probability",
+        *of_cases,
+        "why",
+    ]
+
+
+def _row(one: xr.Dataset) -> list[Any]:
+    """Cells of a data set."""
+    values = [one[key].sel(parameter=name) for name in one.parameter.values for key in STATISTICS]
+    values += [one[key] for key in (*NUMBERS, "residual_probability")]
+    values += [one["misfit"].sel(case=case) for case in one.case.values]
+    shown = [f"{float(value):.8g}" if np.isfinite(float(value)) else "" for value in values]
+    count = int(np.isfinite(one["measured"]).sum())
+    ok = "yes" if bool(one["ok"]) else "no"
+    return [str(one.data_set.item()), ok, count, int(one["points_moved"]), *shown, str(one["why"].item())]
+
+
+class Rows:
+    """The table of a batch, written anew whenever a data set is finished; the sets stand in their order.
+
+    Parameters
+    ----------
+    study
+        All data sets.
+    vertices
+        As of `dataset`.
+    write
+        Writes the table.
+    """
+
+    def __init__(self, study: Inversion, vertices: Any, write: Callable[[str], None]) -> None:
+        self._study, self._vertices, self._write = study, vertices, write
+        self._rows: dict[int, list[Any]] = {}
+        self._head = _head(study.names, [case.name for case in study.model.cases])
+
+    def add(self, number: int, outcome: Outcome) -> None:
+        """Add a finished data set."""
+        sets, measurement = self._study.data.sets[number], self._study.measurements[number]
+        if outcome.dataset is None:
+            moved = 0 if measurement is None else int((measurement.moved > 0).sum())
+            empty = [""] * (len(self._head) - 5)
+            self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason]
+        else:
+            data = self._study.data.model_copy(update={"sets": (sets,)})
+            alone = self._study.model_copy(update={"data": data, "measurements": (measurement,)})
+            found = judged(dataset(alone, [outcome], self._vertices), alone)
+            self._rows[number] = _row(found.isel(data_set=0))
+        self._write(_table([self._head, *(self._rows[number] for number in sorted(self._rows))]))
+
+
+def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
+    import xarray as xr
+
+    of_set = found if found.sizes["data_set"] > 1 else found.isel(data_set=0, drop=True)
+
+    # Draws of chains stand one after the other, as many of each.
+    counts = set(found["chains"].to_numpy()[found["ok"].to_numpy()].astype(int).tolist())
+    chains = max(counts.pop() if len(counts) == 1 and not study.field else 1, 1)
+    each = found.sizes["sample"] // chains
+
+    def draws(name: str) -> Any:
+        values = of_set[name].isel(sample=slice(chains * each)).transpose("sample", ...)
+        shape = (chains, each, *values.shape[1:])
+        dims = ("chain", "draw", *values.dims[1:])
+        here = {key: value for key, value in values.coords.items() if "sample" not in value.dims}
+        return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
+
+    left: dict[str, xr.Dataset] = {}
+    observed = {"displacement": of_set["measured"]}
+    left["observed_data"] = xr.Dataset(observed).drop_vars("parameter", errors="ignore")
+    if study.field:
+        left["posterior"] = xr.Dataset({"stiffness": draws("stiffness_draw")})
+        return left
+    whole = draws("draw")
+    left["posterior"] = xr.Dataset({str(name): whole.sel(parameter=name, drop=True) for name in found.parameter.values})
+    before = prior_draws(study)
+    columns = {name: (("chain", "draw"), before[None, :, i]) for i, name in enumerate(study.inputs.names)}
+    if study.method.noise is not None:
+        z = np.random.default_rng([study.method.seed, 1]).standard_normal(PRIOR_DRAWS)
+        columns[NOISE] = (("chain", "draw"), study.method.noise.from_normal(z)[0][None])
+    left["prior"] = xr.Dataset(columns)
+    dense = draws("draw_log_likelihood")
+    left["log_likelihood"] = xr.Dataset({"displacement": dense})
+    seen = np.isfinite(found["measured"].to_numpy())
+    if (
+        len(seen) > 1 and not seen.all()
+    ):  # of different numbers of data: one variable of each, without what is filled up
+        parts = {
+            str(name): dense.sel(data_set=name, drop=True)[..., here].rename(datum=f"datum_{name}")
+            for name, here in zip(found.data_set.values, seen, strict=True)
+            if here.any()
+        }
+        left["log_likelihood"] = left["log_likelihood"].assign(parts)
+    return left

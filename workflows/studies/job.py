@@ -1,0 +1,156 @@
+"""What the ranks do for a study: evaluations that a method asks for, or tasks that each give a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import xarray as xr
+
+    from forward.model import FloatArray, ForwardModel
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.tasks import Outcome
+    from uq.evaluation.turns import Progress
+
+Groups = Callable[["xr.Dataset"], Mapping[str, "xr.Dataset"]]
+Texts = Callable[["xr.Dataset"], Mapping[str, str]]
+
+
+class Job(Protocol):
+    """What the ranks do for a study."""
+
+    @property
+    def labelled(self) -> Callable[[xr.Dataset], xr.Dataset]:
+        """Adds to the results what the method does not know."""
+
+    @property
+    def groups(self) -> Groups:
+        """Groups of results.nc beside its own variables."""
+
+    @property
+    def texts(self) -> Texts:
+        """Further files of the directory, by name."""
+
+    @property
+    def evaluations(self) -> dict[str, Evaluations]:
+        """What was evaluated, by the name that it is kept under."""
+
+    @property
+    def outcomes(self) -> Sequence[Outcome]:
+        """What came of tasks, where there are any, in their order."""
+
+    def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
+        """Do it: results on rank 0, None on the others; collective over all ranks."""
+
+
+@dataclass(frozen=True)
+class MethodJob:
+    """Evaluations that a method asks for.
+
+    Attributes
+    ----------
+    model, others
+        Models number 0, and 1, 2, …
+    task
+        Runs the method on rank 0.
+    recorders
+        What was evaluated, by the name that it is kept under.
+    labelled, groups, texts
+        As of `Job`.
+    costly
+        Whether solves are worth a file: where they are not, an interrupted study begins again.
+    node_volumes
+        Of the nodes of the first model, see `Evaluate`; on rank 0, if a method asks.
+    """
+
+    model: ForwardModel
+    others: list[Callable[[], ForwardModel]]
+    task: Callable[[Evaluate], xr.Dataset]
+    recorders: dict[str, Recorder]
+    labelled: Callable[[xr.Dataset], xr.Dataset]
+    costly: bool = True
+    groups: Groups = field(default=lambda _: {})
+    texts: Texts = field(default=lambda _: {})
+    node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
+
+    @property
+    def evaluations(self) -> dict[str, Evaluations]:
+        """What was evaluated, by the name that it is kept under."""
+        return {name: merge(recorder.log) for name, recorder in self.recorders.items()}
+
+    @property
+    def outcomes(self) -> Sequence[Outcome]:
+        """There are no tasks."""
+        return ()
+
+    def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
+        """Run the method on rank 0, with an evaluation that all groups work on; collective over all ranks."""
+        return ensemble.run(
+            self.model,
+            self.task,
+            others=self.others,
+            checkpoint=checkpoint if self.costly else None,
+            progress=progress,
+            blocks=blocks,
+            node_volumes=self.node_volumes,
+        )
+
+
+@dataclass(frozen=True)
+class TasksJob:
+    """Tasks that groups of ranks share, each of which gives a dataset.
+
+    Attributes
+    ----------
+    names
+        Of the tasks.
+    work, arrived, kept
+        As of `uq.evaluation.tasks.run_tasks`.
+    results
+        The dataset of the study from the outcomes of all tasks.
+    labelled, groups, texts
+        As of `Job`.
+    outcomes
+        Those of all tasks, once they are done.
+    """
+
+    names: Sequence[str]
+    work: Callable[[int, list[Evaluations]], xr.Dataset]
+    arrived: Callable[[int, Outcome], None]
+    kept: Callable[[], None]
+    results: Callable[[Sequence[Outcome]], xr.Dataset]
+    labelled: Callable[[xr.Dataset], xr.Dataset]
+    groups: Groups = field(default=lambda _: {})
+    texts: Texts = field(default=lambda _: {})
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    @property
+    def evaluations(self) -> dict[str, Evaluations]:
+        """What was solved for each task, by its name."""
+        pairs = zip(self.names, self.outcomes, strict=True)
+        return {name: one.evaluations for name, one in pairs if one.evaluations is not None}
+
+    def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
+        """Do the tasks, one after the other in each group; collective over all ranks."""
+        from uq.evaluation.tasks import run_tasks
+
+        found = run_tasks(
+            ensemble,
+            self.names,
+            self.work,
+            checkpoint=checkpoint,
+            progress=progress,
+            arrived=self.arrived,
+            kept=self.kept,
+        )
+        if found is None:
+            return None
+        self.outcomes.extend(found)
+        return self.results(found)

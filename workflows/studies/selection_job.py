@@ -1,0 +1,59 @@
+"""The job of a study that compares models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
+from inverse.criticism.finer import Finer
+from uq.evaluation.evaluate import Evaluate, Recorder, SerialEvaluate
+from uq.findings import add
+from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
+from workflows.studies.finer import once_on_finer_mesh, solved_by
+from workflows.studies.job import MethodJob
+from workflows.studies.selection import groups
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import ForwardModel
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.selection import Comparison
+
+
+def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
+    """The candidates, each for each group of data; making them is collective over the group."""
+    pairs = study.pairs
+    makers = [cache(partial(study.build, *pair, ensemble.group)) for pair in pairs]
+    recorders: dict[str, Recorder] = {}
+    why = study.unchecked
+    checked = [number for number, (name, _) in enumerate(pairs) if not why.get(name, "none")]
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        def recorded(name: str, group: str) -> Evaluate:
+            recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
+            return recorders[f"{name}/{group}"]
+
+        def free(name: str, group: str) -> Evaluate:
+            # What nested sampling solves is too much, and too cheap, to keep.
+            return SerialEvaluate(study.build(name, group), ensemble.count)
+
+        def finer(name: str, group: str) -> Finer:
+            number = pairs.index((name, group))
+            if number not in checked:
+                return Finer(None, why[name])
+            return solved_by(recorders[f"{name}/{group}"].on(len(pairs) + checked.index(number)))
+
+        return study.method.run(study.models, study.groups, recorded, free, finer if why else None)
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = found.assign_attrs(quantity=study.quantity)
+        candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
+        doubts = doubts_of_selection(found, candidates, study.method.noise.factor)
+        add(found, *findings(found), *doubts)
+        return trusted_on_meshes(found)
+
+    others: list[Callable[[], ForwardModel]] = [*makers[1:]]
+    others += [partial(once_on_finer_mesh, makers[number]) for number in checked]
+    return MethodJob(makers[0](), others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)

@@ -1,0 +1,197 @@
+"""Studies that make synthetic data: a specimen that is known is solved, and measured with errors."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from forward.bodies.inclusions import log_factor
+from forward.scalars import Mistake
+from forward.settings import Settings
+from forward.specimen import Specimen
+from inverse.methods.synthesize import Synthesize
+from uq.evaluation.evaluate import Recorder
+from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.random_parameters import Inputs
+from workflows.config.priors import mistakes_of_materials
+from workflows.config.study import Correlation, Parallel, mistakes_of_parameters, ranges, refused
+from workflows.studies.job import MethodJob
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import Finding, FloatArray
+    from forward.specimen import SpecimenModel
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.evaluate import Evaluate
+
+
+class Synthesis(Settings):
+    """What synthetic data to make.
+
+    Parameters
+    ----------
+    model
+        The specimen that is measured, with what is observed of it.
+    parameters
+        Distributions of numbers that are drawn for each data set; coefficients of random fields always are.
+    correlations
+        Correlations between them.
+    method
+        Errors, and the points that data sets have.
+    parallel
+        Use of ranks.
+    """
+
+    model: Specimen
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    method: Synthesize
+    parallel: Parallel = Parallel()
+
+    @cached_property
+    def specimen(self) -> Specimen:
+        """The specimen, in the formulation that suits all values of its parameters."""
+        specimen: Specimen = self.model.over(ranges(self.parameters))
+        return specimen
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the specimen before anything is solved."""
+        return (*self.model.findings, *self.model.locking(ranges(self.parameters)))
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """What is drawn for each data set."""
+        standard = dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+        return Inputs(self.parameters | standard, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def planned(self) -> int:
+        """Number of solves."""
+        return len(self.method.fraction) + 1
+
+    def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
+        """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
+        return log_factor(self.model.inclusions, self.inputs.names, points, places)
+
+    @model_validator(mode="after")
+    def _check(self) -> Synthesis:
+        refused("Synthesis", list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        if not self.model.observed:
+            yield ("model", "observed"), "nothing is observed, expected boundaries or points", ()
+        for i, field in enumerate(self.model.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+        materials = self.model.materials(self.parameters)
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters, materials.names)
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            yield from mistakes_of_materials(inputs.within(materials), materials)
+
+
+def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
+    """An inclusion with other numbers, by their paths."""
+    block: dict[str, Any] = inclusion.model_dump()
+    return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
+
+
+def points_of(model: SpecimenModel) -> NDArray[np.int64]:
+    """Number (m,) of the point that each output of a specimen is observed at, the same in all load cases."""
+    return np.asarray(np.unique(np.round(model.places, 12), axis=0, return_inverse=True)[1].ravel())
+
+
+def with_factor(study: Synthesis, found: xr.Dataset, places: FloatArray, fields: Any) -> xr.Dataset:
+    """Add the true factor on the stiffness at places (k, 3) of each data set, as rows x, y, z, factor.
+
+    Parameters
+    ----------
+    fields
+        Factors (n, k) of the random fields on the stiffness, all together.
+    """
+    points = found["truth"].to_numpy()
+    factor = fields * np.exp(study.stiffness(places, points))
+    table = np.concatenate([np.broadcast_to(places, (len(points), *places.shape)), factor[:, :, None]], axis=2)
+    return found.assign(factor=(("data_set", "place", "axis"), table))
+
+
+def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) -> dict[str, str]:
+    """Return the texts of the files of synthetic data, by their names."""
+    texts = {}
+    points, cases, axes, places = model
+    count = found.sizes["data_set"]
+    scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
+    varies = [
+        path
+        for path in scalars
+        if path.startswith(("inclusions.", "material.", "regions.")) or path in study.parameters
+    ]
+    for k in range(count):
+        one = found.isel(data_set=k)
+        truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
+        label = name if count == 1 else f"{name}-{k + 1}"
+        file = io.StringIO()
+        noise = study.method.noise.model_dump(exclude_none=True)
+        body = study.model.body
+        file.write(
+            f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), errors "
+            f"{', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}.\n"
+        )
+        file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
+        if study.model.inclusions and not study.model.fields:
+            inclusions = [_with_values(inclusion, truth) for inclusion in study.model.inclusions]
+            file.write(f"# truth.inclusions = {json.dumps(inclusions)}\n")
+        if study.model.fields:
+            file.write(f"# truth.stiffness = truth/{label}.csv\n")
+            lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
+            texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
+        file.write("x,y,z,ux,uy,uz,sigma,case\n")
+        values, sigma = one["values"].values, one["sigma"].values
+        for case, case_name in enumerate(c.name for c in study.model.cases):
+            for point in np.unique(points[cases == case]):
+                rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
+                if len(rows) == 0:
+                    continue
+                motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
+                where = ",".join(f"{x:.8g}" for x in np.round(places[rows[0]], 12) + 0.0)
+                cells = ",".join(motion.get(axis, "") for axis in range(3))
+                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}\n")
+        texts[f"{label}.csv"] = file.getvalue()
+    return texts
+
+
+def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
+    """The specimen that is known; collective over the group."""
+    model = study.specimen.build(ensemble.group, study.inputs.names)
+    places, points = model.models[0].layout.coordinates, points_of(model)
+    factor = np.ones((len(study.method.fraction), 1))
+    if study.model.fields and ensemble.index == 0:
+        drawn = model.models[0].factors(study.method.truths(study.inputs)[:, model.positions[0]])
+        for one in (random for random in study.model.fields if random.of == "stiffness" and ensemble.group.rank == 0):
+            factor = factor * drawn[one.label]
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        return study.method.run(study.inputs, recorders["/"], model.cases, points)
+
+    def texts(found: xr.Dataset) -> dict[str, str]:
+        made = synthetic_files(study, name, found, (points, model.cases, model.axes, model.places))
+        return {f"data/{file}": text for file, text in made.items()}
+
+    labelled = partial(with_factor, study, places=places, fields=factor)
+    return MethodJob(model, [], task, recorders, labelled, texts=texts)
