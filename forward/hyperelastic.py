@@ -23,7 +23,8 @@ from forward.observables.outputs import Output, PointDisplacement, Reaction
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
-from forward.terms.loads import LOAD_SIZES, Displacement, Gravity, Load, Pressure
+from forward.terms.displacement import Displacement
+from forward.terms.term import Load
 
 
 class _Fibrous(Settings):
@@ -195,8 +196,8 @@ class Hyperelastic(Settings):
                     value = getattr(inclusion, name)
                     found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         for load in self.loads:
-            size = LOAD_SIZES[load.kind]
-            found[f"loads.{load.label}.{size}"] = Scalar(getattr(load, size), type(load), size)
+            for name, value in load.values.items():
+                found[f"loads.{load.label}.{name}"] = Scalar(value, type(load), name)
         for displacement in self.displacements:
             for axis, value in displacement.components.items():
                 found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
@@ -215,6 +216,11 @@ class Hyperelastic(Settings):
     def unknowns(self) -> int:
         """Number of unknowns: displacements and, in the mixed form, pressures."""
         return 3 * self.body.nodes + (self.body.vertex_count if self.mixed else 0)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the stiffness is symmetric: no load follows the body."""
+        return all(load.symmetric for load in self.loads)
 
     @property
     def mixed(self) -> bool:
@@ -268,7 +274,7 @@ class Hyperelastic(Settings):
 
     def _of_followers(self) -> Iterator[Finding]:
         """What the test of stability cannot see under loads that turn with the body."""
-        followers = [load.label for load in self.loads if isinstance(load, Pressure)]
+        followers = [load.label for load in self.loads if not load.symmetric]
         if followers and not self.solver.accept_unstable:
             text = (
                 f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. "
@@ -397,7 +403,7 @@ class Hyperelastic(Settings):
 
     def _mistakes_of_fields(self) -> Iterator[Mistake]:
         for i, field in enumerate(self.fields):
-            if field.of == "density" and not any(isinstance(load, Gravity) for load in self.loads):
+            if field.of == "density" and not any(load.of_density for load in self.loads):
                 yield ("fields", i, "of"), "no load is gravity, expected one where the density varies", field.of
             if field.modes is not None and field.modes > self.body.vertex_count:
                 message = f"more modes than the mesh has vertices, expected at most {self.body.vertex_count}"

@@ -39,14 +39,15 @@ class Settings(BaseModel):
 
 
 class Named(Settings):
-    """Something that parameter paths refer to by its name (by default its kind)."""
+    """Something that parameter paths refer to by its name (by default its kind, without the module it comes from)."""
 
     name: str = Field(default="", pattern=r"^[^.\s]*$")
 
     @property
     def label(self) -> str:
         """The name in parameter paths."""
-        return self.name or str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
+        kind = str(getattr(self, "kind"))  # noqa: B009 - every subclass has a kind
+        return self.name or kind.rpartition(".")[2]
 
 
 LONGEST = 80  # letters of a value in a message

@@ -29,7 +29,8 @@ from forward.observables.outputs import Output
 from forward.scalars import Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
-from forward.terms.loads import Displacement, Load
+from forward.terms.displacement import Displacement
+from forward.terms.term import Load
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Gt
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from forward.bodies.mesh_file import OwnMesh
 from forward.model import Finding, FloatArray
@@ -21,6 +21,25 @@ AXES: tuple[Axis, ...] = ("x", "y", "z")
 Length = Annotated[float, Gt(0)]
 Count = Annotated[int, Gt(0)]
 Vector = tuple[float, float, float]
+
+
+def _has_length(direction: Vector) -> Vector:
+    if not any(direction):
+        message = "has length zero, expected a vector such as [0, -1, 0]"
+        raise ValueError(message)
+    return direction
+
+
+Direction = Annotated[Vector, AfterValidator(_has_length)]
+
+
+def unit_vector(direction: Vector) -> Vector:
+    """Return a direction with length one."""
+    x, y, z = direction
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
 ROUNDING = 1e-6  # of that distance: a move that is none
 NEARBY = 1e-3  # of the diagonal of a body: distance from it that is an inaccuracy of places
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Gt
+from annotated_types import Gt, Unit
 from pydantic import BeforeValidator, Field
 
 from forward.bodies.geometry import Length
@@ -44,12 +44,12 @@ class Sphere(Named):
     """
 
     kind: Literal["sphere"] = "sphere"
-    x: float
-    y: float
-    z: float
-    radius: Length
-    contrast: Annotated[float, Gt(0)]
-    width: Length
+    x: Annotated[float, Unit("m")]
+    y: Annotated[float, Unit("m")]
+    z: Annotated[float, Unit("m")]
+    radius: Annotated[Length, Unit("m")]
+    contrast: Annotated[float, Gt(0), Unit("1")]
+    width: Annotated[Length, Unit("m")]
 
 
 class Ellipsoid(Named):
@@ -72,17 +72,17 @@ class Ellipsoid(Named):
     """
 
     kind: Literal["ellipsoid"] = "ellipsoid"
-    x: float
-    y: float
-    z: float
-    a: Length
-    b: Length
-    c: Length
-    turn_x: float = 0.0
-    turn_y: float = 0.0
-    turn_z: float = 0.0
-    contrast: Annotated[float, Gt(0)]
-    width: Length
+    x: Annotated[float, Unit("m")]
+    y: Annotated[float, Unit("m")]
+    z: Annotated[float, Unit("m")]
+    a: Annotated[Length, Unit("m")]
+    b: Annotated[Length, Unit("m")]
+    c: Annotated[Length, Unit("m")]
+    turn_x: Annotated[float, Unit("rad")] = 0.0
+    turn_y: Annotated[float, Unit("rad")] = 0.0
+    turn_z: Annotated[float, Unit("rad")] = 0.0
+    contrast: Annotated[float, Gt(0), Unit("1")]
+    width: Annotated[Length, Unit("m")]
 
 
 def _sphere(ops: Any, X: Any, *, x: Any, y: Any, z: Any, radius: Any, width: Any) -> Any:

@@ -10,7 +10,7 @@ indefinite. Forces (N) and volumes (m³), metres and pascals share vectors, so n
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, Literal, assert_never
@@ -31,7 +31,7 @@ from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.materials.energies import MATERIALS
 from forward.model import FloatArray, SolveError, Work
 from forward.solvers.newton import Residual
-from forward.terms.loads import LOAD_SIZES, Gravity, Pressure, Traction
+from forward.terms.term import Place, Term
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
@@ -86,8 +86,9 @@ class Discretisation:
         self.J = ufl.det(self.F)
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
+        self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
         self._loads = self._virtual_works()
-        self.symmetric = not any(isinstance(load, Pressure) for load in spec.loads)
+        self.symmetric = spec.symmetric
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
@@ -210,34 +211,48 @@ class Discretisation:
     def _matrix(self, form: Any) -> Any:
         return compile.compile_form(self._invariants.inserted(form), self.comm)
 
-    def _virtual_works(self) -> list[tuple[Any, Any]]:
-        """Virtual works (integrand, measure) of the loads, with the sign of forces that are out of balance."""
+    def _virtual_works(self) -> list[Any]:
+        """Forms of the virtual works of the loads, with the sign of forces that are out of balance.
+
+        In load steps the numbers of a load are scaled where it is linear in them, else the whole load.
+        """
         works = []
         for load in self.spec.loads:
-            size = self._load * self._variables[f"loads.{load.label}.{LOAD_SIZES[load.kind]}"]
-            match load:
-                case Gravity():
-                    pull = spaces.constant(self.mesh, load.acceleration * np.array(load.unit))
-                    works.append((-size * self._factor_of("density") * ufl.dot(pull, self.test), self.dx))
-                case Traction():
-                    direction = spaces.constant(self.mesh, load.unit)
-                    works.append((-size * ufl.dot(direction, self.test), self.surface(load.on)))
-                case Pressure():
-                    # Nanson's formula: the deformed area element is J F⁻ᵀ N dS.
-                    normal = ufl.dot(self.J * ufl.inv(self.F).T, ufl.FacetNormal(self.mesh))
-                    works.append((size * ufl.dot(normal, self.test), self.surface(load.on)))
-                case _:
-                    assert_never(load)
+            numbers = self._numbers(f"loads.{load.label}")
+            work = self._out_of_balance(load, {name: self._load * number for name, number in numbers.items()})
+            if not _linear(work, numbers.values()):
+                self._proportional = False
+                work = self._load * self._out_of_balance(load, numbers)
+            works.append(work)
         return works
 
+    def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
+        at = Place(
+            u=self.u,
+            v=self.test,
+            F=self.F,
+            J=self.J,
+            X=ufl.SpatialCoordinate(self.mesh),
+            normal=ufl.FacetNormal(self.mesh),
+            dx=self.dx,
+            on=self.surface,
+            numbers=numbers,
+            density=self._factor_of("density"),
+            constant=lambda value: spaces.constant(self.mesh, value),
+        )
+        potential = load.potential(at)
+        if potential is None:
+            return load.virtual_work(at)
+        return ufl.algorithms.expand_derivatives(ufl.derivative(potential, self._state, self._variation))
+
     def _imbalance_form(self, change: Callable[[Any], Any | None] = lambda integrand: integrand) -> Any | None:
-        """Virtual work of all forces, with each integrand replaced by its `change`; nothing if all vanish."""
+        """Virtual work of all forces, with each integrand replaced by its `change`; None if all vanish."""
         density = change(self._potential)
         terms = [] if density is None else [self._variation_of(density) * self.dx]
-        for integrand, measure in self._loads:
-            changed = change(integrand)
+        for integral in (integral for work in self._loads for integral in work.integrals()):
+            changed = change(integral.integrand())
             if changed is not None:
-                terms.append(changed * measure)
+                terms.append(ufl.Form([integral.reconstruct(changed)]))
         return sum(terms[1:], terms[0]) if terms else None
 
     def along_parameters(self, integrand: Any) -> Any | None:
@@ -294,19 +309,25 @@ class Discretisation:
         """
         paths = [path for path in self._constants if path.startswith("loads.")]
         forces: dict[str, FloatArray] = {}
-        kept, work = self._load.value.copy(), self.work
-        self._load.value = 1.0
-        self.work = Work()  # the first solution is charged no more than the others
+        work, self.work = self.work, Work()  # the first solution is charged no more than the others
         for path in ("", *paths):
             for other in paths:
                 self._constants[other].value = float(other == path)
-            forces[path] = self._imbalance(np.zeros(self.size)) - forces.get("", 0.0)
-            forces[path][self.fixed] = 0
+            forces[path] = self._forces_at_rest() - forces.get("", 0.0)
             if path == "" and self.norm(forces[path]) <= self.rounding(np.zeros(self.size), 0.0):
                 forces[path][:] = 0
         for path in paths:
             self._constants[path].value = self._values[path]
-        self._load.value, self.work = kept, work
+        self.work = work
+        return forces
+
+    def _forces_at_rest(self) -> FloatArray:
+        """Forces (U_local,) on the undeformed body, of whole loads."""
+        kept = self._load.value.copy()
+        self._load.value = 1.0
+        forces = self._imbalance(np.zeros(self.size))
+        forces[self.fixed] = 0
+        self._load.value = kept
         return forces
 
     def new_solver(self) -> linear.DirectSolver:
@@ -360,9 +381,9 @@ class Discretisation:
         for path, mover in self._movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
-        external = np.zeros(self.size)
+        external = np.zeros(self.size) if self._proportional else self._forces_at_rest()
         with np.errstate(invalid="ignore"):  # a load that is not finite has no finite residual, which the solver says
-            for path, force in self._unit_loads.items():
+            for path, force in self._unit_loads.items() if self._proportional else ():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
         for field in self.fields:  # the size of the loads is that without fluctuations
@@ -611,14 +632,12 @@ class Discretisation:
         if self.symmetric:
             return self._stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
-        followers = [
-            integrand * measure
-            for load, (integrand, measure) in zip(self.spec.loads, self._loads, strict=True)
-            if isinstance(load, Pressure)
-        ]
-        of_followers = self.derivative(sum(followers[1:], followers[0]), trial)
-        of_energy = self.derivative(self._variation_of(self._potential) * self.dx, trial)
-        return self._matrix(of_energy + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
+        works = list(zip(self.spec.loads, self._loads, strict=True))
+        rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
+        of_rest, of_followers = (
+            self.derivative(work, trial) for work in (rest, sum(work for load, work in works if not load.symmetric))
+        )
+        return self._matrix(of_rest + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
 
     def new_symmetric_solver(self) -> linear.DirectSolver:
         """Return a matrix and a solver of their own for the symmetric part of the stiffness."""
@@ -739,3 +758,13 @@ class Discretisation:
                 right[i] -= self.stiffness_times(w)
                 right[i, self.fixed] = self._movers[path]
         return right
+
+
+def _linear(work: Any, numbers: Collection[Any]) -> bool:
+    """Whether a form is proportional to all of these numbers, which are variables, together."""
+    integrands = [integral.integrand() for integral in work.integrals()]
+    zero = {number.expression(): ufl.as_ufl(0.0) for number in numbers}
+    slopes = [ufl.algorithms.expand_derivatives(ufl.diff(one, number)) for one in integrands for number in numbers]
+    if any(c in zero for slope in slopes for c in ufl.algorithms.analysis.extract_constants(slope)):
+        return False
+    return all(ufl.replace(ufl.algorithms.strip_variables(one), zero) == 0 for one in integrands)

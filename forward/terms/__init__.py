@@ -1,1 +1,1 @@
-"""What acts on a body."""
+"""What acts on a body: loads, one file each, and prescribed displacements."""

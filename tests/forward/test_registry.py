@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 
-LOADS = Kinds("load", {"gravity": "forward.terms.loads:Gravity", "traction": "forward.terms.loads:Traction"})
+LOADS = Kinds("load", {"gravity": "forward.terms.gravity:Gravity", "traction": "forward.terms.traction:Traction"})
 
 
 class Body(Settings):

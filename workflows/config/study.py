@@ -565,9 +565,8 @@ def _kinds() -> set[str]:
     from forward.bodies import geometry, inclusions
     from forward.materials.energies import MATERIALS
     from forward.observables import outputs
-    from forward.terms import loads
 
-    unions = (Model, geometry.Body, inclusions.Inclusion, loads.Load, outputs.Output, Distribution, Method)
+    unions = (Model, geometry.Body, inclusions.Inclusion, outputs.Output, Distribution, Method)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, assert_never
+from typing import Any
 
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.hyperelastic import Hyperelastic
 from forward.materials.energies import MATERIALS, constants, units
 from forward.observables.outputs import Output
-from forward.terms.loads import Gravity, Load, Pressure, Traction
+from forward.terms.term import Term
 from forward.words import listed, number, settings, with_unit
 from workflows.config.study import Study
 
@@ -138,22 +138,13 @@ def _field(field: RandomField) -> str:
     )
 
 
-def _load(study: Study, load: Load) -> str:
-    match load:
-        case Gravity():
-            density = _scalar(study, f"loads.{load.label}.density")
-            return f"gravity: density {density} × {load.acceleration:g} m/s² along {listed(load.direction)}"
-        case Traction():
-            size = _scalar(study, f"loads.{load.label}.size")
-            return f"traction on {load.on}: {size} along {listed(load.direction)}"
-        case Pressure():
-            return f"pressure on {load.on}: {_scalar(study, f'loads.{load.label}.size')}"
-        case _:
-            assert_never(load)
+def _load(study: Study, load: Term) -> str:
+    return load.words({name: _scalar(study, f"loads.{load.label}.{name}") for name in load.values})
 
 
 def _scalar(study: Study, path: str) -> str:
     """A number of the model with its unit, or that it is random."""
     if path in study.parameters:
         return "random"
-    return with_unit(number(study.model.scalars[path].value, 6), unit_of(path))
+    scalar = study.model.scalars[path]
+    return with_unit(number(scalar.value, 6), scalar.unit)

@@ -21,7 +21,6 @@ from forward.fem.finer import finer
 from forward.hyperelastic import Hyperelastic
 from forward.machine import MIB, Headroom, compiled_forms, limits
 from forward.model import Finding
-from forward.terms.loads import Pressure
 from uq.methods.chaos import Chaos
 from uq.methods.compare import Compare
 from uq.methods.derivative_based import DerivativeBased
@@ -134,7 +133,7 @@ class Part(NamedTuple):
 
 
 def _times(spec: Hyperelastic) -> Times:
-    return times(spec.body, mixed=spec.mixed, symmetric=not any(isinstance(load, Pressure) for load in spec.loads))
+    return times(spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
 
 
 def _each(study: Study, spec: Hyperelastic) -> float:

@@ -1,6 +1,4 @@
-"""Outputs of finite elements: forms that live as long as their output, and kinds that nothing handles."""
-
-from typing import Literal
+"""Outputs of finite elements: forms that live as long as their output."""
 
 import numpy as np
 import pytest
@@ -8,7 +6,6 @@ from mpi4py import MPI
 
 from forward.fem.functionals import functional
 from forward.observables.outputs import StrainEnergy, VolumeChange
-from forward.terms import loads
 from tests.bodies import loaded_body
 
 pytestmark = pytest.mark.fem
@@ -28,18 +25,3 @@ def test_outputs_that_are_made_and_dropped_never_get_forms_of_each_other():
         np.testing.assert_array_equal(made.gradient(), expected[which][0])
         np.testing.assert_array_equal(made.partial(), expected[which][1])
         del made
-
-
-class Unknown(loads.Named):
-    """A load of no kind that is known."""
-
-    kind: Literal["unknown"] = "unknown"
-    size: float = 1.0
-
-
-def test_a_load_that_nothing_handles_is_an_error(monkeypatch):
-    """Not a body without loads, of which every displacement is zero."""
-    monkeypatch.setitem(loads.LOAD_SIZES, "unknown", "size")
-    spec = loaded_body("mooney-rivlin").model_copy(update={"loads": (Unknown(),)})
-    with pytest.raises(AssertionError, match="unreachable"):
-        spec.build(MPI.COMM_SELF, ())

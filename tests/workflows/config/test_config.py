@@ -10,7 +10,7 @@ import pytest
 from forward.bodies.geometry import Box
 from forward.hyperelastic import Hyperelastic
 from forward.observables.outputs import MaxDisplacement
-from forward.terms.loads import Gravity
+from forward.terms.gravity import Gravity
 from uq.inputs.distributions import Normal, Uniform
 from uq.methods.monte_carlo import MonteCarlo
 from workflows.__main__ import main
