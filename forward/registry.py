@@ -41,7 +41,7 @@ class Kinds:
 
     family: str
     own: Mapping[str, str]
-    expected: type[Settings] = Settings
+    expected: type = Settings
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ class Kinds:
             raise KindError(message) from None
         if not (isinstance(found, type) and issubclass(found, self.expected)):
             raise KindError(f"'{module}.{name}' is no {self.family}: expected a subclass of {self.expected.__name__}")
-        if "kind" not in found.model_fields:
+        if issubclass(found, Settings) and "kind" not in found.model_fields:
             raise KindError(f"the {self.family} '{module}.{name}' has no field called kind, expected kind: str")
         return found
 
