@@ -131,6 +131,10 @@ def _load(options: argparse.Namespace) -> AnyStudy:
         from forward.external.own_modules import make_visible
 
         make_visible(study.model.modules, [options.study.resolve().parent, Path.cwd()])
+    if study.report is not None:  # a section that is missing is said before the study runs
+        from workflows.report.section import of_study
+
+        of_study(study.report)
     return study
 
 

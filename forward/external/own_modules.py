@@ -134,8 +134,17 @@ class Loaded:
         return None if change is None else other_code(change)
 
 
-def make_visible(modules: Iterable[str], folders: Iterable[Path]) -> None:
+def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:
     """Have modules found in some folders too, after all other places.
+
+    Parameters
+    ----------
+    modules
+        Their dotted names.
+    folders
+        Where they may be.
+    place
+        Where the study names them, for the message.
 
     Raises
     ------
@@ -156,9 +165,7 @@ def make_visible(modules: Iterable[str], folders: Iterable[Path]) -> None:
         other = None if beside is None else _elsewhere(top, elsewhere, beside)
         if other is not None:
             what = f"{importer} imports '{top}', which" if importer else f"'{top}'"
-            message = (
-                f"model.function: {what} is both {beside} and {other}, expected a name of its own: rename the first"
-            )
+            message = f"{place}: {what} is both {beside} and {other}, expected a name of its own: rename the first"
             raise ModelError(message)
 
 

@@ -28,6 +28,7 @@ from uq.methods.multilevel_chaos import MultilevelChaos
 from uq.methods.sobol import Sobol
 from uq.surrogates.linearisation import LocalSensitivity
 from workflows.config.priors import findings_of_draws, mistakes_of_materials
+from workflows.config.report import Report, located
 
 if TYPE_CHECKING:
     from workflows.studies.inversion import Inversion
@@ -44,6 +45,7 @@ Model = Annotated[
 Method = Annotated[
     Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
 ]
+WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
 
@@ -102,6 +104,8 @@ class Study(Settings):
         What is computed and how.
     parallel
         Use of ranks.
+    report
+        Sections of one's own in the report.
     """
 
     model: Model
@@ -109,6 +113,7 @@ class Study(Settings):
     correlations: tuple[Correlation, ...] = ()
     method: Method
     parallel: Parallel = Parallel()
+    report: Report | None = None
 
     @property
     def inputs(self) -> Inputs:
@@ -321,7 +326,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         message = f"lists and tables are nested too deeply, expected at most {DEEPEST} levels"
         raise StudyError(message)
     try:
-        blocks = _located(blocks, folder)
+        blocks = located(_located(blocks, folder), folder)
         kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
         if kind in ("invert", "synthesize"):
             from workflows.studies.inversion import made
@@ -407,9 +412,9 @@ def dump(study: AnyStudy) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """List what changed between two documents, one line for each place.
 
-    How ranks are used does not count, nor where a mesh is, as long as it is the same.
+    Blocks that results do not depend on do not count, nor where a mesh is, as long as it is the same.
     """
-    before, after = (dict(_leaves({k: v for k, v in d.items() if k != "parallel"})) for d in (old, new))
+    before, after = (dict(_leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
     if before.get(_MESH) == after.get(_MESH) is not None:
         after |= {"model.body.file": before["model.body.file"]}
     places = [*before, *(place for place in after if place not in before)]

@@ -7,10 +7,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from workflows.config.study import StudyError, parse
+from pydantic import ValidationError
+
+from workflows.config.report import Report, located
+from workflows.config.study import StudyError, lines, parse
 from workflows.report import comparison
-from workflows.report.blocks import Block, Folded, Heading, Html
-from workflows.report.section import Results, sections
+from workflows.report.blocks import Block, Folded, Heading, Html, Text
+from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 
 Parts = list[tuple[str, list[Block]]]  # sections by their names
@@ -23,10 +26,16 @@ def write_report(directory: Path) -> Path:
     ------
     FileNotFoundError
         If the directory holds no results.
+    StudyError
+        If a section that the study asks for is not there.
     """
     path = directory / "report.html"
     results = _read(directory)
-    parts = [(name, list(one.content(results))) for name, one in sections() if one.applies(results)]
+    parts = [
+        (name, found)
+        for name, section in sections(_asked(directory))
+        if (found := _made(name, section, results)) is not None
+    ]
     write_text(path, render(f"Study {results.summary['study']}", parts))
     return path
 
@@ -48,6 +57,32 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     title = f"Comparison of {len(studies)} studies"
     write_text(out, render(title, [("comparison", [Heading(title, 1), *comparison.content(studies)])]))
     return out
+
+
+def _asked(directory: Path) -> Report | None:
+    """Return what study.toml asks of the report."""
+    try:
+        blocks = tomllib.loads((directory / "study.toml").read_text(encoding="utf-8"))
+        block = located(blocks, directory).get("report")
+        return None if block is None else Report.model_validate(block)
+    except FileNotFoundError:
+        return None
+    except tomllib.TOMLDecodeError as error:
+        message = f"{directory / 'study.toml'}: not valid TOML: {error}"
+        raise StudyError(message) from None
+    except ValidationError as error:
+        raise StudyError(*lines(error, "report")) from None
+
+
+def _made(name: str, section: Section, results: Results) -> list[Block] | None:
+    """Return what a section shows, if it applies; of one from outside that fails, the rest of the report is kept."""
+    try:
+        return list(section.content(results)) if section.applies(results) else None
+    except Exception as error:
+        if name in SECTIONS.own:
+            raise
+        why = f"{type(error).__name__}: {error}"
+        return [Heading(name), Text(f"This section could not be made: {why}", "error")]
 
 
 def _read(directory: Path) -> Results:

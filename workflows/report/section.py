@@ -8,18 +8,22 @@ from an installed package, by an entry point ``section.NAME`` of the group ``tis
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from forward.external.own_modules import make_visible
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import with_error, with_unit
+from workflows.config.study import StudyError
 from workflows.report.words import solves
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from workflows.config.report import Report
     from workflows.report.blocks import Block
 
 ROWS = 40  # parameters that a table lists
@@ -137,27 +141,43 @@ SECTIONS = Kinds(
 )
 
 
-def sections(more: Sequence[str] = ()) -> list[tuple[str, Section]]:
-    """Return all sections by name, in the order of the page.
-
-    Parameters
-    ----------
-    more
-        Names of those that a study asks for: dotted paths to modules beside it.
+def of_study(report: Report | None) -> dict[str, Section]:
+    """Import the sections that a study asks for.
 
     Raises
     ------
-    KindError
-        If one of them is not there, or is to stand before one that is not.
+    StudyError
+        If one of them is not there, or is to stand before one that is not; the message says where it was looked for.
     """
-    own: dict[str, Section] = {name: SECTIONS[name]() for name in SECTIONS.own}
-    others: dict[str, Section] = {name: SECTIONS[name]() for name in (*SECTIONS.names, *more) if name not in own}
-    for name, section in others.items():
-        if section.before not in own:
-            message = f"the section '{name}' is to stand before an unknown one; {nearest(section.before, tuple(own))}"
-            raise KindError(message)
+    if report is None:
+        return {}
+    make_visible(report.modules, [Path(report.folder), Path.cwd()], "report.sections")
+    found: dict[str, Section] = {}
+    for name in report.sections:
+        try:
+            found[name] = SECTIONS[name]()
+        except KindError as error:
+            where = f"{name.partition('.')[0]}.py in {report.folder}"
+            message = f"report.sections: {error}; expected in {where}, or in a package that is installed"
+            raise StudyError(message) from None
+        if found[name].before not in SECTIONS.own:
+            known = nearest(found[name].before, tuple(SECTIONS.own))
+            message = f"report.sections: '{name}' stands before '{found[name].before}', which is no section; {known}"
+            raise StudyError(message)
+    return found
+
+
+def sections(report: Report | None = None) -> list[tuple[str, Section]]:
+    """Return all sections by name, in the order of the page; those that a study asks for too.
+
+    Raises
+    ------
+    StudyError
+        As `of_study` does.
+    """
+    others = {name: SECTIONS[name]() for name in SECTIONS.names if name not in SECTIONS.own} | of_study(report)
     placed: list[tuple[str, Section]] = []
-    for name, section in own.items():
+    for name in SECTIONS.own:
         placed += [(label, other) for label, other in others.items() if other.before == name]
-        placed.append((name, section))
+        placed.append((name, SECTIONS[name]()))
     return placed

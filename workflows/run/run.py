@@ -23,7 +23,7 @@ from uq.estimators import branch
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.findings import add, findings
 from uq.inputs.sampling import random_points
-from workflows.config.study import Study, StudyError, differences, document, dump
+from workflows.config.study import WITHOUT_EFFECT, Study, StudyError, differences, document, dump
 from workflows.report import words
 from workflows.results.directory import (
     above_rounding,
@@ -290,7 +290,7 @@ def _sampling(study: Study, ensemble: Ensemble) -> Job:
 
 def _identity(study: AnyStudy) -> dict[str, Any]:
     """Return what decides on evaluations."""
-    blocks = {key: value for key, value in document(study).items() if key != "parallel"}
+    blocks = {key: value for key, value in document(study).items() if key not in WITHOUT_EFFECT}
     source = own_code.digest(study)
     if source is not None:
         blocks["source"] = source
@@ -332,8 +332,7 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
             raise StudyError(message)
         for leftover in [*directory.glob(".*.*"), *directory.glob("evaluations/.*")]:
             leftover.unlink()
-        if not kept.exists():
-            write_text(kept, dump(study))
+        _keep_study(directory, study)
     except tomllib.TOMLDecodeError:
         message = f"{kept}: is not a study, expected a directory of this study"
         raise StudyError(message) from None
@@ -345,6 +344,16 @@ def _prepare(study: AnyStudy, directory: Path, ranks: int) -> int | None:
         raise StudyError(message) from None
     own_code.refuse_other(directory, study)
     return _finished(directory)
+
+
+def _keep_study(directory: Path, study: AnyStudy) -> None:
+    """Write study.toml, also where it differs in what is asked of the report, which is then made again."""
+    kept = directory / "study.toml"
+    if not kept.exists():
+        write_text(kept, dump(study))
+    elif tomllib.loads(kept.read_text(encoding="utf-8")).get("report") != document(study).get("report"):
+        write_text(kept, dump(study))
+        (directory / "report.html").unlink(missing_ok=True)
 
 
 def _finished(directory: Path) -> int | None:

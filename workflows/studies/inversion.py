@@ -21,6 +21,7 @@ from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import findings_of_materials, mistakes_of_materials
+from workflows.config.report import Report
 from workflows.config.study import (
     Correlation,
     Parallel,
@@ -56,6 +57,8 @@ class Inversion(Settings):
         How it is inverted.
     parallel
         Use of ranks.
+    report
+        Sections of one's own in the report.
     """
 
     model: Specimen
@@ -64,6 +67,7 @@ class Inversion(Settings):
     data: DataFiles
     method: Invert = Invert()
     parallel: Parallel = Parallel()
+    report: Report | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     def __eq__(self, other: object) -> bool:

@@ -26,6 +26,7 @@ from inverse.methods.selection import Select
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import findings_of_materials, mistakes_of_materials
+from workflows.config.report import Report
 from workflows.config.study import Correlation, Parallel, StudyError, mistakes_of_factor, refused
 
 if TYPE_CHECKING:
@@ -329,6 +330,7 @@ class Comparison(Settings):
     candidates: Mapping[str, Any]
     method: Select
     parallel: Parallel = Parallel()
+    report: Report | None = None
 
     @property
     def source(self) -> tuple[str, ...]:
@@ -439,6 +441,8 @@ class Selection(Comparison):
         How the candidates are compared.
     parallel
         Use of ranks.
+    report
+        Sections of one's own in the report.
     """
 
     data: Measurements
@@ -446,6 +450,7 @@ class Selection(Comparison):
     predict: tuple[MaterialTest, ...] = ()
     method: Select
     parallel: Parallel = Parallel()
+    report: Report | None = None
 
     quantity: ClassVar[str] = "stress"
     costly: ClassVar[bool] = False

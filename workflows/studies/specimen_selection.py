@@ -23,6 +23,7 @@ from inverse.methods.selection import SelectSpecimens
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import mistakes_of_materials
+from workflows.config.report import Report
 from workflows.config.study import Correlation, Parallel, StudyError, mistakes_of_parameters, ranges, refused
 from workflows.studies.selection import WHOLE, Comparison
 
@@ -171,6 +172,8 @@ class SpecimenSelection(Comparison):
         How the candidates are compared.
     parallel
         Use of ranks.
+    report
+        Sections of one's own in the report.
     """
 
     model: dict[str, Any]
@@ -178,6 +181,7 @@ class SpecimenSelection(Comparison):
     candidates: dict[str, SpecimenCandidate] = Field(min_length=1)
     method: SelectSpecimens
     parallel: Parallel = Parallel()
+    report: Report | None = None
 
     quantity: ClassVar[str] = "displacement"
     costly: ClassVar[bool] = True

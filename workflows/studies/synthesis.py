@@ -21,6 +21,7 @@ from uq.evaluation.evaluate import Recorder
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import mistakes_of_materials
+from workflows.config.report import Report
 from workflows.config.study import Correlation, Parallel, mistakes_of_parameters, ranges, refused
 from workflows.studies.job import MethodJob
 
@@ -48,6 +49,8 @@ class Synthesis(Settings):
         Errors, and the points that data sets have.
     parallel
         Use of ranks.
+    report
+        Sections of one's own in the report.
     """
 
     model: Specimen
@@ -55,6 +58,7 @@ class Synthesis(Settings):
     correlations: tuple[Correlation, ...] = ()
     method: Synthesize
     parallel: Parallel = Parallel()
+    report: Report | None = None
 
     @cached_property
     def specimen(self) -> Specimen:

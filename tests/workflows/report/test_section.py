@@ -1,0 +1,145 @@
+"""Sections of a report: those of the program, and one from outside in one file."""
+
+import re
+import sys
+
+import pytest
+
+from tests.launch import ROOT
+from workflows.__main__ import main
+from workflows.report.blocks import Folded, Html, Text
+from workflows.report.page import render
+from workflows.report.section import SECTIONS, Section
+
+PAGE = (ROOT / "docs" / "how-to" / "own-sections.md").read_text(encoding="utf-8")
+STUDY = """
+[model]
+kind = "python"
+function = "tests.functions.beam"
+parameters = { E = 1e6, load = 1.0, length = 0.1 }
+outputs = [{ name = "sag", unit = "m" }, "weight"]
+
+[parameters]
+E = { kind = "uniform", lower = 0.9e6, upper = 1.1e6 }
+
+[method]
+kind = "monte-carlo"
+samples = 16
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A study with the section that the documentation shows in a file beside it."""
+    code, named = (re.search(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[1] for language in ("python", "toml"))
+    (tmp_path / "my_sections.py").write_text(code, encoding="utf-8")
+    (tmp_path / "plain.toml").write_text(STUDY)
+    (tmp_path / "study.toml").write_text(STUDY + named)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    yield tmp_path
+    sys.modules.pop("my_sections", None)
+
+
+def tissuq(command, study, out=None):
+    """Exit code of a command, as from a shell without what other tests have imported."""
+    sys.modules.pop("my_sections", None)
+    return main([command, str(study), *(["--out", str(out), "--quiet"] if out else [])])
+
+
+def test_a_section_beside_the_study_stands_where_it_wants_to(folder):
+    assert tissuq("check", folder / "study.toml") == 0
+    assert tissuq("run", folder / "study.toml", folder / "out") == 0
+    page = (folder / "out" / "report.html").read_text()
+    places = [page.index(text) for text in ("<h2>Mean and", "<h2>Is it too soft?</h2>", "<h2>Distribution and")]
+    assert places == sorted(places)
+    assert "0 % of the samples sag by more than 12 cm." in page
+    assert "Samples of the sag." in page
+    assert page.count("document.getElementById('limit').value = '12 cm';") == 1
+    (folder / "out" / "report.html").unlink()
+    assert tissuq("report", folder / "out") == 0
+    assert (folder / "out" / "report.html").read_text() == page
+
+
+def test_a_finished_study_gets_a_section_and_repeats_nothing(folder, capsys):
+    assert tissuq("run", folder / "plain.toml", folder / "out") == 0
+    results = (folder / "out" / "results.nc").read_bytes()
+    assert "too soft" not in (folder / "out" / "report.html").read_text()
+    assert tissuq("run", folder / "study.toml", folder / "out") == 0
+    assert "too soft" in (folder / "out" / "report.html").read_text()
+    assert (folder / "out" / "results.nc").read_bytes() == results
+    assert "report" not in results.decode(errors="ignore")
+    assert tissuq("run", folder / "plain.toml", folder / "out") == 0
+    assert "too soft" not in (folder / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("my_sections.Limits", "has no section 'Limits'; did you mean 'Limit'?"),
+        (
+            "other.Limit",
+            "the section 'other.Limit' cannot be imported: No module named 'other'; expected in other.py in ",
+        ),
+        ("my_sections.Heading", "is no section: expected a subclass of Section"),
+        ("Limit", "report.sections[0]: "),
+    ],
+)
+def test_a_section_that_is_not_there_is_said_before_anything_is_solved(folder, capsys, name, said):
+    path = folder / "study.toml"
+    path.write_text(path.read_text().replace("my_sections.Limit", name))
+    assert tissuq("check", path) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_section_that_is_gone_is_said(folder, capsys):
+    assert tissuq("run", folder / "study.toml", folder / "out") == 0
+    (folder / "my_sections.py").unlink()
+    assert tissuq("report", folder / "out") == 2
+    said = capsys.readouterr().err
+    assert f"No module named 'my_sections'; expected in my_sections.py in {folder}" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_place_that_is_not_there_is_said(folder, capsys):
+    path = folder / "my_sections.py"
+    path.write_text(path.read_text().replace('before = "distribution"', 'before = "distributions"'))
+    assert tissuq("check", folder / "study.toml") == 2
+    assert "did you mean 'distribution'?" in capsys.readouterr().err
+
+
+def test_a_section_that_fails_takes_no_report_with_it(folder):
+    path = folder / "my_sections.py"
+    path.write_text(
+        path.read_text().replace('yield Heading("Is it', 'raise ValueError("<no limit>")\n        yield Heading("Is it')
+    )
+    assert tissuq("run", folder / "study.toml", folder / "out") == 0
+    page = (folder / "out" / "report.html").read_text()
+    assert '<p class="error">This section could not be made: ValueError: &lt;no limit&gt;</p>' in page
+    assert "<h2>Provenance</h2>" in page
+
+
+def test_an_installed_package_adds_a_section(folder, monkeypatch):
+    """By its entry point, without a word in the study."""
+    metadata = folder / "my_package-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[tissuq]\nsection.limit = my_sections:Limit\n")
+    monkeypatch.syspath_prepend(folder)
+    assert tissuq("run", folder / "plain.toml", folder / "out") == 0
+    assert '<section id="limit">' in (folder / "out" / "report.html").read_text()
+
+
+def test_own_sections_are_named_once_and_in_a_file_each():
+    files = {path.stem for path in (ROOT / "workflows" / "report" / "sections").glob("[!_]*.py")}
+    assert {place.partition(":")[0].rpartition(".")[2] for place in SECTIONS.own.values()} == files
+    assert len(files) == len(SECTIONS.own)
+    for name in SECTIONS.own:
+        assert issubclass(SECTIONS[name], Section)
+
+
+def test_what_markup_needs_is_in_the_page_once():
+    viewer = Html("<canvas></canvas>", style="canvas { width: 100%; }", script="turn();")
+    page = render("T", [("a", [viewer]), ("b", [Folded("more", [viewer, Text("<b> & c")])])])
+    assert page.count("<canvas></canvas>") == 2
+    assert page.count("turn();") == page.count("canvas { width: 100%; }") == 1
+    assert "<b>" not in page
