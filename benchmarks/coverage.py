@@ -225,6 +225,7 @@ def _methods() -> dict[str, Any]:
         "qmc, tangent 64": qmc(samples=64),
         "qmc, tangent 256": qmc(samples=256),
         "qmc, quadratic 128": qmc(samples=128, control="quadratic"),
+        "qmc, quadratic 256": qmc(samples=256, control="quadratic"),
         "qmc, chaos 64": qmc(samples=64, control="chaos"),
         "qmc, chaos 256": qmc(samples=256, control="chaos"),
         "chaos 40": Chaos(samples=40, **_plain),

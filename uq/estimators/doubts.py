@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, FloatArray
-from uq.estimators.tails import spread, unseen
+from uq.estimators.tails import spread
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from uq.estimators.moments import Estimates
-    from uq.inputs.random_parameters import Inputs
 
 TAILS = 3.0  # mean square of influences over the square of their mean size, from which a finding is made: of n = 64
-SPREAD = 0.35  # standard deviation of logarithms of 64 samples from which a log-normal is too heavy
-COUNTED = 0.7  # the same, where errors count what is beyond the samples
+SPREAD = 0.7  # standard deviation of logarithms of 64 samples from which a log-normal is too heavy
 HOPELESS = (1.1, 4.0)  # the same, and as `TAILS`, from which together nothing is known of what is beyond
 WIDENS = 0.25  # it grows with n to this power
 GROWTH = 0.4  # it grows with n to this power: among more samples more of a tail is seen
@@ -38,11 +36,7 @@ def influences(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def of_tails(
-    names: Sequence[str],
-    inputs: Inputs,
-    values: FloatArray,
-    relative: FloatArray,
-    controlled: FloatArray | None = None,
+    names: Sequence[str], values: FloatArray, relative: FloatArray, controlled: FloatArray | None = None
 ) -> Iterator[Finding]:
     """Find the outputs of which few samples decide the standard deviation.
 
@@ -53,15 +47,15 @@ def of_tails(
 
     Samples do not show a tail that they have not met. But where their logarithms are about symmetric, they are
     log-normal as far as they say, and these spread by s = std ln|ψ| have tails that are known: intervals from n samples
-    cover 90 % up to s = 0.35 (n/64)^0.25 (64 to 4 096 samples, each 1 000 times), and up to twice as much where they
-    count what is beyond the samples (`uq.estimators.tails`). Beyond s = 1.1 (n/64)^0.25
-    they cover 75 % and less, an error where κ says so too (log-normals with s = 1.27 or 1/u with u from 0.001 to 1: in
-    70 to 80 % of sets of 64 samples; exponential ones: in 3 %).
+    that count what is beyond them (`uq.estimators.tails`) cover 90 % up to s = 0.7 (n/64)^0.25, and where all
+    parameters have ends they cover so without. Beyond s = 1.1 (n/64)^0.25 they cover 75 % and less, an error where κ
+    says so too (log-normals with s = 1.27 or 1/u with u from 0.001 to 1: in 70 to 80 % of sets of 64 samples;
+    exponential ones: in 3 %).
 
     Parameters
     ----------
-    names, inputs
-        Outputs and parameters.
+    names
+        Outputs.
     values
         Values (n, m) of the samples.
     relative
@@ -74,14 +68,12 @@ def of_tails(
     deviations = values - values.mean(axis=0)
     plain = influences(deviations, deviations**2)
     largest = TAILS * max(1.0, n / 64) ** GROWTH
-    counted = unseen(inputs, values)
     for i, name in enumerate(names):
         variance = deviations[:, i].var()
         kappa = _concentration(plain[:, i], variance) if relative[i] > MATTERS else 0.0
         if controlled is not None:
             kappa = max(kappa, _concentration(controlled[:, i], variance) / LATER)
         logarithmic = spread(values[:, i]) if relative[i] > SEEN else 0.0
-        heavy = COUNTED if counted[i] > 0 else SPREAD
         more = (n / 64) ** WIDENS
         if logarithmic > HOPELESS[0] * more and kappa > HOPELESS[1] / TAILS * largest:
             yield Finding(
@@ -90,7 +82,7 @@ def of_tails(
                 f"that spread by {logarithmic:.2g}, and most sets of so few miss the larger values that decide it. "
                 "Take many times more samples, or the logarithm as output.",
             )
-        elif logarithmic > heavy * more and kappa <= largest:
+        elif logarithmic > SPREAD * more and kappa <= largest:
             yield Finding(
                 "warning",
                 f"The {n} samples of {name} look log-normal, with logarithms that spread by {logarithmic:.2g}: few "

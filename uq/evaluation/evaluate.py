@@ -14,9 +14,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
+from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, ModelError, Reference, Solution, SolveError
 from uq.inputs.coordinates import Coordinates
 
+LARGEST = 1e60  # size of outputs, and one over it the smallest: fourth powers of them are numbers
+MANY = 8  # points of which one is expected to have an output that is not small by chance
 TOGETHER = 16  # realisations whose part of a compact sum is formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
@@ -318,8 +320,15 @@ class Recorder:
         return self._evaluate.node_volumes
 
     def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request."""
+        """Evaluate all points of a request.
+
+        Raises
+        ------
+        ModelError
+            If outputs are so large or small that the fourth powers of them are no numbers any more.
+        """
         evaluations = self._evaluate(request)
+        _check_magnitude(evaluations, self.outputs)
         # Derivatives and fields are the method's own business.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
         self.models.append(self._model)
@@ -338,6 +347,18 @@ class Recorder:
     def seconds(self) -> float:
         """Processor time (s) of all points so far."""
         return float(sum(evaluations.seconds.sum() for evaluations in self.log))
+
+
+def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:
+    """Raise a ModelError where fourth powers of outputs, of which errors are made, overflow or vanish."""
+    sizes = np.abs(evaluations.outputs[evaluations.ok]).max(axis=0, initial=0.0)
+    for name, size in zip(names, sizes.tolist(), strict=True):
+        if size > LARGEST or (0 < size < 1 / LARGEST and len(evaluations.points) >= MANY):
+            message = (
+                f"output {name} is of the size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}: moments of "
+                "what is beyond are no numbers; take another unit, or its logarithm"
+            )
+            raise ModelError(message)
 
 
 class BlockSolver:

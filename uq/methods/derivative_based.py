@@ -387,7 +387,7 @@ class _Samples:
                         dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
                 dataset["loo_error"] = (("output",), regression.fit.relative)
                 add(dataset, *of_indices(dataset))
-        add(dataset, *of_tails(self._evaluate.outputs, inputs, values[ok], last.relative_std_error))
+        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
         return dataset

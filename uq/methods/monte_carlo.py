@@ -254,7 +254,7 @@ def _dataset(
         moved = influences(
             first - scalars.coefficient * predicted, first**2 - scalars.second_coefficient * predicted**2
         )
-    add(dataset, *of_tails(evaluate.outputs, inputs, values, scalars.relative_std_error, moved))
+    add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
     if not ok.all():
         which = "plain estimates" if control else "all estimates"
         dataset.attrs["note"] = failure_note(ok, which, "the tangent" if control else None)

@@ -225,7 +225,7 @@ class QuasiMonteCarlo(MonteCarlo):
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
         moved = samples.influences(scalars)
-        add(dataset, *of_tails(evaluate.outputs, inputs, values[ok], scalars.relative_std_error, moved))
+        add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, moved))
         field = samples.field()
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))

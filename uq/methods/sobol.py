@@ -590,7 +590,7 @@ class _Rows:
             }
         )
         last = moments[self.each].relative_std_error
-        add(dataset, *of_tails(self._evaluate.outputs, self._inputs, values[independent], last))
+        add(dataset, *of_tails(self._evaluate.outputs, values[independent], last))
         lost = int((~self.ok).sum())
         if lost:
             dataset.attrs["note"] = (

@@ -577,7 +577,6 @@ class Regression:
             first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
             yield from of_tails(
                 [names[i] for i in which],
-                self.inputs,
                 self.data.values[:, which],
                 np.ones(which.size),
                 influences(first, second)[:, which],

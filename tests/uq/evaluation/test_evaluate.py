@@ -6,10 +6,15 @@ import h5py
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError
+from forward.model import FunctionModel, ModelError, SolveError
 from uq.evaluation.checkpoint import Checkpoint, DamagedError
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import BLOCKS, Request, SerialEvaluate
+from uq.inputs.distributions import Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.methods.chaos import Chaos
+from uq.methods.monte_carlo import MonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
 
 def product(p):
@@ -156,3 +161,26 @@ def test_wrong_number_of_outputs_is_the_callers_mistake():
 def test_values_that_are_not_finite_are_failures():
     model = FunctionModel(lambda p: np.inf, ("a",), ("x",))
     assert len(SerialEvaluate(model)(Request(np.ones((3, 1)))).failures) == 3
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e-90, 1e90, 1e200])
+@pytest.mark.parametrize("kind", [MonteCarlo, QuasiMonteCarlo, Chaos])
+def test_outputs_of_which_no_moments_are_numbers_are_refused(kind, scale):
+    """Standard deviations of 0 ± 0, and tracebacks: squares and fourth powers vanish or overflow."""
+    inputs = Inputs({"a": Uniform(lower=1.0, upper=2.0)})
+    model = FunctionModel(lambda p: [scale * p[0], p[0]], ("a",), ("y", "z"), lambda p: [[scale], [1.0]])
+    with pytest.raises(ModelError, match="output y is of the size"):
+        kind(samples=32).run(inputs, SerialEvaluate(model))
+
+
+@pytest.mark.parametrize("scale", [1e-59, 1e59])
+def test_other_outputs_are_estimated_whatever_their_size(scale):
+    inputs = Inputs({"a": Uniform(lower=1.0, upper=2.0)})
+
+    def model(s):
+        return FunctionModel(lambda p: [s * p[0] ** 2], ("a",), ("y",), lambda p: [[2 * s * p[0]]])
+
+    one, other = (QuasiMonteCarlo(samples=32).run(inputs, SerialEvaluate(model(s))) for s in (1.0, scale))
+    for name in ("mean", "mean_error", "std", "std_error", "variance_ratio"):
+        power = 0 if name == "variance_ratio" else 1
+        assert other[name].item() == pytest.approx(one[name].item() * scale**power, rel=1e-9)
