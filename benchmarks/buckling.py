@@ -212,19 +212,20 @@ def samples(case: Problem, count: int, seed: int = 0) -> list[Sample]:
     strict, accepting = (one.build(MPI.COMM_SELF, inputs.names) for one in (spec, lax))
     centre = linearise(inputs, SerialEvaluate(strict))
     assert centre.prediction is not None
-    predict, reference = centre.prediction.on(strict)
+    guess = centre.prediction.on(strict)
+    reference = guess(inputs.mean).reference
     found = []
     for point in inputs.points(random_points(seed, 0, count, len(inputs.names))):
         negative, lowest, seen = -1, np.nan, NOT_SCREENED
         try:
-            state = np.array(accepting.solve(point, predict(point), reference).state)
+            state = np.array(accepting.solve(point, guess(point)).state)
         except SolveError:
             pass
         else:
             negative, lowest = dense_inertia(accepting, state, point)
             seen = screened(strict.take_reference(reference), strict, state, point)
         try:
-            solution = strict.solve(point, predict(point), reference)
+            solution = strict.solve(point, guess(point))
         except SolveError as error:
             found.append(Sample(negative, lowest, seen, -1, error.stability))
             continue
@@ -286,7 +287,8 @@ def costs(count: int = 30) -> None:
         assert centre.prediction is not None
         seconds, ready, counted = np.zeros((n, 2)), np.zeros(2), 0
         starts = [centre.prediction.on(model) for model in models]
-        for k, (model, (_, reference)) in enumerate(zip(models, starts, strict=True)):
+        for k, (model, guess) in enumerate(zip(models, starts, strict=True)):
+            reference = guess(beam.inputs.mean).reference
             begin = time.process_time()
             if solver != "newton":
                 model.take_reference(reference)
@@ -295,9 +297,9 @@ def costs(count: int = 30) -> None:
             ready[k] = time.process_time() - begin
         for i, point in enumerate(beam.inputs.points(random_points(1, 0, n, len(beam.inputs.names)))):
             for k in (i % 2, 1 - i % 2):
-                predict, reference = starts[k]
+                guess = starts[k]
                 begin = time.process_time()
-                solution = models[k].solve(point, predict(point), reference)
+                solution = models[k].solve(point, guess(point))
                 seconds[i, k] = time.process_time() - begin
                 counted += k == 1 and solution.stability == Stability.COUNTED
         plain, tested = 1e3 * seconds.mean(axis=0)

@@ -74,7 +74,7 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     model: SpecimenModel = specimen(cells).build(MPI.COMM_SELF, inputs.names)
     centre = inputs.from_normals(np.zeros((1, len(inputs.names))))[0][0]
     solution = model.solve(centre)
-    state, slopes = model.gather(solution.state[None]), model.gather(solution.state_tangent(np.eye(len(centre))))
+    state, slopes = map(model.space.gather, (solution.state[None], solution.state_tangent(np.eye(len(centre)))))
     assert state is not None
     assert slopes is not None
     sizes = [np.sqrt((part**2).mean()) for part in model.values(solution.outputs)]

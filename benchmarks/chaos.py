@@ -14,7 +14,7 @@ from mpi4py import MPI
 from scipy.linalg import cho_solve
 
 from benchmarks.beams import CONFIG
-from forward.model import WORK, FloatArray, ForwardModel, FunctionModel
+from forward.model import WORK, FloatArray, ForwardModel, FunctionModel, displacements
 from uq.estimators.indices import coefficient_moments
 from uq.evaluation.evaluate import Evaluations, Merger, Request, SerialEvaluate
 from uq.inputs.distributions import Beta, Uniform
@@ -51,7 +51,7 @@ class Remembered:
         self._evaluate = SerialEvaluate(model)
         self._known: dict[bytes, Evaluations] = {}
         self.parameters, self.outputs = model.parameters, model.outputs
-        self.differentiable, self.displacements = model.differentiable, model.displacements
+        self.differentiable, self.displacements = model.differentiable, displacements(model)
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate, or remember."""
@@ -186,7 +186,7 @@ def _errors(case: Case, expected: FloatArray, found: Found, seconds: float) -> F
 
 def _compare(case: Case, ot: Any) -> None:
     inputs, evaluate = case.inputs, Remembered(case.model)
-    test = inputs.points(random_points(99, 0, 400 if case.model.displacements else 3000, len(inputs.names)))
+    test = inputs.points(random_points(99, 0, 400 if displacements(case.model) else 3000, len(inputs.names)))
     expected = SerialEvaluate(case.model)(Request(test)).outputs[:, 0]
     for n in case.sizes:
         rows: dict[str, list[FloatArray]] = {}

@@ -62,9 +62,8 @@ def mean() -> None:
         "quasi-Monte Carlo, quadratic": QuasiMonteCarlo(samples=SAMPLES, seed=1, fields=False, control="quadratic"),
         "chaos": Chaos(samples=64, seed=1, fields=False, max_order=4),
     }
-    print(
-        f"\n{len(inputs.names)} modes keep {100 * model.variance_kept['stiffness']:.0f} % of the variance of the field."
-    )
+    kept = 100 * model.space.variance_kept["stiffness"]
+    print(f"\n{len(inputs.names)} modes keep {kept:.0f} % of the variance of the field.")
     print(
         f"\n| method | solves | CPU time (s) | mean of {OUTPUT} (m) | error | variance ratio to MC of as many solves |"
     )

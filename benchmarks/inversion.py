@@ -58,7 +58,7 @@ def problem(cells: int) -> tuple[FieldPosterior, FloatArray]:
     """Return the posterior of data that the same mesh has made (what is measured is the cost), and the truth (N,)."""
     spec = specimen(cells)
     model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
-    true = truth(model.models[0].layout.coordinates)
+    true = truth(model.space.coordinates)
     clean = model.solve(true).outputs
     sizes = [np.sqrt((part**2).mean()) for part in model.values(clean)]
     sigma = NOISE * np.array(sizes)[model.cases]

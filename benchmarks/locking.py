@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.hyperelastic import Hyperelastic
-from forward.model import SolveError
+from forward.model import Guess, SolveError
 
 RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 1e2, 1e3, 1e4)
 SHEAR = 1e4  # μ (Pa)
@@ -70,7 +70,7 @@ def curve(name: str, cells: tuple[int, int, int], cell: str, degree: int, formul
     found, start = [], None
     for ratio in RATIOS:
         try:
-            solution = model.solve(np.array([ratio * SHEAR / 2]), start)
+            solution = model.solve(np.array([ratio * SHEAR / 2]), Guess(start))
         except SolveError:
             found.append(np.nan)
             continue

@@ -70,17 +70,18 @@ def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]
     small.tangent(np.eye(d)), small.state_tangent(np.eye(d))  # compiles
     first, solution = _timed(lambda: model.solve(inputs.mean))
     tangents, (slopes, outputs) = _timed(lambda: (solution.state_tangent(np.eye(d)), solution.tangent(np.eye(d))))
-    gathered, by_parameter = model.gather(solution.state[None]), model.gather(slopes)
+    gathered, by_parameter = model.space.gather(solution.state[None]), model.space.gather(slopes)
     assert gathered is not None
     assert by_parameter is not None
     centre = Linearisation(
         inputs.mean, solution.outputs, outputs.T, gathered[0], by_parameter, inputs.coordinates, inputs.std
     )
     assert centre.prediction is not None
-    predict, reference = centre.prediction.on(model)
+    guess = centre.prediction.on(model)
+    reference = guess(inputs.mean).reference
     once, _ = _timed(lambda: (model.reference.prepare(reference), model.reference.prepare_screen()))
     points = inputs.points(random_points(1, 0, DRAWS, d))
-    samples = sum(_timed(lambda at=at: model.solve(at, predict(at), reference))[0] for at in points) / DRAWS
+    samples = sum(_timed(lambda at=at: model.solve(at, guess(at)))[0] for at in points) / DRAWS
     slow, _ = _timed(lambda: forced.solve(points[0]))
     model_times = times(study.body.body, mixed=study.body.mixed)
     predicted = np.array(

@@ -50,11 +50,11 @@ def _row(cells: tuple[int, int, int]) -> str:
     evaluate = SerialEvaluate(model)
     centre = linearise(inputs, evaluate)
     assert centre.prediction is not None
-    predict, reference = centre.prediction.on(model)
-    warm = model.solve(inputs.mean, predict(inputs.mean), reference)  # factorises the reference
+    guess = centre.prediction.on(model)
+    warm = model.solve(inputs.mean, guess(inputs.mean))  # factorises the reference
     warm.tangent(np.eye(2)), warm.adjoint(np.eye(2)[0])  # compiles
     begin = time.perf_counter()
-    expansion, _ = expanded(inputs, evaluate, centre).on(model)
+    expansion = expanded(inputs, evaluate, centre).on(model)
     setup = time.perf_counter() - begin
     times, counts, gap = [], [], 0.0
     for point in inputs.points(random_points(1, 0, DRAWS, 2)):
@@ -65,7 +65,7 @@ def _row(cells: tuple[int, int, int]) -> str:
 
         expected = textbook.solve(point)
         lap()
-        solution = model.solve(point, predict(point), reference)
+        solution = model.solve(point, guess(point))
         lap()
         work = solution.work
         counts.append([expected.work.factorisations, work.factorisations, work.back_substitutions])
@@ -73,7 +73,7 @@ def _row(cells: tuple[int, int, int]) -> str:
         lap()
         solution.adjoint(np.eye(2)[0])
         lap()
-        predicted = model.solve(point, expansion(point), reference)
+        predicted = model.solve(point, expansion(point))
         lap()
         counts[-1].append(predicted.work.back_substitutions)
         times.append(np.diff(marks))

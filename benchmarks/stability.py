@@ -30,7 +30,7 @@ from benchmarks.beams import CONFIG
 from forward.bodies.geometry import AXES
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, Guess, SolveError
 from workflows.config.study import load
 
 ROOT = Path(__file__).parent.parent
@@ -361,7 +361,7 @@ def walk(model: HyperelasticModel, point: FloatArray, loads: FloatArray) -> tupl
         to = min(1.0, at + step)
         start = u if slope is None else u + (to - at) * slope
         try:
-            solution = model.solve(np.where(loads, to * point, point), start)
+            solution = model.solve(np.where(loads, to * point, point), Guess(start))
             change = (solution.state - u) / (to - at)
             steady = slope is None or np.linalg.norm(change - slope) <= np.linalg.norm(slope)
             good = steady and solution.work.load_steps == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.beams import CONFIG
@@ -81,11 +82,11 @@ def memory_over(realisations: int) -> list[float]:
     model = study.model.build(MPI.COMM_SELF, study.inputs.names)
     prediction = linearise(study.inputs, SerialEvaluate(model)).prediction
     assert prediction is not None
-    predict, reference = prediction.on(model)
+    guess = prediction.on(model)
     sizes = []
     for i in range(realisations):
         point = study.inputs.mean * (1 + 0.01 * np.sin(i))
-        model.solve(point, predict(point), None if i % 4 == 0 else reference).tangent(np.ones(2))
+        model.solve(point, replace(guess(point), reference=None) if i % 4 == 0 else guess(point)).tangent(np.ones(2))
         if i % (realisations // 10) == realisations // 10 - 1:
             sizes.append(resident())
     return sizes

@@ -6,9 +6,10 @@ stale derivative cannot be written. Nothing here knows FEniCSx or MPI.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from itertools import repeat
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -128,6 +129,29 @@ class Reference:
         return self is other or all(a is b or np.array_equal(a, b) for a, b in pairs)
 
 
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """What is known of a solution before it is solved for.
+
+    A state and a reference may change what the solution costs, never the answer beyond the solver's tolerance.
+
+    Attributes
+    ----------
+    state
+        This rank's part (U_local,) of a prediction of the state, from which the solver starts.
+    reference
+        A solution nearby, whose linearisation helps.
+    iterations
+        The solver makes at most so many, and the solution is the state that it has then, whose `residual` says how far
+        it is from equilibrium; only where that state is not admissible is the model solved after all. None: it goes on
+        to its tolerance.
+    """
+
+    state: FloatArray | None = None
+    reference: Reference | None = None
+    iterations: int | None = None
+
+
 class Solution(Protocol):
     """The answer of a model at one parameter vector, with its linearisation there.
 
@@ -184,12 +208,50 @@ class NamedOutput(Protocol):
         """SI unit of its value; "1" for ratios."""
 
 
-class ForwardModel(Protocol):
-    """A map from parameters to solutions, for one group of ranks.
+class NodalSpace(Protocol):
+    """The nodes of a body, the cells between them, and states over them, of which each rank of the group holds a part.
 
-    The state of a distributed model is split over the group; `gather` and `scatter` go between this rank's part and
-    the canonical order, which does not depend on the number of ranks.
+    Nodes are in canonical order: sorted by x, then y, then z, whatever the number of ranks. A state (U,) in canonical
+    order begins with the displacements of the nodes, interleaved by component.
     """
+
+    @property
+    def coordinates(self) -> FloatArray:
+        """Coordinates (N, 3) of the nodes (m), on every rank."""
+
+    @property
+    def displacements(self) -> int:
+        """Number of displacements with which a state (U,) begins; 0 where a state is no displacement field.
+
+        What follows (pressures) is needed to predict states, and is no displacement field.
+        """
+
+    def cells(self) -> tuple[NDArray[np.int64], int]:
+        """Return all cells (n_cells, k) as nodes in VTK's order, and VTK's number of their type; collective."""
+
+    def regions(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of `cells`; None without regions; collective."""
+
+    def gather(self, rows: FloatArray) -> FloatArray | None:
+        """Collect (k, U_local) from the group as (k, U) on the group's first rank; None on the others."""
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Take this rank's part (k, U_local) of (k, U)."""
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d), by its name.
+
+        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
+        the vertices.
+        """
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+
+
+class ForwardModel(Protocol):
+    """A map from parameters to solutions, for one group of ranks."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -204,24 +266,11 @@ class ForwardModel(Protocol):
         """Whether solutions have tangents and adjoints."""
 
     @property
-    def displacements(self) -> int:
-        """Number of displacements, interleaved by component, with which a state (U,) in canonical order begins.
+    def space(self) -> NodalSpace | None:
+        """Where the states of a body live; None for a model without states."""
 
-        What follows (pressures) is needed to predict states, and is no displacement field; 0 where there is no state.
-        """
-
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> Solution:
-        """Solve at `parameters` (d,), from the state `start` (U_local,) with the help of a `reference`, if given.
-
-        Both may change the cost, never the answer beyond the solver's tolerance. With `iterations` the solver makes at
-        most so many from `start`, and the solution is the state that it has then, whose `residual` says how far it is
-        from equilibrium; only where that state is not admissible is the model solved after all.
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
+        """Solve at `parameters` (d,), with the help of a guess.
 
         Raises
         ------
@@ -229,11 +278,43 @@ class ForwardModel(Protocol):
             Where there is no answer.
         """
 
-    def gather(self, rows: FloatArray) -> FloatArray | None:
-        """Collect (k, U_local) from the group as (k, U) in canonical order on the group's first rank."""
+    def solve_many(
+        self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
+    ) -> Iterator[Solution | SolveError]:
+        """Solve at points (n, d), each with its guess; yield the solutions in this order, or why there is none.
 
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Take this rank's part (k, U_local) of fields (k, U) in canonical order."""
+        What is wanted of a solution is cheapest before the next one is asked for.
+        """
+
+
+class OneByOne:
+    """`solve_many` of a model that solves one point after the other."""
+
+    def solve_many(
+        self: ForwardModel, points: FloatArray, guesses: Iterable[Guess | None] | None = None
+    ) -> Iterator[Solution | SolveError]:
+        """Yield the solution at each of points (n, d), or why there is none; each is solved when it is asked for."""
+        for point, guess in zip(points, guesses or repeat(None), strict=False):
+            try:
+                found: Solution | SolveError = self.solve(point, guess)
+            except SolveError as error:
+                found = error
+            yield found
+
+
+def displacements(model: ForwardModel) -> int:
+    """Return the number of displacements with which a state of a model begins; 0 without states."""
+    return 0 if model.space is None else model.space.displacements
+
+
+def gathered(model: ForwardModel, rows: FloatArray) -> FloatArray | None:
+    """Collect rows (k, U_local) of states of a model on the group's first rank; the (empty) rows without states."""
+    return rows if model.space is None else model.space.gather(rows)
+
+
+def scattered(model: ForwardModel, rows: FloatArray) -> FloatArray:
+    """Take this rank's part (k, U_local) of states (k, U) of a model; the (empty) rows without states."""
+    return rows if model.space is None else model.space.scatter(rows)
 
 
 def real(returned: object, what: str) -> FloatArray:
@@ -256,7 +337,7 @@ def real(returned: object, what: str) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class FunctionModel:
+class FunctionModel(OneByOne):
     """A forward model made of a Python function of a parameter vector.
 
     Parameters
@@ -280,18 +361,12 @@ class FunctionModel:
         return self.jacobian is not None
 
     @property
-    def displacements(self) -> int:
-        """No state, so none."""
-        return 0
+    def space(self) -> None:
+        """No states."""
+        return
 
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> FunctionSolution:
-        """Evaluate the function at `parameters` (d,); there is no state to `start` from, and nothing to iterate on."""
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FunctionSolution:
+        """Evaluate the function at `parameters` (d,); there is no state to guess, and nothing to iterate on."""
         # Copies: neither the caller nor the function can change a solution afterwards.
         point = np.array(parameters, dtype=float)
         point.flags.writeable = False
@@ -303,14 +378,6 @@ class FunctionModel:
             raise SolveError("the model's function returned a value that is not finite")
         outputs.flags.writeable = False
         return FunctionSolution(self, point, outputs)
-
-    def gather(self, rows: FloatArray) -> FloatArray:
-        """Return the (empty) rows as they are."""
-        return rows
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Return the (empty) rows as they are."""
-        return rows
 
 
 @dataclass(frozen=True)

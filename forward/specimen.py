@@ -24,7 +24,7 @@ from forward.fem.locking import Decision, Formulation, Ranges, decide, of_lockin
 from forward.hyperelastic import Hyperelastic, Material, materials
 from forward.materials.admissible import Materials
 from forward.materials.energies import splits
-from forward.model import Finding, FloatArray, Reference, SolveError, Stability, Work
+from forward.model import Finding, FloatArray, Guess, OneByOne, Reference, SolveError, Stability, Work
 from forward.observables.outputs import Output
 from forward.scalars import Scalar
 from forward.settings import Settings, nearest
@@ -242,7 +242,7 @@ def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErro
     )
 
 
-class SpecimenModel:
+class SpecimenModel(OneByOne):
     """A specimen as a `ForwardModel`: its outputs are what is observed in all cases, its states those of all cases.
 
     Attributes
@@ -279,7 +279,7 @@ class SpecimenModel:
             body.build(comm, tuple(parameters[i] for i in where))
             for body, where in zip(bodies, self.positions, strict=True)
         )
-        self.displacements = 0  # states of several cases are no displacement field
+        self.space = SpecimenSpace(self)
         self.differentiable = True
         names: list[str] = []
         places: list[FloatArray] = []
@@ -340,17 +340,11 @@ class SpecimenModel:
         model = self.models[0]
         found = np.zeros((len(points), self.spec.body.vertex_count))
         if self.spec.fields:
-            factors = model.body.comm.bcast(model.factors(points[:, self.positions[0]], 1))
+            factors = model.body.comm.bcast(self.space.factors(points, 1))
             found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
         return found
 
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> SpecimenSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> SpecimenSolution:
         """Find the equilibria of all cases at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
 
         Raises
@@ -358,23 +352,27 @@ class SpecimenModel:
         SolveError
             With the case that has no answer.
         """
-        starts = [None] * len(self.models) if start is None else self.states(start)
-        references: list[FloatArray | None] = [None] * len(self.models)
-        if reference is not None:
-            references = list(self.states(reference.state))
         solutions = []
-        parts = zip(self.spec.cases, self.models, self.positions, starts, references, strict=True)
-        for case, model, where, begin, state in parts:
-            near = None
-            if reference is not None and state is not None:
-                spread = None if reference.spread is None else reference.spread[where]
-                near = Reference(reference.parameters[where], state, spread)
+        guesses = self._guesses(guess or Guess())
+        for case, model, where, known in zip(self.spec.cases, self.models, self.positions, guesses, strict=True):
             try:
-                solutions.append(model.solve(parameters[where], begin, near, iterations))
+                solutions.append(model.solve(parameters[where], known))
             except SolveError as error:
                 message = f"load case '{case.name}': {error.reason}"
                 raise type(error)(message, error.history, error.work, error.stability) from error
         return SpecimenSolution(self, tuple(solutions))
+
+    def _guesses(self, guess: Guess) -> Iterator[Guess]:
+        """Split a guess into those of the cases."""
+        near = guess.reference
+        for k, where in enumerate(self.positions):
+            state = None if guess.state is None else self.states(guess.state)[k]
+            if near is None:
+                yield Guess(state, iterations=guess.iterations)
+            else:
+                spread = None if near.spread is None else near.spread[where]
+                reference = Reference(near.parameters[where], self.states(near.state)[k], spread)
+                yield Guess(state, reference, guess.iterations)
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
         """Split this rank's states (…, U_local) into those of the cases."""
@@ -384,16 +382,33 @@ class SpecimenModel:
         """Split what is observed (…, n) into that of the cases."""
         return np.split(rows, self._ends, axis=-1)
 
+
+class SpecimenSpace:
+    """The `NodalSpace` of a specimen: states hold those of its cases, one after the other."""
+
+    def __init__(self, model: SpecimenModel) -> None:
+        self._model = model
+        first = model.models[0].space
+        self.coordinates, self.cells, self.regions = first.coordinates, first.cells, first.regions
+        self.variance_kept = first.variance_kept
+        self.displacements = 0  # states of several cases are no displacement field
+
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U), case after case, on the first rank."""
-        parts = [model.gather(part) for model, part in zip(self.models, self.states(rows), strict=True)]
+        model = self._model
+        parts = [case.space.gather(part) for case, part in zip(model.models, model.states(rows), strict=True)]
         whole = [part for part in parts if part is not None]
         return np.concatenate(whole, axis=1) if whole else None
 
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U)."""
-        parts = np.split(rows, len(self.models), axis=1)  # the cases have as many unknowns
-        return np.concatenate([model.scatter(part) for model, part in zip(self.models, parts, strict=True)], axis=1)
+        models = self._model.models
+        parts = np.split(rows, len(models), axis=1)  # the cases have as many unknowns
+        return np.concatenate([case.space.scatter(part) for case, part in zip(models, parts, strict=True)], axis=1)
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d), which all cases share; collective."""
+        return self._model.models[0].space.factors(points[:, self._model.positions[0]], degree)
 
 
 class SpecimenSolution:
@@ -452,7 +467,7 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
         return np.array(item.at)
     from forward.fem.dolfinx import spaces
 
-    body, layout = model.body, model.layout
+    body, layout = model.body, model.body.layout
     mine = layout.nodes()[spaces.boundary_nodes(body.space, body.facets[item.on])]
     return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
 
@@ -471,7 +486,7 @@ def _interpolation(
 
     from forward.fem.dolfinx import spaces
 
-    body, layout, spec = model.body, model.layout, model.body.spec.body
+    body, layout, spec = model.body, model.body.layout, model.body.spec.body
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     which = which.ravel()
     numbers = layout.nodes()

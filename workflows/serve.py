@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from queue import SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +23,7 @@ from pydantic import ValidationError
 
 from forward.external.models import PROTOCOL
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, ModelError, Reference, Solution, SolveError
+from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, displacements
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
@@ -179,30 +180,25 @@ class _Solver:
 
         inputs = study.inputs
         self.model: ForwardModel = spec.build(MPI.COMM_SELF, inputs.names)
-        self._start: tuple[Callable[[FloatArray], FloatArray], Reference] | None = None
+        self._guess: Callable[[FloatArray], Guess] | None = None
         self._last: tuple[bytes, Solution] | None = None
-        if self.model.displacements:
+        if displacements(self.model):
             try:
                 prediction = linearise(inputs, SerialEvaluate(self.model)).prediction
             except SolveError:
                 prediction = None  # every solve starts from zero
-            self._start = None if prediction is None else prediction.on(self.model)
+            self._guess = None if prediction is None else prediction.on(self.model)
 
     def at(self, point: FloatArray) -> Solution:
         """Solve, unless that is where the last solution was."""
         if self._last is None or self._last[0] != point.tobytes():
-            if self._start is None:
-                solution = self.model.solve(point)
-            else:
-                predict, reference = self._start
-                solution = self.model.solve(point, predict(point), reference)
+            solution = self.model.solve(point, None if self._guess is None else self._guess(point))
             self._last = point.tobytes(), solution
         return self._last[1]
 
     def exactly_at(self, point: FloatArray) -> Solution:
         """Solve so that derivatives come from a factor of their own."""
-        start = None if self._start is None else self._start[0](point)
-        return self.model.solve(point, start)
+        return self.model.solve(point, None if self._guess is None else replace(self._guess(point), reference=None))
 
 
 def _vector(question: dict[str, Any], key: str, length: int) -> FloatArray:

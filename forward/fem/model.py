@@ -10,14 +10,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from forward.bodies.mesh_file import OwnMesh
-from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
+from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, InadmissibleError, Reference, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, Reference, SolveError, Stability, Work
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.newton import Found, Residual, solve
 from forward.solvers.reference import ReferenceFactor, turn
@@ -27,7 +25,7 @@ FEW = 4  # derivatives up to which products with the stiffness are cheaper than 
 ITERATIONS = 20  # of these derivatives, before a factor is made after all
 
 
-class HyperelasticModel:
+class HyperelasticModel(OneByOne):
     """A hyperelastic body as a `ForwardModel`: one mesh, one set of forms and one solver for every realisation.
 
     Parameters
@@ -58,8 +56,7 @@ class HyperelasticModel:
         self._materials = spec.materials(parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
         self.body = Discretisation(spec, comm, parameters)
-        self.layout = self.body.layout
-        self.displacements = self.layout.coordinates.size
+        self.space = BodySpace(self.body, self._leave)
         self.differentiable = True
         self._functionals = [functional(output, self.body) for output in spec.outputs]
         self._visited: object = None  # the solution whose state is set
@@ -70,25 +67,12 @@ class HyperelasticModel:
         """The factor of the last reference that was given."""
         return ReferenceFactor(self.body)
 
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> FiniteElementSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
 
-        Parameters
-        ----------
-        start
-            Prediction of the state (U_local,).
-        reference
-            A solution elsewhere, whose factor corrects the prediction. It is factorised when it is first given; the
-            factor is kept until another is.
-        iterations
-            Stop after so many corrections with that factor (Newton steps without a reference, or with
-            ``solver = "newton"``). Derivatives are then those of the equations linearised at the state reached.
+        The factor of the guess's reference corrects its state. It is factorised when it is first given; the factor is
+        kept until another is. Iterations are corrections with that factor (Newton steps without a reference, or with
+        ``solver = "newton"``); derivatives after so many are those of the equations linearised at the state reached.
 
         Raises
         ------
@@ -109,8 +93,8 @@ class HyperelasticModel:
         objection = self._materials.objection(dict(zip(self.parameters, map(float, parameters), strict=True)))
         if objection is not None:
             raise InadmissibleError(objection)
-        if self.spec.solver.kind == "newton" or start is None:
-            reference = None
+        guess = guess or Guess()
+        reference = guess.reference if self.spec.solver.kind != "newton" and guess.state is not None else None
         screen = False
         if reference is not None:
             self.reference.prepare(reference)
@@ -119,46 +103,17 @@ class HyperelasticModel:
         body.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters, screen=screen)
         with body.time_limit(self.spec.solver.solve_seconds):
-            found = solve(body, self.spec.solver, np.zeros(body.size), start, way, iterations)
+            found = solve(body, self.spec.solver, np.zeros(body.size), guess.state, way, guess.iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
         if found.stability >= Stability.COUNTED and body.symmetric:
             self._factorised = solution
         return solution
 
-    def gather(self, rows: FloatArray) -> FloatArray | None:
-        """Collect (k, U_local) as (k, U) in canonical order on the first rank."""
-        return self.layout.gather(rows)
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Take this rank's part (k, U_local) of (k, U) in canonical order."""
-        return self.layout.scatter(rows)
-
-    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
-        """Return the factors (n, nodes) of each random field at parameters (n, d), nodes in canonical order.
-
-        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
-        the vertices.
-        """
+    def _leave(self) -> None:
+        """Forget what is set: another changes it."""
         self._visited = None
         self.body.forget_parameters()
-        space = spaces.scalar_space(self.body.mesh, degree or self.spec.body.degree)
-        found = {field.field.label: field.factors(points, space) for field in self.body.fields}
-        return {label: factors for label, factors in found.items() if factors is not None}
-
-    def region_of_cells(self) -> NDArray[np.int64] | None:
-        """Return the number of the region of each cell, in the order of the layout's cells; nothing without regions.
-
-        Collective.
-        """
-        if not isinstance(self.spec.body, OwnMesh):
-            return None
-        return self.layout.by_cell(meshes.region_numbers(self.body.comm, self.spec.body, self.body.mesh))
-
-    @property
-    def variance_kept(self) -> dict[str, float]:
-        """Fraction of the variance of each random field that its modes make."""
-        return {field.field.label: field.kept for field in self.body.fields}
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
         """Set parameters and state to those of a solution, if they are not."""

@@ -26,7 +26,7 @@ from pydantic import Field, model_validator
 from forward.materials.admissible import objection
 from forward.materials.energies import MATERIALS, constants, measures
 from forward.materials.kinematics import dilation_of, of_stretches
-from forward.model import FloatArray, FunctionModel, FunctionSolution, InadmissibleError, Reference, SolveError
+from forward.model import FloatArray, FunctionModel, FunctionSolution, Guess, InadmissibleError, OneByOne, SolveError
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
@@ -92,7 +92,7 @@ def named(test: str, component: Component) -> str:
     return test if component == "P1" else f"{test} {component}"
 
 
-class HomogeneousModel:
+class HomogeneousModel(OneByOne):
     """A forward model: stresses (Pa) of material tests as outputs, the constants of a material as parameters.
 
     Parameters
@@ -116,7 +116,7 @@ class HomogeneousModel:
     """
 
     differentiable = True
-    displacements = 0
+    space = None
 
     def __init__(
         self,
@@ -171,13 +171,7 @@ class HomogeneousModel:
             found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
         return found
 
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> FunctionSolution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FunctionSolution:
         """Return the stresses (m,) at `parameters` (d,).
 
         Raises
@@ -206,14 +200,6 @@ class HomogeneousModel:
 
     def _jacobian(self, parameters: FloatArray) -> FloatArray:
         return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])
-
-    def gather(self, rows: FloatArray) -> FloatArray:
-        """Return the (empty) rows as they are."""
-        return rows
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Return the (empty) rows as they are."""
-        return rows
 
 
 # --- closed forms --------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from forward.model import FloatArray, Reference, SolveError
+from forward.model import FloatArray, Guess, Reference, SolveError
 from inverse.criticism.predictive import ResidualTest
 from inverse.criticism.weights import effective_number, normalised, tail_shape, trustworthy, worth
 from inverse.fields.field_posterior import Point
@@ -347,7 +347,7 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
 
     def solved(noise: FloatArray) -> Point:
         start = state + ((noise - mode.noise) @ pairs.vectors.T) @ slopes
-        return mode.posterior.at(noise, start, reference)
+        return mode.posterior.at(noise, Guess(start, reference))
 
     def place(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         along = z @ vectors.T

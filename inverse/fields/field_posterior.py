@@ -21,7 +21,7 @@ from typing import Protocol
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Reference, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
 from inverse.data.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
 
 BLOCK = 32  # vectors whose products are formed together
@@ -116,8 +116,8 @@ class FieldPosterior:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
         return self.prior.root(noise) + (0.0 if self.mean is None else self.mean)
 
-    def at(self, noise: FloatArray, start: FloatArray | None = None, reference: Reference | None = None) -> Point:
-        """Solve at ξ (N,), from a prediction of the state and with the help of a reference.
+    def at(self, noise: FloatArray, guess: Guess | None = None) -> Point:
+        """Solve at ξ (N,), with the help of a guess.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class FieldPosterior:
         self.counts.solves += 1
         values = self.values(noise)
         try:
-            solution = self.model.solve(values, start, reference)
+            solution = self.model.solve(values, guess)
         except SolveError:
             self.progress(1, 1)
             raise

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, Guess, SolveError
 from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import Spectrum, leading_pairs
 
@@ -177,7 +177,7 @@ def _search(here: Point, step: FloatArray) -> tuple[Point | None, float, int]:
     length = 1.0
     for solves in range(1, HALVINGS + 1):
         try:
-            there = here.posterior.at(here.noise + length * step, here.solution.state + length * change)
+            there = here.posterior.at(here.noise + length * step, Guess(here.solution.state + length * change))
         except SolveError:
             pass
         else:

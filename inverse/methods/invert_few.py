@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Reference, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, Reference, SolveError
 from inverse.criticism.chains import Chains, chains_of_few, ensemble, verdict_on_few
 from inverse.criticism.comparison import quantiles
 from inverse.criticism.finer import NOT_LOOKED, Finer, parameters_moved
@@ -63,9 +63,10 @@ class Nearby:
         solution = model.solve(point)
         return cls(point, np.array(solution.state), solution.state_tangent(np.eye(len(point))))
 
-    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
-        """Return the function parameters (d,) → predicted state (U_local,), and its reference."""
-        return lambda point: self.state + (point - self.point) @ self.slopes, Reference(self.point, self.state)
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) with its reference."""
+        reference = Reference(self.point, self.state)
+        return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
 
 
 def invert_by_group(

@@ -54,8 +54,8 @@ class Faulty:
     def __getattr__(self, name):
         return getattr(self.inner, name)
 
-    def solve(self, parameters, start=None):
-        return Wrapped(self.inner.solve(parameters, start), **self.faults)
+    def solve(self, parameters, guess=None):
+        return Wrapped(self.inner.solve(parameters, guess), **self.faults)
 
 
 def test_right_derivatives_pass():
@@ -112,7 +112,7 @@ def test_a_stale_linearisation_is_caught():
     class Stale(FunctionModel):
         """Differentiates where it was solved last."""
 
-        def solve(self, parameters, start=None):
+        def solve(self, parameters, guess=None):
             last.parameters = np.array(parameters)
             return Lazy(super().solve(parameters))
 
@@ -136,7 +136,7 @@ def test_a_stale_linearisation_is_caught():
 
 def test_a_solution_that_can_be_changed_is_caught():
     class Open(FunctionModel):
-        def solve(self, parameters, start=None):
+        def solve(self, parameters, guess=None):
             return FunctionSolution(
                 self, parameters, values(parameters)
             )  # keeps the caller's vector, and can be written
@@ -162,7 +162,7 @@ def test_a_wrong_shape_is_caught():
             return super().tangent(direction)[:, None]
 
     class Model(FunctionModel):
-        def solve(self, parameters, start=None):
+        def solve(self, parameters, guess=None):
             return Column(self, parameters, values(parameters))
 
     with pytest.raises(AssertionError, match=r"tangent returned shape \(4, 1\), expected \(4,\)"):

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from forward.machine import StopError
-from forward.model import FloatArray, ForwardModel, SolveError
+from forward.model import FloatArray, ForwardModel, SolveError, displacements
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job
@@ -202,7 +202,7 @@ class EnsembleEvaluate:
     @property
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
-        return self.worker.models[self.number].displacements
+        return displacements(self.worker.models[self.number])
 
     @property
     def node_volumes(self) -> FloatArray | None:

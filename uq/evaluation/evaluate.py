@@ -14,7 +14,20 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import WORK, FloatArray, ForwardModel, InadmissibleError, ModelError, Reference, Solution, SolveError
+from forward.model import (
+    WORK,
+    FloatArray,
+    ForwardModel,
+    Guess,
+    InadmissibleError,
+    ModelError,
+    Reference,
+    Solution,
+    SolveError,
+    displacements,
+    gathered,
+    scattered,
+)
 from uq.inputs.coordinates import Coordinates
 
 LARGEST = 1e60  # size of outputs, and one over it the smallest: fourth powers of them are numbers
@@ -120,8 +133,8 @@ class Start(Protocol):
     A dataclass, by whose fields the blocks that were started from it are found again.
     """
 
-    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
-        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +162,14 @@ class Prediction:
     coordinates: Coordinates
     spread: FloatArray | None = None
 
-    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
-        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
-        state, slopes = model.scatter(self.state[None, :])[0], model.scatter(self.slopes)
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
+        state, slopes = scattered(model, self.state[None, :])[0], scattered(model, self.slopes)
         reference = Reference(self.point, state, self.spread)
         if len(slopes) == 0:
-            return lambda _: state, reference
+            return lambda _: Guess(state, reference)
         here = self.coordinates.of(self.point)
-        return lambda parameters: state + (self.coordinates.of(parameters) - here) @ slopes, reference
+        return lambda parameters: Guess(state + (self.coordinates.of(parameters) - here) @ slopes, reference)
 
 
 @dataclass(frozen=True)
@@ -213,7 +226,7 @@ class Evaluate(Protocol):
 
     @property
     def displacements(self) -> int:
-        """Number of displacements at the head of a state, see `ForwardModel.displacements`."""
+        """Number of displacements at the head of a state, see `NodalSpace.displacements`."""
 
     @property
     def node_volumes(self) -> FloatArray | None:
@@ -269,7 +282,7 @@ class SerialEvaluate:
     @property
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
-        return self.model.displacements
+        return displacements(self.model)
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
@@ -367,15 +380,18 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents = request.tangents
-        self._iterations = request.iterations
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = isinstance(request.fields, CompactSum)
         self._joint = request.joint.on(model) if request.joint is not None else None
         self._together = 1 if request.joint is None else request.joint.size
-        self._predict: Callable[[FloatArray], FloatArray] | None = None
-        self._reference: Reference | None = None
-        if request.start is not None:
-            self._predict, self._reference = request.start.on(model)
+        self._guess = None if request.start is None else request.start.on(model)
+        self._plain = Guess(iterations=request.iterations)
+
+    def _guessed(self, point: FloatArray) -> Guess:
+        """What is known of the solution at a point (d,)."""
+        if self._guess is None:
+            return self._plain
+        return replace(self._guess(point), iterations=self._plain.iterations)
 
     def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
         """Solve at points (n, d); the fields are complete on the group's first rank only."""
@@ -390,12 +406,14 @@ class BlockSolver:
         failures: list[Failure] = []
         rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
         states: list[FloatArray] = []  # of a row that is not complete
+        solutions = model.solve_many(points, map(self._guessed, points))
         for i, point in enumerate(points):
             begin = time.process_time()
             row = None
             try:
-                start = self._predict(point) if self._predict is not None else None
-                solution = model.solve(point, start, self._reference, self._iterations)
+                solution = next(solutions)
+                if isinstance(solution, SolveError):
+                    raise solution
                 if self._row is not None:
                     row = self._row(solution, point)
                 if tangents is not None:
@@ -422,7 +440,7 @@ class BlockSolver:
                 rows[0] += row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
-        fields = model.gather(np.concatenate(rows)) if rows else np.zeros((0, 0))
+        fields = gathered(model, np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))
         return Evaluations(

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, InadmissibleError, Reference, Solution, SolveError
+from forward.model import (
+    FloatArray,
+    ForwardModel,
+    Guess,
+    InadmissibleError,
+    NodalSpace,
+    OneByOne,
+    Solution,
+    SolveError,
+    displacements,
+    gathered,
+    scattered,
+)
 from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, Request, merge
 
 if TYPE_CHECKING:
@@ -85,7 +97,7 @@ class KeptEvaluate:
     @property
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
-        return self.model.displacements
+        return displacements(self.model)
 
     @property
     def node_volumes(self) -> FloatArray | None:
@@ -135,7 +147,7 @@ class _Solved:
 
 
 @dataclass(frozen=True)
-class KeptModel:
+class KeptModel(OneByOne):
     """A model in one group of ranks whose states are kept: one that is on disk is where the solver starts, and ends.
 
     The state meets the tolerance as it is, so that a solution found again is the same. Collective over the group.
@@ -171,22 +183,16 @@ class KeptModel:
         return self.model.outputs
 
     @property
-    def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
-        return self.model.displacements
+    def space(self) -> NodalSpace | None:
+        """As of the model."""
+        return self.model.space
 
     @property
     def differentiable(self) -> bool:
         """Whether solutions have derivatives."""
         return self.model.differentiable
 
-    def solve(
-        self,
-        parameters: FloatArray,
-        start: FloatArray | None = None,
-        reference: Reference | None = None,
-        iterations: int | None = None,
-    ) -> Solution:
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Return the solution at parameters (d,), from its state if that is kept; errors as of the model."""
         key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
         self.keys.append(key)
@@ -196,15 +202,15 @@ class KeptModel:
         kept = self.group.bcast(kept)
         if kept is not None:
             self._note(kept)
-            return self.model.solve(parameters, self.model.scatter(kept.fields)[0], reference, iterations)
+            return self.model.solve(parameters, replace(guess or Guess(), state=scattered(self.model, kept.fields)[0]))
         begin = time.process_time()
         try:
-            solution = self.model.solve(parameters, start, reference, iterations)
+            solution = self.model.solve(parameters, guess)
         except SolveError as error:
             self._note(_failed(self.outputs, error, time.process_time() - begin))
             raise
         seconds = np.array([time.process_time() - begin])
-        whole = self.model.gather(np.asarray(solution.state)[None])
+        whole = gathered(self.model, np.asarray(solution.state)[None])
         work = solution.work.as_array()[None]
         residual, converged = np.array([solution.residual]), np.array([solution.converged])
         outputs = np.asarray(solution.outputs)[None]
@@ -220,14 +226,6 @@ class KeptModel:
 
     def _note(self, block: Evaluations) -> None:
         self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
-
-    def gather(self, rows: FloatArray) -> FloatArray | None:
-        """As of the model."""
-        return self.model.gather(rows)
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """As of the model."""
-        return self.model.scatter(rows)
 
     def forget(self) -> None:
         """Remove the states: what follows from them is kept."""

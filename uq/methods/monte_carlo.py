@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
 from uq.estimators.doubts import influences, of_control, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
@@ -131,8 +131,8 @@ class _JointMoments:
     slopes: FloatArray | None
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        state = model.scatter(self.state[None, :])[0]
-        slopes = None if self.slopes is None else model.scatter(self.slopes)
+        state = scattered(model, self.state[None, :])[0]
+        slopes = None if self.slopes is None else scattered(model, self.slopes)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
             prediction = None if slopes is None else self.coordinates.of(parameters) @ slopes

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
 from uq.estimators.doubts import influences, of_control, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
@@ -258,9 +258,9 @@ class _FieldProducts:
     control: Control | None
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
-        state = model.scatter(self.state[None, :])[0]
+        state = scattered(model, self.state[None, :])[0]
         control = self.control
-        coefficients = None if control is None else model.scatter(control.state)
+        coefficients = None if control is None else scattered(model, control.state)
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
             controls = None

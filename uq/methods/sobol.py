@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from forward.model import FloatArray, ForwardModel, SolveError
+from forward.model import FloatArray, ForwardModel, SolveError, scattered
 from forward.settings import nearest
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import (
@@ -416,7 +416,7 @@ class _FieldProducts:
     state: FloatArray
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
-        state = model.scatter(self.state[None, :])[0]
+        state = scattered(model, self.state[None, :])[0]
         used = self.products.size
         return lambda states: self.products.of(states[:used] - state)
 

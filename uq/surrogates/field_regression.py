@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, ForwardModel, Reference, Solution
+from forward.model import FloatArray, ForwardModel, Guess, Reference, Solution, scattered
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
@@ -49,7 +49,7 @@ class Projections:
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → y_z of one group's model."""
-        state = model.scatter(self.state[None, :])[0]
+        state = scattered(model, self.state[None, :])[0]
 
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
             deviation: FloatArray = (solution.state - state)[None, :]
@@ -158,10 +158,11 @@ class StateExpansion:
         coefficients[(basis.indices == 0).all(axis=1)] += centre.state
         return cls(basis, coefficients, centre.point, centre.state, centre.spread)
 
-    def on(self, model: ForwardModel) -> tuple[Callable[[FloatArray], FloatArray], Reference]:
-        """Return the function parameters (d,) → predicted state (U_local,) for one group's model, and its reference."""
-        coefficients, state = model.scatter(self.coefficients), model.scatter(self.state[None, :])[0]
-        return lambda parameters: self.basis.at(parameters) @ coefficients, Reference(self.point, state, self.spread)
+    def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
+        """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
+        coefficients, state = scattered(model, self.coefficients), scattered(model, self.state[None, :])[0]
+        reference = Reference(self.point, state, self.spread)
+        return lambda parameters: Guess(self.basis.at(parameters) @ coefficients, reference)
 
 
 def solved(fit: Fit, projections: FloatArray) -> FloatArray:

@@ -273,18 +273,18 @@ def _sampling(study: Study, ensemble: Ensemble) -> Job:
     spec = study.body
     model = spec.build(ensemble.group, inputs.names)
     # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
-    cells, kind = model.layout.cells()
-    regions = model.region_of_cells()
+    cells, kind = model.space.cells()
+    regions = model.space.regions()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
     locking = measured(study, model) if ensemble.index == 0 else []
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = label(found, units, model.layout.coordinates, cells, kind)
+        found = label(found, units, model.space.coordinates, cells, kind)
         add(found, *locking)
         found = with_regions(found, spec.body.regions, regions)
-        return with_random_fields(found, factors, model.variance_kept)
+        return with_random_fields(found, factors, model.space.variance_kept)
 
-    volumes = partial(node_volumes, model.layout.coordinates, cells)
+    volumes = partial(node_volumes, model.space.coordinates, cells)
     return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes)
 
 
@@ -396,7 +396,7 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
     if not study.model.coefficients:
         return {}
     seed = getattr(study.method, "seed", 0)
-    return model.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
+    return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
 def _version() -> str:

@@ -181,10 +181,10 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
 def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
     """The specimen that is known; collective over the group."""
     model = study.specimen.build(ensemble.group, study.inputs.names)
-    places, points = model.models[0].layout.coordinates, points_of(model)
+    places, points = model.space.coordinates, points_of(model)
     factor = np.ones((len(study.method.fraction), 1))
     if study.model.fields and ensemble.index == 0:
-        drawn = model.models[0].factors(study.method.truths(study.inputs)[:, model.positions[0]])
+        drawn = model.space.factors(study.method.truths(study.inputs))
         for one in (random for random in study.model.fields if random.of == "stiffness" and ensemble.group.rank == 0):
             factor = factor * drawn[one.label]
     recorders: dict[str, Recorder] = {}

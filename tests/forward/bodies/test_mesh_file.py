@@ -136,7 +136,7 @@ def answers(comm, file):
     """Outputs, tangents and adjoints, and the state on the first rank, of the model with regions."""
     model = regional(file).build(comm, NUMBERS)
     solution = model.solve(np.array([1e4, 2e4, 3e4, 1e5, 1.5]))
-    state = model.gather(solution.state[None])
+    state = model.space.gather(solution.state[None])
     found = (solution.outputs, solution.tangent(np.eye(5)), solution.adjoint(np.eye(2)), state)
     return None if state is None else [values.ravel().tolist() for values in found]
 
@@ -190,10 +190,10 @@ def test_specimens_have_regions(file):
 @pytest.mark.fem
 def test_results_hold_the_regions(tmp_path, file):
     model = built(regional(file), *NUMBERS)
-    nodes = model.layout.coordinates
+    nodes = model.space.coordinates
     data = xr.Dataset({"field_mean": (("node", "component"), nodes)}, {"output": ["u"]})
-    data = label(data, {"u": "m"}, nodes, *model.layout.cells())
-    data = with_regions(data, model.spec.body.regions, model.region_of_cells())
+    data = label(data, {"u": "m"}, nodes, *model.space.cells())
+    data = with_regions(data, model.spec.body.regions, model.space.regions())
     grid = pyvista.read(write_fields(tmp_path, data))
     middles = grid.cell_centers().points[:, 0]
     assert list(data.region.values) == ["left", "right"]

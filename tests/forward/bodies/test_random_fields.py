@@ -207,9 +207,9 @@ def test_parts_of_a_field_can_be_parameters():
 
 def test_factors_at_nodes():
     model, point, _ = build()
-    factors = model.factors(np.stack([point, 0 * point]))
+    factors = model.space.factors(np.stack([point, 0 * point]))
     assert set(factors) == {"stiffness", "density"}
-    assert factors["stiffness"].shape == (2, model.layout.coordinates.shape[0])
+    assert factors["stiffness"].shape == (2, model.space.coordinates.shape[0])
     spec = model.spec
     expansion = spec.fields[0].on(spec.body)
     expected = np.exp(expansion.offset + expansion.values(point[3:9]))
@@ -244,7 +244,7 @@ def shared(ensemble):
         assert found.ok.all(), found.failures
         return {"outputs": found.outputs, "tangents": found.tangents, "fields": found.fields}
 
-    factors = model.factors(point[None])
+    factors = model.space.factors(point[None])
     found = ensemble.run(model, task)
     return None if found is None else found | factors
 

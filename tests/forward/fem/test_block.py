@@ -166,9 +166,9 @@ loads = ({"kind": "traction", "on": "x-max", "direction": (0.0, 1.0, 1.0), "size
 outputs = (*points, {"kind": "volume-change", "name": "V"})
 model = body_of(WARPED, "hexahedron", 1, loads=loads, outputs=outputs).build(MPI.COMM_WORLD, ())
 solution = model.solve(np.empty(0))
-state = model.gather(solution.state[None])
+state = model.space.gather(solution.state[None])
 if MPI.COMM_WORLD.rank == 0:
-    np.savez(sys.argv[1], state=state, outputs=solution.outputs, coordinates=model.layout.coordinates)
+    np.savez(sys.argv[1], state=state, outputs=solution.outputs, coordinates=model.space.coordinates)
 """
 
 

@@ -65,8 +65,8 @@ class Faulty:
     def __getattr__(self, name):
         return getattr(self.inner, name)
 
-    def solve(self, parameters, start=None):
-        return FaultySolution(self.inner.solve(parameters, start), self.factor)
+    def solve(self, parameters, guess=None):
+        return FaultySolution(self.inner.solve(parameters, guess), self.factor)
 
 
 @dataclass(frozen=True)

@@ -218,8 +218,8 @@ def test_the_published_beam():
     slopes = np.array([solution.tangent(np.array([300.0, 0.0])), solution.tangent(np.array([0.0, 2e5]))])
     np.testing.assert_allclose(np.abs(slopes[:, :2]), [[0.0365, 0.0214], [0.0139, 0.0080]], rtol=5e-3)
     assert np.sign(slopes[:, :2]).tolist() == [[1, 1], [-1, -1]]
-    tip = np.flatnonzero(np.isclose(model.layout.coordinates[:, 0], 0.28))
-    field = model.gather(solution.state[None]).reshape(-1, 3)
+    tip = np.flatnonzero(np.isclose(model.space.coordinates[:, 0], 0.28))
+    field = model.space.gather(solution.state[None]).reshape(-1, 3)
     assert field[tip, 1].min() == pytest.approx(-0.1227, rel=5e-3)
     assert solution.outputs[0] == pytest.approx(-field[:, 1].min(), abs=1e-15)
 

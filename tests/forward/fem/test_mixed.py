@@ -121,16 +121,16 @@ def test_a_state_has_a_canonical_order(form):
     body = model.body
     places = [np.asarray(space.tabulate_dof_coordinates()) for space in (body.space, body.unknowns.pressure)]
     state = np.concatenate([places[0].ravel(), places[1] @ [100.0, 10.0, 1.0]])
-    whole = model.gather(state[None])
+    whole = model.space.gather(state[None])
     assert whole.shape == (1, spec.unknowns)
     assert spec.unknowns == 3 * 7 * 5 * 9 + 4 * 3 * 5
-    np.testing.assert_array_equal(whole[0, : model.displacements].reshape(-1, 3), model.layout.coordinates)
+    np.testing.assert_array_equal(whole[0, : model.space.displacements].reshape(-1, 3), model.space.coordinates)
     # Vertices are nodes, in the same order.
     sizes = np.array(spec.body.size) / (3, 2, 4)
-    at_vertex = np.isclose(model.layout.coordinates / sizes, np.round(model.layout.coordinates / sizes)).all(axis=1)
-    expected = model.layout.coordinates[at_vertex] @ [100.0, 10.0, 1.0]
-    np.testing.assert_allclose(whole[0, model.displacements :], expected, rtol=1e-12)
-    np.testing.assert_array_equal(model.scatter(whole)[0], state)
+    at_vertex = np.isclose(model.space.coordinates / sizes, np.round(model.space.coordinates / sizes)).all(axis=1)
+    expected = model.space.coordinates[at_vertex] @ [100.0, 10.0, 1.0]
+    np.testing.assert_allclose(whole[0, model.space.displacements :], expected, rtol=1e-12)
+    np.testing.assert_array_equal(model.space.scatter(whole)[0], state)
     body.set_state(state)
     np.testing.assert_array_equal(body.state(), state)
     body.set_state(0 * state)
@@ -151,7 +151,7 @@ def test_fields_are_those_of_displacements_and_predictions_hold_pressures():
     for name in ("field_nominal", "field_mean", "field_std"):
         assert data[name].shape == (nodes, 3)
     assert data["field_derivative"].shape == (2, nodes, 3)
-    tip = np.isclose(model.layout.coordinates[:, 0], 0.1)
+    tip = np.isclose(model.space.coordinates[:, 0], 0.1)
     assert np.abs(data["field_mean"].to_numpy()[tip, 1]).mean() == pytest.approx(abs(data["mean"].item(0)), rel=0.01)
 
     centre = linearise(inputs, evaluate)
@@ -173,9 +173,9 @@ for cell in ("tetrahedron", "hexahedron"):
     model = cantilever(cell, (6, 1, 1))
     solution = model.solve(np.array([1e6 * SHEAR / 2, LOAD]))
     slope = solution.tangent(np.array([0.0, LOAD]))
-    field = model.gather(np.array([solution.state]))
+    field = model.space.gather(np.array([solution.state]))
     if MPI.COMM_WORLD.rank == 0:
-        displacements, pressures = np.split(field[0], [model.displacements])
+        displacements, pressures = np.split(field[0], [model.space.displacements])
         found.append([*solution.outputs, *slope, np.linalg.norm(displacements), pressures[0], pressures[-1],
                       np.linalg.norm(pressures), solution.work.factorisations])
     assert model.linearise(solution).negative_pivots() == 0

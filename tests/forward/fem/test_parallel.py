@@ -13,7 +13,7 @@ import sys
 import numpy as np
 from mpi4py import MPI
 from forward.conformance import check_derivatives
-from forward.model import SolveError
+from forward.model import Guess, SolveError
 from tests.bodies import OUTPUTS, loaded_body
 
 comm = MPI.COMM_WORLD
@@ -36,8 +36,8 @@ def solve(material):
     assert len(set(reasons)) == 1, reasons
 
     solution = model.solve(values)
-    state = model.gather(solution.state[None])
-    slopes = model.gather(np.array([solution.state_tangent(direction) for direction in np.diag(values)]))
+    state = model.space.gather(solution.state[None])
+    slopes = model.space.gather(np.array([solution.state_tangent(direction) for direction in np.diag(values)]))
     tangents = np.array([solution.tangent(direction) for direction in np.diag(values)])
     gradients = np.array([solution.adjoint(weights) for weights in np.eye(len(model.outputs))])
     for array in (solution.outputs, tangents, gradients):
@@ -45,20 +45,21 @@ def solve(material):
 
     # Back and forth through the canonical order; a state from elsewhere is a start.
     whole = comm.bcast(state)
-    assert np.array_equal(model.scatter(whole)[0], solution.state)
-    assert model.solve(values, model.scatter(whole)[0]).work.factorisations == 1  # that which counts eigenvalues
+    assert np.array_equal(model.space.scatter(whole)[0], solution.state)
+    again = model.solve(values, Guess(model.space.scatter(whole)[0]))
+    assert again.work.factorisations == 1  # that which counts eigenvalues
 
     steps = 1 / 32, 1 / 64, 1 / 128
     directions = np.ones((1, len(values)))
     check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, noise=1e-12).require()
-    cells, _ = model.layout.cells()
+    cells, _ = model.space.cells()
     return {
         "outputs": solution.outputs,
         "state": state,
         "slopes": slopes,
         "tangents": tangents,
         "gradients": gradients,
-        "coordinates": model.layout.coordinates,
+        "coordinates": model.space.coordinates,
         "cells": cells,
     }
 

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 
 from benchmarks import buckling
 from forward.hyperelastic import Hyperelastic
-from forward.model import Reference, SolveError, Stability
+from forward.model import Guess, Reference, SolveError, Stability
 from forward.solvers import stability
 from uq.estimators import branch
 from uq.evaluation.evaluate import Evaluations, Failure, SerialEvaluate
@@ -118,22 +118,23 @@ def test_the_answer_does_not_depend_on_the_path(column):
         changed(spec, **solver).build(MPI.COMM_SELF, names)
         for solver in ({}, {"kind": "newton"}, {"accept_unstable": True})
     )
-    predict, reference = centre.prediction.on(model)
+    guess = centre.prediction.on(model)
+    reference = guess(problem.inputs.mean).reference
     without = Reference(reference.parameters, reference.state)  # no spread, so no screen
     for load, stable in ((85.0, True), (112.0, True), (123.0, True), (127.0, False), (145.0, False)):
         point = np.array([load])
-        straight = np.array(lenient.solve(point, predict(point), reference).state)
+        straight = np.array(lenient.solve(point, guess(point)).state)
         assert lenient.solve(point).stability == Stability.NOT_TESTED
         # Corrected and screened, corrected, a few corrections; Newton from the prediction, at the state, from zero.
         paths = (
-            lambda p: model.solve(p, predict(p), reference),
-            lambda p: model.solve(p, predict(p), without),
-            lambda p: model.solve(p, predict(p), reference, 30),
-            lambda p: model.solve(p, predict(p)),
-            lambda p, straight=straight: model.solve(p, straight),
+            lambda p: model.solve(p, guess(p)),
+            lambda p: model.solve(p, Guess(guess(p).state, without)),
+            lambda p: model.solve(p, replace(guess(p), iterations=30)),
+            lambda p: model.solve(p, Guess(guess(p).state)),
+            lambda p, straight=straight: model.solve(p, Guess(straight)),
             model.solve,
             textbook.solve,
-            lambda p: textbook.solve(p, predict(p), None, 20),
+            lambda p: textbook.solve(p, Guess(guess(p).state, None, 20)),
         )
         for path in paths:
             if stable:
@@ -148,7 +149,7 @@ def test_the_answer_does_not_depend_on_the_path(column):
                 assert refused.value.stability == Stability.REFUSED
     # A few iterations that are not enough for an equilibrium claim nothing.
     point = np.array([145.0])
-    few = model.solve(point, predict(point), reference, 1)
+    few = model.solve(point, replace(guess(point), iterations=1))
     assert (few.converged, few.stability) == (False, Stability.NOT_TESTED)
 
 
@@ -156,10 +157,10 @@ def test_the_answer_does_not_depend_on_the_path(column):
 def test_what_a_derivative_sees_counts(column, monkeypatch):
     problem, centre = column
     model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
-    predict, reference = centre.prediction.on(model)
+    guess = centre.prediction.on(model)
     point = np.array([100.0])
     many = np.ones((5, 1))
-    solution = model.solve(point, predict(point), reference)
+    solution = model.solve(point, guess(point))
     assert solution.stability == Stability.SCREENED
     solution.state_tangent(many)
     assert solution.stability == Stability.COUNTED
@@ -170,14 +171,14 @@ def test_what_a_derivative_sees_counts(column, monkeypatch):
     monkeypatch.setattr(stability.Screened, "clear", property(lambda seen: True))
     monkeypatch.setattr(stability.Screened, "chance", property(lambda seen: 0.0))
     beyond = np.array([140.0])
-    wrong = model.solve(beyond, predict(beyond), reference)
+    wrong = model.solve(beyond, guess(beyond))
     assert wrong.stability == Stability.SCREENED
     with pytest.raises(SolveError, match="which a derivative has shown") as seen:
         wrong.state_tangent(many)
     assert seen.value.stability == Stability.MISSED
     monkeypatch.setattr(stability.Screened, "chance", property(lambda seen: 1.0))
     with pytest.raises(SolveError) as counted:
-        model.solve(beyond, predict(beyond), reference)
+        model.solve(beyond, guess(beyond))
     assert counted.value.stability == Stability.MISSED
 
 

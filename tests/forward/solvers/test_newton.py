@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from forward.fem.dolfinx import linear
-from forward.model import SolveError
+from forward.model import Guess, SolveError
 from tests.bodies import FORMS, OUTPUTS, loaded_body, unloaded_body
 
 pytestmark = pytest.mark.fem
@@ -49,7 +49,7 @@ def test_load_steps_succeed_where_newton_from_zero_fails(heavy):
     check(heavy, light)
     check(heavy, loaded)
     # A state found by load steps is found directly from its neighbour.
-    near = heavy.solve(np.array([1e4]), heavy.solve(np.array([9.9e3])).state)
+    near = heavy.solve(np.array([1e4]), Guess(heavy.solve(np.array([9.9e3])).state))
     assert near.work.load_steps == 0
     np.testing.assert_allclose(near.state, loaded.state, rtol=0, atol=1e-9)
 
@@ -136,12 +136,12 @@ def test_a_prediction_changes_the_cost_and_not_the_answer(model):
     base = model.solve(POINT)
     change = 0.1 * POINT
     from_zero = model.solve(POINT + change)
-    predicted = model.solve(POINT + change, base.state + base.state_tangent(change))
+    predicted = model.solve(POINT + change, Guess(base.state + base.state_tangent(change)))
     np.testing.assert_allclose(predicted.state, from_zero.state, rtol=0, atol=1e-12)
     np.testing.assert_allclose(predicted.outputs, from_zero.outputs, rtol=1e-9)
     assert predicted.work.back_substitutions < from_zero.work.back_substitutions
     check(model, predicted)
-    again = model.solve(POINT + change, from_zero.state)
+    again = model.solve(POINT + change, Guess(from_zero.state))
     assert again.work.factorisations == 1  # that which counts the negative eigenvalues there
 
 
@@ -149,7 +149,7 @@ def test_a_prediction_changes_the_cost_and_not_the_answer(model):
 def test_a_useless_prediction_does_no_harm(model, wrong):
     base = model.solve(POINT)
     start = wrong * np.random.default_rng(0).random(len(base.state))
-    np.testing.assert_allclose(model.solve(POINT, start).state, base.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(model.solve(POINT, Guess(start)).state, base.state, rtol=0, atol=1e-12)
 
 
 def test_a_solution_is_immutable(model):
@@ -161,7 +161,7 @@ def test_a_solution_is_immutable(model):
     point[:] = 0
     np.testing.assert_array_equal(solution.parameters, POINT)
     start = np.array(solution.state)
-    near = model.solve(POINT, start)
+    near = model.solve(POINT, Guess(start))
     start[:] = 0
     np.testing.assert_array_equal(near.state, solution.state)
 

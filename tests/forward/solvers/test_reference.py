@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.model import Reference
+from forward.model import Guess, Reference
 from tests.bodies import OUTPUTS, loaded_body, unloaded_body
 
 pytestmark = pytest.mark.fem
@@ -39,7 +39,7 @@ def test_the_answer_is_that_of_newton_without_a_stiffness(case):
     reference = Reference(values, base.state)
     for point in points(values, 0.3):
         expected = model.solve(point)
-        found = model.solve(point, base.state + (point - values) @ slopes, reference)
+        found = model.solve(point, Guess(base.state + (point - values) @ slopes, reference))
         assert found.work.factorisations == found.work.assemblies == 0
         assert found.work.back_substitutions == found.work.residuals - 1
         size = np.abs(expected.state).max()
@@ -55,7 +55,7 @@ def test_derivatives_are_as_good_as_asked_and_no_dearer(material):
         base = model.solve(values)
         point, few = points(values, 0.3)[0], np.diag(values)[:3]
         start = base.state + base.state_tangent(point - values)
-        found = model.solve(point, start, Reference(values, base.state))
+        found = model.solve(point, Guess(start, Reference(values, base.state)))
         before = found.work.residuals
         tangents = found.state_tangent(few)
         products.append(found.work.residuals - before)
@@ -68,7 +68,7 @@ def test_derivatives_are_as_good_as_asked_and_no_dearer(material):
 def test_derivatives_follow_to_the_tolerance_of_the_solver(case):
     model, values, base, slopes = case
     point = points(values, 0.3)[0]
-    found = model.solve(point, base.state + (point - values) @ slopes, Reference(values, base.state))
+    found = model.solve(point, Guess(base.state + (point - values) @ slopes, Reference(values, base.state)))
     exact = model.solve(point)
     directions, weights = np.diag(values)[:3], np.eye(len(OUTPUTS))[:3]
     for name, rows in (("state_tangent", directions), ("tangent", directions), ("adjoint", weights)):
@@ -99,14 +99,14 @@ def test_what_was_solved_before_changes_nothing(case):
     point = points(values, 0.2)[0]
     start = base.state + (point - values) @ slopes
     direction = np.eye(len(values))[0]
-    first = model.solve(point, start, reference)
+    first = model.solve(point, Guess(start, reference))
     tangent = first.tangent(direction)
-    model.solve(points(values, 0.3)[1], None, None).tangent(direction)
-    model.solve(point, start, elsewhere).tangent(direction)
-    again = model.solve(point, start, Reference(values.copy(), base.state.copy()))
+    model.solve(points(values, 0.3)[1], None).tangent(direction)
+    model.solve(point, Guess(start, elsewhere)).tangent(direction)
+    again = model.solve(point, Guess(start, Reference(values.copy(), base.state.copy())))
     np.testing.assert_array_equal(again.state, first.state)
     np.testing.assert_array_equal(again.tangent(direction), tangent)
-    model.solve(point, start, elsewhere)
+    model.solve(point, Guess(start, elsewhere))
     np.testing.assert_array_equal(first.tangent(direction), tangent)
 
 
@@ -116,7 +116,7 @@ def test_a_reference_that_is_too_far_hands_over_to_newton(case):
     for i, path in enumerate(model.parameters):
         far[i] *= 0.2 if path.startswith("material.") else 1.5 if path.startswith("loads.") else 1
     expected = model.solve(far)
-    found = model.solve(far, base.state + (far - values) @ slopes, Reference(values, base.state))
+    found = model.solve(far, Guess(base.state + (far - values) @ slopes, Reference(values, base.state)))
     np.testing.assert_allclose(found.state, expected.state, rtol=0, atol=1e-7 * np.abs(expected.state).max())
     found.tangent(np.eye(len(values)))
 
@@ -125,7 +125,7 @@ def test_a_reference_that_is_too_far_hands_over_to_newton(case):
 def test_a_useless_prediction_does_no_harm(case, wrong):
     model, values, base, _ = case
     start = wrong * np.random.default_rng(0).random(len(base.state))
-    found = model.solve(values, start, Reference(values, base.state))
+    found = model.solve(values, Guess(start, Reference(values, base.state)))
     np.testing.assert_allclose(found.state, base.state, rtol=0, atol=1e-8 * np.abs(base.state).max())
 
 
@@ -134,7 +134,7 @@ def test_the_textbook_path_takes_no_help():
     textbook = model.spec.model_copy(update={"solver": model.spec.solver.model_copy(update={"kind": "newton"})})
     plain = textbook.build(MPI.COMM_SELF, model.parameters)
     base = plain.solve(values)
-    again = plain.solve(values, base.state, Reference(values, base.state))
+    again = plain.solve(values, Guess(base.state, Reference(values, base.state)))
     assert again.work == base.work
     assert base.work.factorisations == base.work.back_substitutions
     np.testing.assert_array_equal(again.state, base.state)
@@ -167,9 +167,9 @@ def test_a_few_corrections_say_how_far_they_are(case):
     exact = model.solve(point)
     assert exact.converged
     assert exact.residual <= TOLERANCE
-    errors, corrections = [], model.solve(point, start, reference).work.back_substitutions
+    errors, corrections = [], model.solve(point, Guess(start, reference)).work.back_substitutions
     for d in (1, 2, 4):
-        found = model.solve(point, start, reference, d)
+        found = model.solve(point, Guess(start, reference, d))
         assert not found.converged
         assert found.work.back_substitutions == d == found.work.residuals - 1
         assert found.work.factorisations == 0
@@ -178,7 +178,7 @@ def test_a_few_corrections_say_how_far_they_are(case):
         errors.append(np.abs(found.state - exact.state).max())
     assert errors[2] < 0.1 * errors[1] < 0.1 * errors[0]
     # More than it takes: stopped by the tolerance, at the state of an unlimited solve.
-    enough = model.solve(point, start, reference, corrections + 5)
+    enough = model.solve(point, Guess(start, reference, corrections + 5))
     assert enough.converged
     assert enough.work.back_substitutions == corrections
     np.testing.assert_allclose(enough.state, exact.state, rtol=0, atol=1e-8 * np.abs(exact.state).max())
@@ -195,21 +195,22 @@ def test_a_few_newton_steps_go_from_the_start(case):
     for any_model in (textbook, model):  # without a reference, both make Newton steps
         errors = []
         for d in (1, 2):
-            found = any_model.solve(point, start, None, d)
+            found = any_model.solve(point, Guess(start, None, d))
             assert found.work.factorisations == d
             errors.append(np.abs(found.state - exact.state).max() / np.abs(exact.state).max())
         assert errors[1] < 1e-2 * errors[0]
-    at_once = textbook.solve(point, start, None, 1000)
+    at_once = textbook.solve(point, Guess(start, None, 1000))
     assert at_once.converged
     assert at_once.work.factorisations < exact.work.factorisations
-    assert textbook.solve(point, start).work.factorisations == exact.work.factorisations  # the textbook is from zero
+    from_zero = textbook.solve(point, Guess(start))  # as the textbook
+    assert from_zero.work.factorisations == exact.work.factorisations
 
 
 @pytest.mark.parametrize("wrong", [np.nan, 1e6, -0.7])
 def test_a_partial_state_that_is_not_admissible_is_solved_and_charged(case, wrong):
     model, values, base, _ = case
     start = wrong * np.random.default_rng(0).random(len(base.state))
-    found = model.solve(values, start, Reference(values, base.state), 2)
+    found = model.solve(values, Guess(start, Reference(values, base.state), 2))
     assert found.converged
     np.testing.assert_allclose(found.state, base.state, rtol=0, atol=1e-8 * np.abs(base.state).max())
     assert found.work.residuals > model.solve(values).work.residuals

@@ -12,7 +12,7 @@ from forward.bodies.geometry import Box
 from forward.bodies.random_fields import Matern
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
-from forward.model import SolveError
+from forward.model import Guess, SolveError
 from forward.specimen import Specimen
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
@@ -100,9 +100,9 @@ def test_states_of_all_cases_start_solves():
     model, point = built()
     solution = model.solve(point)
     near = point * (1 + 1e-6)
-    assert model.solve(near, solution.state).work.factorisations < model.solve(near).work.factorisations
-    whole = model.gather(solution.state[None])
-    np.testing.assert_array_equal(model.scatter(whole)[0], solution.state)
+    assert model.solve(near, Guess(solution.state)).work.factorisations < model.solve(near).work.factorisations
+    whole = model.space.gather(solution.state[None])
+    np.testing.assert_array_equal(model.space.scatter(whole)[0], solution.state)
 
 
 def test_the_case_without_an_answer_is_named():
@@ -137,7 +137,7 @@ from tests.inverse.fields.test_field_inversion import built
 model, point = built(MPI.COMM_WORLD)
 solution = model.solve(point)
 found = solution.outputs, solution.tangent(point), solution.adjoint(np.ones(len(model.outputs)))
-state = model.gather(solution.state[None])
+state = model.space.gather(solution.state[None])
 if MPI.COMM_WORLD.rank == 0:
     np.savez(sys.argv[1], *found, state)
 """
@@ -151,7 +151,7 @@ def test_ranks_do_not_matter(tmp_path):
     solution = model.solve(point)
     expected = solution.outputs, solution.tangent(point), solution.adjoint(np.ones(len(model.outputs)))
     with np.load(tmp_path / "found.npz") as found:
-        for name, values in zip(found.files, (*expected, model.gather(solution.state[None])), strict=True):
+        for name, values in zip(found.files, (*expected, model.space.gather(solution.state[None])), strict=True):
             np.testing.assert_allclose(found[name], values, atol=1e-9 * np.abs(values).max())
 
 
@@ -235,7 +235,7 @@ def recovered(fine, cells, **settings):
     maker, model = (
         spec.build(MPI.COMM_SELF, spec.coefficients) for spec in (specimen(fine, POINTS), specimen(cells, POINTS))
     )
-    clean = maker.solve(truth(maker.models[0].layout.coordinates)).outputs
+    clean = maker.solve(truth(maker.space.coordinates)).outputs
     rng = np.random.default_rng(0)
     sigma = NOISE * np.array([np.sqrt((values**2).mean()) for values in model.values(clean)])[model.cases]
     data = clean + sigma * rng.standard_normal(len(clean))
@@ -243,7 +243,7 @@ def recovered(fine, cells, **settings):
     few = np.repeat(rng.uniform(size=len(data) // 3) < 0.05, 3)
     posteriors = [posterior, part(posterior, few)]
     found = [LowRankPosterior.at(find_mode(p).point, **settings) for p in posteriors]
-    return found, truth(model.models[0].layout.coordinates)
+    return found, truth(model.space.coordinates)
 
 
 @pytest.mark.slow

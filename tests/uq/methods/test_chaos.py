@@ -336,7 +336,7 @@ class States:
         directions = np.eye(len(model.parameters))
 
         def rows(solution, _):
-            self.rows.append(model.gather(np.vstack([solution.state, solution.state_tangent(directions)])))
+            self.rows.append(model.space.gather(np.vstack([solution.state, solution.state_tangent(directions)])))
             return np.zeros((1, solution.state.size))
 
         return rows

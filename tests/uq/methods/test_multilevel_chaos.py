@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError, Stability, Work
+from forward.model import FunctionModel, Guess, OneByOne, SolveError, Stability, Work
 from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Request, SerialEvaluate
@@ -45,8 +45,22 @@ class Approached:
     stability: Stability = Stability.NOT_TESTED
 
 
+class Whole:
+    """All three unknowns, on one rank."""
+
+    displacements = 3
+
+    @staticmethod
+    def gather(rows):
+        return rows
+
+    @staticmethod
+    def scatter(rows):
+        return rows
+
+
 @dataclass(frozen=True)
-class Contraction:
+class Contraction(OneByOne):
     """A model of which every iteration leaves a part of the error; outputs are its first two unknowns."""
 
     left: float = 0.1
@@ -54,9 +68,10 @@ class Contraction:
     parameters: tuple[str, ...] = INPUTS.names
     outputs: tuple[str, ...] = ("f", "g")
     differentiable: bool = False
-    displacements: int = 3
+    space: type = Whole
 
-    def solve(self, parameters, start=None, reference=None, iterations=None):
+    def solve(self, parameters, guess=None):
+        start, iterations = (None, None) if guess is None else (guess.state, guess.iterations)
         if parameters[0] > self.fails:
             raise SolveError("too far")
         truth = exact(parameters)
@@ -65,12 +80,6 @@ class Contraction:
             state, made = truth + self.left * (state - truth), made + 1
         residual = float(np.abs(state - truth).max())
         return Approached(state[:2], state, residual, residual <= TOLERANCE, Work(residuals=made))
-
-    def gather(self, rows):
-        return rows
-
-    def scatter(self, rows):
-        return rows
 
 
 def truth():
@@ -182,11 +191,12 @@ def test_an_expansion_predicts_and_is_part_of_the_name_of_a_block(tmp_path):
     basis = orthonormal(INPUTS, hyperbolic(2, 3, 1.0))
     rng = np.random.default_rng(0)
     start = StateExpansion(basis, rng.random((10, 3)), INPUTS.mean, np.zeros(3), INPUTS.std)
-    predict, reference = start.on(Contraction())
+    guess = start.on(Contraction())
+    reference = guess(INPUTS.mean).reference
     points = rng.random((5, 2))
     for point, row in zip(points, basis.values(points), strict=True):
         np.testing.assert_array_equal(basis.at(point), row)
-        np.testing.assert_allclose(predict(point), row @ start.coefficients, rtol=1e-14)
+        np.testing.assert_allclose(guess(point).state, row @ start.coefficients, rtol=1e-14)
     np.testing.assert_array_equal(reference.parameters, INPUTS.mean)
     checkpoint = Checkpoint(tmp_path, "study")
     other = StateExpansion(basis, start.coefficients * (1 + 1e-15), INPUTS.mean, np.zeros(3), INPUTS.std)
@@ -236,7 +246,7 @@ def test_the_beam_by_corrections_is_the_beam_by_newton(beam):
     point = study.inputs.points(np.array([[0.3, 0.8]]))
     solved = model.solve(point[0])
     np.testing.assert_allclose(expansion.outputs(point)[0], solved.outputs, rtol=3e-4)
-    field = model.gather(solved.state[None, :])[0]
+    field = model.space.gather(solved.state[None, :])[0]
     np.testing.assert_allclose(expansion.displacements(point).ravel(), field, atol=3e-4 * np.abs(field).max())
 
 
@@ -247,7 +257,9 @@ def test_a_chaos_prediction_saves_corrections(beam):
     centre = linearise(inputs, evaluate)
     basis = orthonormal(inputs, hyperbolic(2, 4, 1.0))
     points = inputs.points(np.random.default_rng(0).random((40, 2)))
-    states = model.gather(np.array([model.solve(p, centre.prediction.on(model)[0](p)).state for p in points]))
+    states = model.space.gather(
+        np.array([model.solve(p, Guess(centre.prediction.on(model)(p).state)).state for p in points])
+    )
     coefficients = np.linalg.lstsq(basis.values(points), states, rcond=None)[0]
     start = StateExpansion(basis, coefficients, centre.point, centre.state, centre.spread)
     fresh = inputs.points(np.random.default_rng(1).random((20, 2)))

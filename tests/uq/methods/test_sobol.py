@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, SolveError
+from forward.model import FunctionModel, OneByOne, SolveError
 from tests.launch import run_script
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
 from uq.evaluation.evaluate import Request, SerialEvaluate
@@ -314,7 +314,7 @@ class States:
 
     def on(self, model):
         def rows(solution, _):
-            self.rows.append(model.gather(solution.state[None, :])[0])
+            self.rows.append(model.space.gather(solution.state[None, :])[0])
             return np.zeros((1, solution.state.size))
 
         return rows
@@ -375,14 +375,14 @@ def test_a_row_with_a_failure_adds_nothing_to_the_fields(beam, monkeypatch):
     model = evaluate.model
     limit = 860.0
 
-    class Fragile:
+    class Fragile(OneByOne):
         def __getattr__(self, name):
             return getattr(model, name)
 
-        def solve(self, parameters, *rest):
+        def solve(self, parameters, guess=None):
             if parameters[0] > limit:
                 raise SolveError("gone")
-            return model.solve(parameters, *rest)
+            return model.solve(parameters, guess)
 
     method = Sobol(design="saltelli", samples=32, scrambles=4)
     data = method.run(inputs, replace(evaluate, model=Fragile()))

@@ -28,7 +28,7 @@ def test_polynomials_are_integrated_exactly(cell, degree):
     """On boxes cut in any way: linear fields on cells of degree 1, quadratic ones on those of degree 2."""
     body = {"kind": "box", "size": [2.0, 1.0, 0.5], "cells": [3, 2, 1], "cell": cell, "degree": degree}
     model = Hyperelastic.model_validate(BLOCK | {"body": body}).build(MPI.COMM_SELF, ())
-    nodes, (cells, _) = model.layout.coordinates, model.layout.cells()
+    nodes, (cells, _) = model.space.coordinates, model.space.cells()
     x, y, z = nodes.T
     linear = np.column_stack([x, 2 * y, np.ones_like(z)])
     whole = [linear, np.column_stack([x * x, y * z, 0 * z])] if degree == 2 else [linear]
@@ -46,7 +46,7 @@ def test_nodes_stand_for_shares_of_the_body(cell, degree):
     grading = {"x-min": 5.0, "z-max": 3.0}
     body = {"kind": "box", "size": [2, 1, 0.5], "cells": [4, 3, 3], "cell": cell, "degree": degree, "grading": grading}
     model = Hyperelastic.model_validate(BLOCK | {"body": body}).build(MPI.COMM_SELF, ())
-    nodes, (cells, _) = model.layout.coordinates, model.layout.cells()
+    nodes, (cells, _) = model.space.coordinates, model.space.cells()
     volumes = node_volumes(nodes, cells)
     assert (volumes > 0).all()
     assert volumes.sum() == pytest.approx(1.0, rel=1e-12)

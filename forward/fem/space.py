@@ -1,0 +1,60 @@
+"""The space in which the states of a finite-element body live, with the factors of its random fields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.dolfinx import meshes, spaces
+from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    from forward.fem.equations import Discretisation
+
+
+class BodySpace:
+    """The `NodalSpace` of a body.
+
+    Parameters
+    ----------
+    body
+        The body.
+    leave
+        Called before the parameters of the body are changed.
+    """
+
+    def __init__(self, body: Discretisation, leave: Callable[[], None]) -> None:
+        self._body = body
+        self._layout = body.layout
+        self._leave = leave
+        self.coordinates = body.layout.coordinates
+        self.displacements = body.layout.coordinates.size
+        self.cells, self.gather, self.scatter = body.layout.cells, body.layout.gather, body.layout.scatter
+
+    def regions(self) -> NDArray[np.int64] | None:
+        """Return the number of the region of each cell, in the order of `cells`; None without regions; collective."""
+        body = self._body
+        if not isinstance(body.spec.body, OwnMesh):
+            return None
+        return self._layout.by_cell(meshes.region_numbers(body.comm, body.spec.body, body.mesh))
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d), by its name.
+
+        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
+        the vertices.
+        """
+        body = self._body
+        self._leave()
+        space = spaces.scalar_space(body.mesh, degree or body.spec.body.degree)
+        found = {field.field.label: field.factors(points, space) for field in body.fields}
+        return {label: factors for label, factors in found.items() if factors is not None}
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+        return {field.field.label: field.kept for field in self._body.fields}
