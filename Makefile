@@ -28,7 +28,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-all test-wheel lint bench docs clean system
+.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint bench docs clean system
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -42,6 +42,9 @@ demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the
 
 test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
 	@$(PYTHON) -m pytest $(WORKERS) $(ARGS)
+
+test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
+	@$(PYTHON) -m pytest -m unit $(ARGS)
 
 test-all: $(READY) ## run the test suite with the slow tests
 	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)

@@ -11,6 +11,8 @@ from forward.machine import Headroom, out_of_memory, out_of_room, reason_to_stop
 from forward.model import SolveError
 from tests.launch import run_script
 
+pytestmark = pytest.mark.unit
+
 
 def test_the_smallest_limit_counts():
     script = """

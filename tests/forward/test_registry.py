@@ -9,6 +9,8 @@ from pydantic import TypeAdapter, ValidationError
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 
+pytestmark = pytest.mark.unit
+
 LOADS = Kinds("load", {"gravity": "forward.terms.gravity:Gravity", "traction": "forward.terms.traction:Traction"})
 
 

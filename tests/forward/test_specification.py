@@ -8,6 +8,8 @@ from forward.hyperelastic import Hyperelastic
 from forward.materials.energies import MATERIALS, constants, measures
 from forward.solvers.newton import SolverSettings
 
+pytestmark = pytest.mark.unit
+
 BLOCKS = {
     "body": {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (2, 2, 2)},
     "material": {"kind": "neo-hookean", "C1": 1.0, "D1": 1.0},

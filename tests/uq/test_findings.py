@@ -1,10 +1,13 @@
 """What a study says of the worth of its own numbers: kept with the results, and in the exit code."""
 
+import pytest
 import xarray as xr
 
 from forward.model import Finding
 from uq.findings import add, findings
 from workflows.run.run import exit_code
+
+pytestmark = pytest.mark.unit
 
 
 def test_findings_are_kept_once_and_listed_by_severity():

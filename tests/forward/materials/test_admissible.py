@@ -12,6 +12,8 @@ from tests.bodies import CONSTANTS
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
+pytestmark = pytest.mark.unit
+
 
 @pytest.mark.parametrize("kind", list(MATERIALS))
 def test_moduli_are_second_derivatives_of_the_energy(kind):

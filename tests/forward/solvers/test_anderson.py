@@ -6,6 +6,8 @@ import pytest
 from forward.solvers.anderson import AndersonMixing, block_galerkin
 from forward.solvers.reference import rotations, turned
 
+pytestmark = pytest.mark.unit
+
 RNG = np.random.default_rng(3)
 N = 40
 

@@ -14,6 +14,8 @@ from inverse.criticism.doubts import (
 )
 from uq.inputs.distributions import Beta, LogNormal, LogUniform, Normal, Uniform
 
+pytestmark = pytest.mark.unit
+
 RNG = np.random.default_rng(2)
 BELL = Normal(mean=1e3, std=300.0)
 

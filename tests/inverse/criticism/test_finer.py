@@ -14,6 +14,8 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
 
+pytestmark = pytest.mark.unit
+
 RNG = np.random.default_rng(5)
 B, OFFSET = RNG.standard_normal((7, 2)), RNG.standard_normal(7)
 GAP = 0.4 * RNG.standard_normal(7)

@@ -6,6 +6,8 @@ import pytest
 from forward.bodies.geometry import Block, Box
 from inverse.data.observations import DataError, files, read
 
+pytestmark = pytest.mark.unit
+
 BODY = Box(size=(1.0, 1.0, 1.0), cells=(1, 1, 1))
 CASES = ("shear", "extension")
 TABLE = """\

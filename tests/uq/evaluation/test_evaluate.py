@@ -16,6 +16,8 @@ from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 
+pytestmark = pytest.mark.unit
+
 
 def product(p):
     if p[0] > 0.9:

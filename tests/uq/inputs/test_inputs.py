@@ -20,6 +20,8 @@ from uq.inputs.distributions import (
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 
+pytestmark = pytest.mark.unit
+
 # Each block beside SciPy's version of the same distribution.
 PAIRS = [
     (Uniform(lower=2.0, upper=5.0), stats.uniform(2, 3)),

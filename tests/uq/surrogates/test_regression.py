@@ -12,6 +12,8 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import hyperbolic, hyperbolic_count, orthonormal
 from uq.surrogates.regression import DICTIONARY, Candidate, Data, Regression, _Products, _select, candidates_of
 
+pytestmark = pytest.mark.unit
+
 
 def inputs_of(d):
     return Inputs({f"x{i}": Uniform(lower=-1, upper=1) for i in range(d)})

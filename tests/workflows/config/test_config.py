@@ -18,6 +18,8 @@ from workflows.config.study import Study, StudyError, differences, document, dum
 from workflows.run.plan import plan
 from workflows.starter import _METHODS, starter
 
+pytestmark = pytest.mark.unit
+
 CONFIGS = sorted((Path(__file__).parent.parent.parent.parent / "configs").glob("*.toml"))
 
 

@@ -9,6 +9,8 @@ import pytest
 from workflows.config.study import load
 from workflows.run.plan import parts, plan
 
+pytestmark = pytest.mark.unit
+
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 
 
