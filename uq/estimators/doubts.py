@@ -167,9 +167,16 @@ def of_centre(names: Sequence[str], errors: FloatArray, loo: FloatArray, std: Fl
             )
 
 
-def of_field(rest: float, trusted: float) -> Iterator[Finding]:
+def of_field(rest: float, trusted: float, nothing: float) -> Iterator[Finding]:
     """Find that an expansion leaves more than a share of the standard deviation of the displacement field."""
-    if rest > trusted:
+    if rest > nothing:
+        yield Finding(
+            "error",
+            f"The expansion of the displacement field explains nothing: at samples that it has not seen it errs by "
+            f"{rest:.2g} of the standard deviation. There are no Sobol' indices of the field, and its moments must not "
+            "be used. Take more samples, or a method without an expansion.",
+        )
+    elif rest > trusted:
         yield Finding(
             "warning",
             f"The expansion of the displacement field errs by {rest:.2g} of its standard deviation: its moments, its "

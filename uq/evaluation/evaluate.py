@@ -74,6 +74,8 @@ class Evaluations:
     fields
         Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
         `CompactSum`, the rows of these points themselves, one point after the other.
+    sketches
+        What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are put together.
     """
 
     points: FloatArray
@@ -86,6 +88,7 @@ class Evaluations:
     converged: NDArray[np.bool_]
     stability: NDArray[np.int8]
     fields: FloatArray
+    sketches: FloatArray | None = None
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -110,7 +113,10 @@ class CompactSum(FieldSum, Protocol):
     """
 
     def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, k, U)."""
+        """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, r, U)."""
+
+    def sketch(self, rows: FloatArray) -> FloatArray | None:
+        """Return a few numbers (n, r, k) of the rows (n, r, U) of some realisations, to be kept; None for none."""
 
 
 class JointSum(Protocol):
@@ -343,7 +349,7 @@ class Recorder:
         evaluations = self._evaluate(request)
         _check_magnitude(evaluations, self.outputs)
         # Derivatives and fields are the method's own business.
-        self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0]))
+        self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0], sketches=None))
         self.models.append(self._model)
         return evaluations
 
@@ -475,6 +481,7 @@ class Merger:
         self._blocks: list[Evaluations] = []
         self._fields = np.zeros((0, 0))
         self._waiting: list[tuple[FloatArray, FloatArray]] = []
+        self._sketches: list[FloatArray] = []
         self._points = 0
         self.count = 0
         self._failures: list[Failure] = []
@@ -483,6 +490,7 @@ class Merger:
         """Append the next block."""
         if block.fields.size and self._compact is None:
             self._add(block.fields)
+            self._keep(block.sketches)
         elif block.fields.size:
             solved = block.points[block.ok]
             self._waiting.append((solved, block.fields.reshape(len(solved), -1, block.fields.shape[1])))
@@ -491,17 +499,22 @@ class Merger:
         self._failures += [replace(f, index=f.index + self._points) for f in block.failures]
         self._points += len(block.points)
         self.count += 1
-        self._blocks.append(replace(block, fields=np.zeros((0, 0))))
+        self._blocks.append(replace(block, fields=np.zeros((0, 0)), sketches=None))
 
     def _form(self) -> None:
         """Add what waits, in one product: the sum is read and written once for all of it."""
         if self._compact is not None and self._waiting:
             points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
             self._add(self._compact.total(points, rows))
+            self._keep(self._compact.sketch(rows))
             self._waiting.clear()
 
     def _add(self, part: FloatArray) -> None:
         self._fields = part if self._fields.size == 0 else self._fields + part
+
+    def _keep(self, sketches: FloatArray | None) -> None:
+        if sketches is not None:
+            self._sketches.append(sketches)
 
     def result(self) -> Evaluations:
         """Return everything added so far as one."""
@@ -525,4 +538,5 @@ class Merger:
             np.concatenate([b.converged for b in self._blocks]),
             np.concatenate([b.stability for b in self._blocks]),
             self._fields,
+            np.concatenate(self._sketches) if self._sketches else None,
         )

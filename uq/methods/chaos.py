@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
@@ -24,11 +25,19 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.stopping import Amount
 from uq.surrogates.basis import gauss, orthonormal
-from uq.surrogates.field_regression import FIELD_DICTIONARY, Projections, solved
+from uq.surrogates.field_regression import (
+    FIELD_DICTIONARY,
+    Projections,
+    errors_of_indices,
+    regression_of_field,
+    relative_of_field,
+    solved,
+)
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import (
     DICTIONARY,
     FULL,
+    NOTHING,
     ROWS_PER_TERM,
     TRUSTED,
     Data,
@@ -141,7 +150,9 @@ class Chaos(Amount):
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
-            fields = Projections(largest, centre.state, gradients, grid, weights)
+            fields = Projections(
+                largest, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
+            )
         rounds: list[Evaluations] = []
         count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
         while True:
@@ -224,6 +235,12 @@ def expansion_dataset(
     )
     by_output, by_pair = ("output",), ("output", "parameter")
     dataset = local_dataset(inputs, evaluate, centre, fields=method.fields)
+    field, terms = None, fit.chosen.which
+    if evaluations.sketches is not None and method.fields:
+        field = regression_of_field(regression, evaluations.sketches)
+        terms = np.concatenate([terms, np.setdiff1d(field.fit.chosen.which, terms)])
+    indices = regression.largest.indices[terms]
+    coefficients = _among(terms, fit.chosen.which, fit.coefficients)
     dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
         {
             **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
@@ -233,8 +250,8 @@ def expansion_dataset(
             "ok": (("sample",), evaluations.ok),
             "order": ((), fit.chosen.order),
             "q": ((), fit.chosen.q),
-            "multi_index": (("term", "parameter"), basis.indices),
-            "coefficients": (("term", "output"), fit.coefficients),
+            "multi_index": (("term", "parameter"), indices),
+            "coefficients": (("term", "output"), coefficients),
             "coordinate_logarithmic": (("parameter",), basis.coordinates.logarithmic.astype(np.int64)),
             "coordinate_mean": (("parameter",), basis.coordinates.centre),
             "coordinate_std": (("parameter",), basis.coordinates.scale),
@@ -249,10 +266,11 @@ def expansion_dataset(
     add(dataset, *regression.doubts(evaluate.outputs))
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
     add(dataset, *of_centre(evaluate.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
-    if evaluations.fields.size and method.fields:
-        fields, rest = _field_estimates(evaluations, centre, evaluate.displacements, regression, estimates)
-        dataset = dataset.assign(fields)
-        add(dataset, *of_field(rest, TRUSTED))
+    if field is not None:
+        dataset = dataset.assign(
+            _field_estimates(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
+        )
+        add(dataset, *of_field(relative_of_field(field), TRUSTED, NOTHING))
     dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:
@@ -295,23 +313,27 @@ def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tup
     }
 
 
+def _among(terms: NDArray[np.int64], which: NDArray[np.int64], coefficients: FloatArray) -> FloatArray:
+    """Return coefficients (P, m) of the functions `which` (P,) as those of `terms` (T,), with zeros for the others."""
+    found = np.zeros((len(terms), coefficients.shape[1]))
+    found[[int(np.flatnonzero(terms == term)[0]) for term in which]] = coefficients
+    return found
+
+
 def _field_estimates(
     evaluations: Evaluations,
     centre: Linearisation,
     count: int,
     regression: Regression,
+    terms: NDArray[np.int64],
+    outputs: Regression,
     estimates: dict[str, FloatArray],
-) -> tuple[dict[str, tuple[tuple[str, ...], FloatArray]], float]:
-    """Coefficients, mean and standard deviation of the displacements, and what the fit leaves of them.
+) -> dict[str, tuple[tuple[str, ...], FloatArray | float]]:
+    """Coefficients of the functions `terms` (T,), mean and standard deviation of the displacements, and their errors.
 
-    Their errors are those of the outputs in proportion to the residuals, which come from the same rows. Standard
-    deviations have the variance that is left as a further error: residuals, as much larger where the fit has not seen
-    the sample as those of the outputs are.
-
-    Returns
-    -------
-    dict, float
-        The variables, and the rest over the standard deviation of the whole field.
+    Errors are those of the sketches and of the outputs in proportion to the residuals, which come from the same rows.
+    What the fit leaves of a variance s², residuals that are as much larger where it has not seen the sample as those of
+    the sketches are, is an error of the standard deviation too, √(s² + left) − s.
     """
     basis, fit = regression.basis, regression.fit
     projections = evaluations.fields[fit.chosen.which][:, :count]
@@ -319,19 +341,26 @@ def _field_estimates(
     squares = np.maximum(evaluations.fields[-1, :count] - (coefficients * projections).sum(axis=0), 0.0)
     coefficients[(basis.indices == 0).all(axis=1)] += centre.state[:count]
     moments = coefficient_moments(coefficients.T, basis.indices)
+    of_sketches = regression.estimates()
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
     rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
-    seen = shares(fit.loo**2, fit.squares / rows)
-    left = max(1.0, float(seen.max(initial=0.0))) * squares / rows
+    seen = float(shares((fit.loo**2).sum(), fit.squares.sum() / rows))
+    left = max(1.0, seen) * squares / rows
     for name in ("mean", "std"):
-        share = np.sqrt(shares(estimates[f"{name}_error"] ** 2, fit.squares).max())
-        error = share * np.sqrt(squares)
+        known = [(estimates, outputs.fit), (of_sketches, fit)]
+        share = max(float(shares(of[f"{name}_error"] ** 2, by.squares).max()) for of, by in known)
+        error = np.sqrt(share * squares)
         if name == "std":
-            error = np.hypot(error, shares(left, 2 * moments["std"]))
+            error = np.hypot(error, shares(left, moments["std"] + np.sqrt(moments["std"] ** 2 + left)))
         fields[f"{name}_error"] = error.reshape(-1, 3)
-    variables = {
+    by_node = [part.reshape(-1, 3).sum(axis=1) for part in (left, left + moments["std"] ** 2)]
+    return {
         **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
-        "field_coefficients": (("term", "node", "component"), coefficients.reshape(len(coefficients), -1, 3)),
+        "field_coefficients": (
+            ("term", "node", "component"),
+            _among(terms, fit.chosen.which, coefficients).reshape(len(terms), -1, 3),
+        ),
+        "field_loo_error": ((), relative_of_field(regression)),
+        "node_loo_error": (("node",), np.sqrt(shares(*by_node))),
+        **{f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()},
     }
-    variance = float((moments["std"] ** 2).sum())
-    return variables, float(np.sqrt(left.sum() / (variance + left.sum()))) if left.sum() > 0 else 0.0

@@ -133,7 +133,11 @@ class MultilevelChaos(Amount):
         bases, n = whole(inputs, self.order), self.per_level(d)
         basis = orthonormal(inputs, bases.all)
         start = _start(centre, self.first)
-        sums = None if start is None else Projections(basis, centre.state, False, None, None)
+        sums = (
+            None
+            if start is None
+            else Projections(basis, centre.state, False, None, None, evaluate.displacements, evaluate.node_volumes)
+        )
         known = _of_tangent(centre, evaluate.displacements)
         levels: list[_Level] = []
         finishing = False

@@ -334,21 +334,24 @@ def _running(rounds: dict[int, dict[str, FloatArray]]) -> Variables:
 def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     """Add the indices of an expanded field.
 
-    Their errors are those of the outputs in proportion to the relative errors of the standard deviations.
+    Errors of the whole field's are known with the expansion; where that explains nothing of the field there are none.
+    Maps are empty where it explains nothing of a node.
     """
     if "field_coefficients" not in dataset:
         return dataset
     squares = (dataset["field_coefficients"].to_numpy() ** 2).sum(axis=2).T
     indices = dataset["multi_index"].to_numpy()
     variance, first, total = partial_variances(squares, indices, np.eye(indices.shape[1], dtype=bool))
-    dataset = dataset.assign(field_indices(variance, first.T, total.T, volumes))
-    of_outputs = dataset["std_error"] / dataset["std"]
-    v = np.ones(dataset.sizes["node"]) if volumes is None else volumes
-    error, size = ((dataset[name].to_numpy() ** 2).sum(axis=1) @ v for name in ("field_std_error", "field_std"))
-    of_field = np.sqrt(error / size)
+    nothing = "field_loo_error" in dataset and float(dataset["field_loo_error"]) > NOTHING
+    known = None
+    if "node_loo_error" in dataset:
+        known = (dataset["node_loo_error"].to_numpy() <= NOTHING) & (not nothing)
+    dataset = dataset.assign(field_indices(variance, first.T, total.T, volumes, known))
     for name in RUNNING:
-        errors = shares(dataset[f"{name}_error"].to_numpy(), of_outputs.to_numpy()[:, None])
-        dataset[f"field_{name}_error"] = (("parameter",), of_field * errors.max(axis=0))
+        if nothing:
+            dataset[f"field_{name}"] = dataset[f"field_{name}"] * np.nan
+        if f"field_{name}_error" not in dataset:  # results of an earlier version
+            dataset[f"field_{name}_error"] = dataset[f"field_{name}"] * np.nan
     return dataset
 
 

@@ -3,24 +3,41 @@
 The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
 of the largest basis that may be chosen. These rows are summed where blocks are added, from the d + 1 fields of a sample
 that the blocks carry.
+
+Which functions the field has is decided by what the field does, and no output need do the same: one on a plane of
+symmetry does not depend on what moves the body across it. Errors at samples that are left out need each sample, of
+which fields keep too much. So a few sketches of each are kept, integrals of its displacements with random weights: to
+these, functions are fitted as to outputs, and what they leave of the sketches is what they leave of the field.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, ForwardModel, Guess, Reference, Solution, scattered
+from forward.model import FloatArray, ForwardModel, Guess, Reference, Solution, SolveError, scattered
+from uq.estimators.indices import partial_variances, shares
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.regression import Data, Fit, candidates_of, fit_best, rows_of
+from uq.surrogates.regression import (
+    NOTHING,
+    ROUNDING,
+    Data,
+    Fit,
+    Regression,
+    candidates_of,
+    fit_best,
+    rows_of,
+)
 
 FIELD_DICTIONARY = 500  # functions to select from, at most: a field in memory for each
+SKETCHES = 8  # of a sample's field
+AS_GOOD = 1.5  # times the least leave-one-out error: up to it, the field has the functions that the outputs have
 
 
 @dataclass(frozen=True)
@@ -39,6 +56,10 @@ class Projections:
         Whether derivatives give rows too.
     points, weights
         Points (n, d) whose weights (n,) are not one.
+    displacements
+        Number of displacements at the head of the state, of which sketches are kept; 0: none are.
+    volumes
+        Share (nodes,) of the body that each node stands for; by default all count alike.
     """
 
     basis: Basis
@@ -46,6 +67,8 @@ class Projections:
     gradients: bool
     points: FloatArray | None
     weights: FloatArray | None
+    displacements: int = 0
+    volumes: FloatArray | None = None
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → y_z of one group's model."""
@@ -71,6 +94,20 @@ class Projections:
         np.matmul(left.reshape(-1, left.shape[2]).T, weighted.reshape(-1, rows.shape[2]), out=total[:-1])
         np.einsum("zru,zru->u", rows, weighted, out=total[-1])
         return total
+
+    def sketch(self, rows: FloatArray) -> FloatArray | None:
+        """Return the integrals (n, r, k) of the displacements of rows (n, r, U) with normal weights.
+
+        Their mean square is that of the displacements over the body (M. F. Hutchinson, Commun. Stat. Simul. Comput. 18
+        (1989) 1059–1076).
+        """
+        count = self.displacements
+        if not count:
+            return None
+        random = np.random.default_rng(0).standard_normal((count, SKETCHES))
+        if self.volumes is not None:
+            random *= np.sqrt(np.repeat(self.volumes, 3))[:, None]
+        return np.asarray(rows[:, :, :count] @ random)
 
 
 @dataclass(frozen=True)
@@ -170,3 +207,50 @@ def solved(fit: Fit, projections: FloatArray) -> FloatArray:
     from scipy.linalg import cho_solve
 
     return np.asarray(cho_solve((fit.triangle, False), projections))
+
+
+# --- what the sketches of a field say ------------------------------------------------------------------------------
+
+
+def regression_of_field(outputs: Regression, sketches: FloatArray) -> Regression:
+    """Fit to the sketches (n, r, k) of the samples of a regression of outputs: by its functions, or by better ones."""
+    slopes = sketches[:, 1:] if sketches.shape[1] > 1 else None
+    data = Data(outputs.data.points, sketches[:, 0], slopes, outputs.data.weights)
+    fits: list[Regression] = []
+    same = replace(outputs.fit.chosen, sparse=False)
+    for sets in ((same,), outputs.candidates.sets):
+        try:
+            fit = fit_best(replace(outputs.candidates, sets=sets), outputs.largest, data)
+        except SolveError:
+            continue  # they are not determined without some of the samples
+        fits.append(replace(outputs, data=data, fit=fit))
+    errors = [relative_of_field(fit) for fit in fits]
+    return next(fit for fit, error in zip(fits, errors, strict=True) if error <= AS_GOOD * min(errors) + ROUNDING)
+
+
+def errors_of_indices(regression: Regression) -> dict[str, FloatArray]:
+    """Return standard errors (d,) of the generalised indices, by the jackknife and by what the fit leaves.
+
+    NaN where it explains nothing.
+    """
+    fit, largest = regression.fit, regression.largest.indices
+    alone = np.eye(largest.shape[1], dtype=bool)
+
+    def of(coefficients: FloatArray, indices: NDArray[np.int64]) -> FloatArray:
+        variance, first, total = partial_variances((coefficients**2).sum(axis=-1), indices, alone)
+        return np.stack([shares(part, variance[..., None]) for part in (first, total)])
+
+    central = of(fit.coefficients, largest[fit.chosen.which])
+    left_out = of(fit.without, largest)
+    groups = len(fit.without)
+    spread = np.sqrt((groups - 1) / groups * ((left_out - central[:, None]) ** 2).sum(axis=1))
+    left = relative_of_field(regression)
+    errors = np.hypot(spread, left**2) if left <= NOTHING else np.full_like(spread, np.nan)
+    return dict(zip(("sobol_first", "sobol_total"), errors, strict=True))
+
+
+def relative_of_field(regression: Regression) -> float:
+    """Return the leave-one-out error of the field over its standard deviation, from all sketches together."""
+    fit = regression.fit
+    variances = shares(fit.loo**2, fit.relative**2)
+    return float(np.sqrt(shares((fit.loo**2).sum(), variances.sum())))

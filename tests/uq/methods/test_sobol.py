@@ -1,12 +1,12 @@
 """Sobol' indices: closed forms, SALib, their own errors, fields from a finite-element model."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from forward.model import FunctionModel, OneByOne, SolveError
+from forward.model import FunctionModel, OneByOne, Solution, SolveError
 from tests.launch import run_script
 from uq.estimators.indices import RowProducts, bootstrap, bootstrap_error, exchanged, pair_variances, partial_variances
 from uq.evaluation.evaluate import Request, SerialEvaluate
@@ -405,6 +405,99 @@ def test_given_an_expansion_of_the_field(beam, tmp_path):
     same = Sobol(samples=8, seed=1).run(inputs, evaluate)
     for name in ("node_sobol_first", "node_sobol_total", "dominating", "field_sobol_total", "field_sobol_total_error"):
         np.testing.assert_allclose(data[name], same[name], rtol=1e-9)
+
+
+SYMMETRIC = """
+[model]
+body = { kind = "box", size = [1.0, 0.3, 0.3], cells = [4, 1, 1], cell = "hexahedron", degree = 1 }
+material = { kind = "neo-hookean", C1 = 1e5, D1 = 1e5 }
+displacements = [{ on = "x-min", x = 0, y = 0, z = 0 }]
+loads = [{ kind = "traction", on = "x-max", direction = [1, 0, 0], size = 5e4 }]
+outputs = [{ name = "ux", kind = "displacement", at = [1, 0, 0], component = "x" }]
+
+[parameters]
+"displacements.x-min.y" = { kind = "uniform", lower = -0.1, upper = 0.1 }
+"loads.traction.size" = { kind = "uniform", lower = 1e4, upper = 5e4 }
+"""
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory):
+    """A bar that is pulled, of which no output says where it is held."""
+    from mpi4py import MPI
+
+    from workflows.config.study import load as load_study
+
+    path = tmp_path_factory.mktemp("moved") / "study.toml"
+    path.write_text(SYMMETRIC + '[method]\nkind = "sobol"\nsamples = 8\n')
+    study = load_study(path)
+    return study.inputs, SerialEvaluate(study.model.build(MPI.COMM_SELF, study.inputs.names))
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(("samples", "gradients"), [(8, True), (8, False), (24, False)])
+def test_fields_have_functions_of_their_own(moved, tmp_path, samples, gradients):
+    """The field moves with the end that is held by 0.2/√12 everywhere, and no output does."""
+    inputs, evaluate = moved
+    data = Sobol(samples=samples, gradients=gradients).run(inputs, evaluate)
+    np.testing.assert_allclose(data["sobol_total"][0], [0, 1], atol=1e-9)
+    # On the axis, y moves as the end that is held; elsewhere the bar gets thinner too.
+    assert (0.2 / np.sqrt(12) <= data["field_std"].sel(component="y") * (1 + 1e-3)).all()
+    exact = np.array([0.9136927, 0.0863073])  # of 60 solves
+    for which in ("first", "total"):
+        error = data[f"field_sobol_{which}_error"].to_numpy()
+        assert (np.abs(data[f"field_sobol_{which}"] - exact) < 3 * error + 1e-7).all()
+        assert (error < 1e-3).all()
+    assert "findings" not in data.attrs
+    again = given(tmp_path, Chaos(samples=samples, gradients=gradients).run(inputs, evaluate)).run(inputs, evaluate)
+    for name in ("field_sobol_total", "field_sobol_total_error", "node_sobol_first"):
+        np.testing.assert_allclose(again[name], data[name], rtol=1e-9)
+
+
+@pytest.mark.fem
+def test_errors_of_fields_hold_what_their_functions_leave(moved):
+    """Of order 1, nothing of the field is known beyond its slopes: indices and moments say by how much."""
+    inputs, evaluate = moved
+    wide = Inputs({**inputs.marginals, "loads.traction.size": Uniform(lower=1e3, upper=2e5)})
+    exact = Sobol(samples=40).run(wide, evaluate)
+    data = Sobol(samples=12, gradients=False, max_order=1).run(wide, evaluate)
+    for which in ("first", "total"):
+        name = f"field_sobol_{which}"
+        distance, error = np.abs(data[name] - exact[name]), data[f"{name}_error"]
+        assert (distance > 1e-3).any()
+        assert (distance < 3 * error).all()
+    distance = np.abs(data["field_std"] - exact["field_std"])
+    assert (distance <= 3 * data["field_std_error"] + 1e-12).mean() > 0.9
+
+
+@pytest.mark.fem
+def test_a_field_that_an_expansion_does_not_explain_has_no_indices(moved):
+    """Values that do not follow from the parameters: no index, no map, and the study says so."""
+    inputs, evaluate = moved
+    model, random = evaluate.model, np.random.default_rng(0)
+
+    @dataclass(frozen=True)
+    class Answer:
+        solution: Solution
+        state: np.ndarray
+
+        def __getattr__(self, name):
+            return getattr(self.solution, name)
+
+    class Noisy(OneByOne):
+        def __getattr__(self, name):
+            return getattr(model, name)
+
+        def solve(self, parameters, guess=None):
+            solution = model.solve(parameters)
+            return Answer(solution, random.standard_normal(solution.state.size))
+
+    data = Sobol(samples=24, gradients=False).run(inputs, replace(evaluate, model=Noisy()))
+    assert np.isnan(data["field_sobol_total"]).all()
+    assert np.isnan(data["field_sobol_total_error"]).all()
+    assert "displacement field explains nothing" in data.attrs["findings"]
+    assert (data["dominating"] == -1).all()
+    assert (data["node_sobol_total"] == 0).all()
 
 
 @pytest.mark.fem
