@@ -29,11 +29,9 @@ from workflows.results.directory import (
     above_rounding,
     blank_where_still,
     digest,
-    inverted,
     label,
     read_dataset,
     read_summary,
-    summarise,
     with_norms,
     with_random_fields,
     with_regions,
@@ -42,6 +40,7 @@ from workflows.results.directory import (
     write_text,
 )
 from workflows.results.norms import node_volumes
+from workflows.results.summary import inverted, summarise
 from workflows.run import own_code
 from workflows.run.plan import memory, of_program, shortage
 from workflows.run.progress import Progress

@@ -21,7 +21,8 @@ from uq.methods.monte_carlo import MonteCarlo
 from workflows.config.study import StudyError, document, dump, parse
 from workflows.report import plots
 from workflows.report.page import write_report
-from workflows.results.directory import label, summarise, write_dataset
+from workflows.results.directory import label, write_dataset
+from workflows.results.summary import summarise
 from workflows.run.plan import plan
 
 CONFIGS = ROOT / "configs"

@@ -19,7 +19,8 @@ from workflows.config.study import dump, parse
 from workflows.report import bodies, plots, words
 from workflows.report.page import compare, write_report
 from workflows.report.sections.body import NO_BODY
-from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, summarise, write_dataset
+from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, write_dataset
+from workflows.results.summary import summarise
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 HEXAHEDRON = [[0, 4, 6, 2, 1, 5, 7, 3]]

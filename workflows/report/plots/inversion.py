@@ -67,6 +67,11 @@ class Cut:
         shares[found < 0] = np.nan
         return cls(1, level, (0, 2), (first, second), mesh.simplices[found], shares)
 
+    @property
+    def words(self) -> str:
+        """The plane in words."""
+        return f"the plane {'xyz'[self.axis]} = {self.level:.4g} m"
+
     def values(self, field: FloatArray) -> FloatArray:
         """Return a field (N,) at the points of the plane."""
         return np.asarray((field[self.vertices] * self.weights).sum(axis=1).reshape(RESOLUTION, RESOLUTION))

@@ -1,4 +1,4 @@
-"""Densities of the outputs, and how their estimates converge."""
+"""Samples of the outputs, and how their estimates converge."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from workflows.report.section import Results, Section
 
 
 class Distribution(Section):
-    """Densities of the outputs, and how their estimates converge."""
+    """Samples of the outputs, and how their estimates converge."""
 
     def applies(self, results: Results) -> bool:
-        """Whether there are samples."""
-        return "values" in results.dataset and "nominal" in results.dataset
+        """Whether there are samples, and nothing smoother."""
+        return {"values", "nominal"} <= set(results.dataset) and "density" not in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """Pictures of each output."""
@@ -22,10 +22,6 @@ class Distribution(Section):
         yield Heading("Distribution and convergence")
         for output in results.outputs:
             yield Heading(output, level=3)
-            if "density" in dataset:
-                caption = f"Density of {output} by the expansion, mean and quantiles."
-                yield Pictures([Picture.drawn(plots.histogram(dataset, output), caption)], small=True)
-                continue
             samples = f"Samples of {output}: density, mean and quantiles."
             running = f"Running mean of {output} with its 95 % confidence band."
             pictures = [

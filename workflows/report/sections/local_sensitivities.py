@@ -23,20 +23,13 @@ class LocalSensitivities(Section):
         return "derivative" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
-        """Tables of each output and of the displacement field, and tornado charts."""
+        """Tables of each output, and tornado charts."""
         dataset = results.dataset
         yield Heading("Local sensitivities")
         yield Text("Derivatives at the mean parameters: what a parameter changes to first order.")
         for output in results.outputs:
             yield Heading(output, level=3)
             yield sensitivities(results, output)
-        if "field_derivative_rms" in dataset:
-            yield Heading("Displacement field", level=3)
-            yield Text(
-                "Root mean square of the derivative of the displacement over the body: its L² norm over the root of "
-                "the volume."
-            )
-            yield field_norms(results)
         captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.outputs}
         yield Pictures([Picture.drawn(plots.tornado(dataset, o), caption) for o, caption in captions.items()])
 
@@ -51,20 +44,6 @@ def sensitivities(results: Results, output: str) -> Table:
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
         rows.append((name, slope, *(with_unit(number(value), unit) for value in scaled)))
     return Table(("parameter", "derivative", "× standard deviation", "× range"), rows)
-
-
-def field_norms(results: Results) -> Table:
-    """Root mean squares over the body of the derivatives of the displacement field."""
-    dataset = results.dataset
-    rows = []
-    for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
-        of_parameter = dataset.sel(parameter=name)
-        size, std, wide = (
-            float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
-        )
-        slope = with_unit(number(size, 5), per("m", unit_of(name)))
-        rows.append((name, slope, with_unit(number(size * std), "m"), with_unit(number(size * wide), "m")))
-    return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
 
 
 def largest_of(dataset: xr.Dataset) -> str:

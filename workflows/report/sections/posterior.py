@@ -1,4 +1,4 @@
-"""What was found for each data set."""
+"""What was found for each data set: estimates, pictures, load cases, directions, iterations."""
 
 from __future__ import annotations
 
@@ -25,39 +25,53 @@ DRAWN = 8  # data sets that have more than a row of the table
 
 
 class Posterior(Section):
-    """What was found for each data set: estimates, pictures, load cases, directions, iterations."""
+    """What was found for each data set of a few parameters."""
 
     def applies(self, results: Results) -> bool:
-        """Whether data were inverted."""
-        return "alone_eigenvalue" in results.dataset
+        """Whether a few parameters were inverted for."""
+        return "alone_eigenvalue" in results.dataset and "draw" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """The same for each of the first data sets."""
-        dataset = results.dataset
-        several, before = dataset.sizes["data_set"] > 1, prior_densities(results.study)
-        for name in dataset.data_set.values[dataset["ok"]][:DRAWN]:
-            one = dataset.sel(data_set=name)
-            yield Heading(str(name))
-            if several:
-                yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
-            yield Pairs([(word, [text]) for word, text in amounts(one)])
+        before = prior_densities(results.study)
+        for one in first(results):
+            yield from verdict(results, one)
+            yield Pairs([*amounts(one, one.sizes["direction"])])
             yield posterior(one)
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before)])
-            yield Heading("Load cases", level=3)
-            yield Text("What each of them alone would have said, with the model linearised at the mode.")
-            yield cases(one)
-            if "direction_parameter" in one:
-                yield Heading("Directions", level=3)
-                yield Text(
-                    "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
-                    "most, the last what they constrain least."
-                )
-                yield directions(one)
-            yield Folded("Iterations of the search for the mode", [iterations(one)])
+            names = [str(name) for name in one.parameter.values if name != "noise"]
+            alone = [[_shown(of["alone_std"].sel(parameter=name), 2) for name in names] for of in each_case(one)]
+            together = [_shown(one["together_std"].sel(parameter=name), 2) for name in names]
+            yield from cases(one, [f"± {named(name, unit_of(name))}" for name in names], [*alone, together])
+            yield Heading("Directions", level=3)
+            yield Text(
+                "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
+                "most, the last what they constrain least."
+            )
+            yield directions(one)
+            yield iterations(one)
 
 
-def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
-    """What was measured, and what it took."""
+def first(results: Results) -> Iterator[xr.Dataset]:
+    """Go through the first data sets that could be inverted."""
+    dataset = results.dataset
+    for name in dataset.data_set.values[dataset["ok"]][:DRAWN]:
+        yield dataset.sel(data_set=name)
+
+
+def verdict(results: Results, one: xr.Dataset) -> Iterator[Block]:
+    """Name a data set, and of several say whether it is to be trusted; of one alone, findings do."""
+    yield Heading(str(one.data_set.item()))
+    if results.dataset.sizes["data_set"] > 1:
+        yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
+
+
+def amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, list[str]]]:
+    """What was measured, and what it took; there are so many directions in all."""
+    return ((word, [text]) for word, text in _amounts(one, directions))
+
+
+def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
     yield "data", f"{int(np.isfinite(one['measured']).sum()):,} components of displacements"
     moved = int(one["points_moved"])
     if moved:
@@ -66,8 +80,7 @@ def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
             f"{moved} points, up to {number(float(one['largest_move']), 2)} m, moved to its surface",
         )
     seen = int((one["eigenvalue"] > plots.SEEN).sum())
-    of = one.sizes["direction"] if "direction_parameter" in one else one.sizes["node"]
-    yield "directions that the data say more of than the prior", f"{seen} of {of:,}"
+    yield "directions that the data say more of than the prior", f"{seen} of {directions:,}"
     yield "directions determined", number(float(one["determined"]), 3)
     if np.isfinite(one["log_evidence_error"]):
         yield "ln Z", f"{number(float(one['log_evidence']), 7)} ± {number(float(one['log_evidence_error']), 2)}"
@@ -88,11 +101,6 @@ def amounts(one: xr.Dataset) -> Iterator[tuple[str, str]]:
         said = f"R̂ up to {float(one['chain_rhat']):.3f}, effective draws from {float(one['chain_effective']):.0f}"
         yield "chains", f"{said}: {words}"
     yield "solves", f"{int(one['solves']):,}"
-    if "products" in one:
-        yield "Hessian products", f"{int(one['products']):,}"
-    if np.isfinite(one["stiffness_true"]).all() and "draw" not in one:
-        inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
-        yield "true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"
 
 
 def posterior(one: xr.Dataset) -> Table:
@@ -125,37 +133,27 @@ def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[s
     return row
 
 
-def cases(one: xr.Dataset) -> Table:
-    """Misfit of each load case, and what it alone would have said."""
-    few = "alone_std" in one
-    names = [str(name) for name in one.parameter.values] if few else []
+def each_case(one: xr.Dataset) -> list[xr.Dataset]:
+    """Return what belongs to each load case."""
+    return [one.sel(case=case) for case in one.case.values]
+
+
+def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator[Block]:
+    """Misfit of each load case, and what it alone would have said: widths with their heads, of all together at last."""
     rows = []
-    for case in one.case.values:
-        of = one.sel(case=case)
-        row = [
-            str(case),
-            f"{int(of['misfit_count']):,}",
-            f"{_shown(of['misfit'])} of {_shown(of['misfit_degrees'])}",
-            str(int((of["alone_eigenvalue"] > plots.SEEN).sum())),
-            _shown(of["alone_determined"], 3),
-        ]
-        if few:
-            row += [_shown(of["alone_std"].sel(parameter=name), 2) for name in names if name != "noise"]
-        else:
-            row.append(_shown(of["alone_stiffness_std"].mean(), 3))
-        rows.append(row)
+    for of, width in zip(each_case(one), widths, strict=False):
+        misfit = f"{_shown(of['misfit'])} of {_shown(of['misfit_degrees'])}"
+        seen = int((of["alone_eigenvalue"] > plots.SEEN).sum())
+        determined = _shown(of["alone_determined"], 3)
+        rows.append([str(of.case.item()), f"{int(of['misfit_count']):,}", misfit, str(seen), determined, *width])
     together = ["all together", f"{int(one['misfit_count'].sum()):,}"]
     together += [f"{_shown(one['misfit'].sum())} of {_shown(one['misfit_degrees'].sum())}"]
-    together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3)]
-    if few:
-        together += [_shown(one["together_std"].sel(parameter=name), 2) for name in names if name != "noise"]
-    else:
-        together.append(_shown(one["stiffness_std"].mean(), 3))
-    head = ["load case", "data", "|r|², expected", "directions with λ > 1", "determined"]
-    head += (
-        [f"± {named(name, unit_of(name))}" for name in names if name != "noise"] if few else ["mean ± of ln stiffness"]
+    together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3), *widths[-1]]
+    yield Heading("Load cases", level=3)
+    yield Text("What each of them alone would have said, with the model linearised at the mode.")
+    yield Table(
+        ["load case", "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together]
     )
-    return Table(head, [*rows, together])
 
 
 def directions(one: xr.Dataset) -> Table:
@@ -168,17 +166,18 @@ def directions(one: xr.Dataset) -> Table:
     return Table(("direction", "λ", "posterior over prior width", *names), rows)
 
 
-def iterations(one: xr.Dataset) -> Table:
-    """The search for the mode."""
-    table = one["step"].to_numpy()
-    table = table[np.isfinite(table).any(axis=1)]
+def iterations(one: xr.Dataset) -> Block:
+    """The search for the mode, which is seen when it is asked for."""
+    steps = one["step"].to_numpy()
+    steps = steps[np.isfinite(steps).any(axis=1)]
     names = [str(name) for name in one.column.values]
     whole = {"start", "pairs", "products", "solves"}
     rows = [
         [str(int(x)) if name in whole else number(float(x), 5) for name, x in zip(names, row, strict=True)]
-        for row in table
+        for row in steps
     ]
-    return Table([name.replace("_", " ") for name in names], rows, text=frozenset())
+    table = Table([name.replace("_", " ") for name in names], rows, text=frozenset())
+    return Folded("Iterations of the search for the mode", [table])
 
 
 def _shown(value: Any, digits: int = 4) -> str:
@@ -190,9 +189,7 @@ def _estimate(of: Any) -> str:
 
 
 def prior_densities(study: Inversion) -> dict[str, plots.Density]:
-    """Curves (values, density) of the priors by the names of the parameters; those of a field have none."""
-    if study.field:
-        return {}
+    """Curves (values, density) of the priors by the names of the parameters."""
     known = dict(study.inputs.marginals)
     if study.method.noise is not None:
         known["noise"] = study.method.noise
@@ -206,33 +203,29 @@ def prior_densities(study: Inversion) -> dict[str, plots.Density]:
     return curves
 
 
-def pictures(one: xr.Dataset, before: dict[str, plots.Density]) -> Iterator[tuple[Axes, str]]:
-    """Draw what was found for one data set, each with what it shows."""
-    cut = plots.Cut.of(one)
-    where = f"the plane {'xyz'[cut.axis]} = {cut.level:.4g} m"
+def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
+    """Draw the stiffness, if it is not the same everywhere, and the spectrum of the data."""
     if float(one["stiffness_prior_std"].max()) > 0:
-        yield plots.slices(one, cut), f"ln of the stiffness factor on {where}: {', '.join(plots.panels(one))}."
+        drawn = ", ".join(plots.panels(one))
+        yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {drawn}."
     yield (
         plots.spectrum(one),
         "λ of all load cases together and of each alone; above 1 the data say more than the prior.",
     )
-    if "draw" in one:
-        yield (
-            plots.marginals(one, before),
-            "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",
-        )
-    else:
-        words = "The directions that the data constrain most, and the last that were found"
-        yield plots.direction_slices(one, cut), f"{words}, on {where}."
-        yield plots.alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {where}."
-        words = "Prior and posterior of ln stiffness where it is found to be least and most, and where least is known"
-        yield plots.node_marginals(one), f"{words}; the truth where it is known."
-    yield plots.misfits(one), "|r|² of each load case, and what is expected: mean and two standard deviations."
-    if "draw" in one:
-        if np.isfinite(one["true"]).any():
-            yield plots.errors(one), "Mean less truth over the posterior standard deviation; 95 % lie in the grey band."
-    elif np.isfinite(one["stiffness_true"]).all():
-        yield (
-            plots.coverage(one),
-            "Error at the nodes over the posterior standard deviation, and the standard normal density.",
-        )
+
+
+def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
+    """Draw the misfits of the load cases."""
+    return plots.misfits(one), "|r|² of each load case, and what is expected: mean and two standard deviations."
+
+
+def pictures(one: xr.Dataset, before: dict[str, plots.Density]) -> Iterator[tuple[Axes, str]]:
+    """Draw what was found for one data set, each with what it shows."""
+    yield from on_a_plane(one, plots.Cut.of(one))
+    yield (
+        plots.marginals(one, before),
+        "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",
+    )
+    yield of_misfits(one)
+    if np.isfinite(one["true"]).any():
+        yield plots.errors(one), "Mean less truth over the posterior standard deviation; 95 % lie in the grey band."

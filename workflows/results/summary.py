@@ -1,0 +1,165 @@
+"""What summary.json says of results: each kind of result has its part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uq.estimators.moments import ESTIMATES
+from uq.methods.compare import ESTIMATED, gains
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Part = dict[str, Any]
+OTHER_ESTIMATES = (
+    *("variance_ratio", "std_variance_ratio", "loo_error"),
+    *("bias_error", "total_error", "std_bias_error", "std_total_error"),
+)
+
+
+def summarise(dataset: xr.Dataset) -> Part:
+    """Return the part of summary.json that follows from the results: `outputs`, `local`, `methods`, or `models`."""
+    summary: Part = {}
+    for needed, part in _PARTS:
+        if needed <= set(dataset.variables):
+            summary |= part(dataset)
+    return summary
+
+
+def inverted(summary: Mapping[str, Any]) -> list[str]:
+    """Say in a line what was found for each data set, if data were inverted."""
+    lines = []
+    for name, found in summary.get("data_sets", {}).items():
+        if "failed" in found:
+            lines.append(f"{name}: failed: {found['failed']}")
+            continue
+        values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
+        lines.append(f"{name}: {', '.join(values)}")
+    if "data" in summary:
+        lines.append(f"{summary['data']} data made")
+    return lines
+
+
+def _inversion(dataset: xr.Dataset) -> Part:
+    from workflows.studies.inversion_results import summary
+
+    return summary(dataset)
+
+
+def _synthetic(dataset: xr.Dataset) -> Part:
+    return {"data": int(np.isfinite(dataset["values"]).sum())}
+
+
+def _comparison(dataset: xr.Dataset) -> Part:
+    shown = ("log_evidence", "log_evidence_error", "probability")
+    trusted = dataset["trusted"].all("group")
+    return {
+        "models": {
+            str(model): {name: _number(dataset[name].sel(model=model)) for name in shown}
+            | {"trusted": bool(trusted.sel(model=model))}
+            for model in dataset.model.values
+        }
+    }
+
+
+def _moments(dataset: xr.Dataset) -> Part:
+    names = [name for name in (*ESTIMATES, *OTHER_ESTIMATES) if name in dataset]
+    return {
+        "outputs": {
+            str(output): {name: float(dataset[name].sel(output=output)) for name in names}
+            for output in dataset.output.values
+        }
+    }
+
+
+def _sobol(dataset: xr.Dataset) -> Part:
+    shares = {"first": "sobol_first", "total": "sobol_total"}
+    names = {f"{short}{end}": f"{name}{end}" for short, name in shares.items() for end in ("", "_error")}
+    return {"sobol": _by_parameter(dataset, names)}
+
+
+def _bounds(dataset: xr.Dataset) -> Part:
+    return {"bounds": _by_parameter(dataset, {"total": "total_bound", "total_error": "total_bound_error"})}
+
+
+def _local(dataset: xr.Dataset) -> Part:
+    names = {"local": "derivative", "local_per_std": "derivative_per_std", "local_per_range": "derivative_per_range"}
+    return {
+        key: {
+            output: {parameter: numbers[""] for parameter, numbers in of_output.items()}
+            for output, of_output in _by_parameter(dataset, {"": variable}).items()
+        }
+        for key, variable in names.items()
+        if variable in dataset
+    }
+
+
+def _by_parameter(dataset: xr.Dataset, names: Mapping[str, str]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return some variables (output, parameter) under shorter names, by output and parameter."""
+    return {
+        str(output): {
+            str(parameter): {
+                short: _number(dataset[name].sel(output=output, parameter=parameter)) for short, name in names.items()
+            }
+            for parameter in dataset.parameter.values
+        }
+        for output in dataset.output.values
+    }
+
+
+def _methods(dataset: xr.Dataset) -> Part:
+    """Cost and error by method and budget; `error` is the root mean square error of the mean of the first output."""
+    gained = {estimated: gains(dataset, estimated) for estimated in ESTIMATED}
+    methods: dict[str, list[dict[str, Any]]] = {}
+    for i, name in enumerate(dataset["row_method"].to_numpy().tolist()):
+        row = dataset.isel(row=i)
+        outputs = {
+            str(output): {
+                estimated: {
+                    "rmse": _number(of_output[f"{estimated}_rmse"]),
+                    "rmse_error": _number(of_output[f"{estimated}_rmse_error"]),
+                    "resolved": bool(of_output[f"{estimated}_resolved"]),
+                    "claimed": _number(of_output[f"{estimated}_claimed"]),
+                    "coverage": _number(of_output[f"{estimated}_coverage"]),
+                    "understated": bool(of_output[f"{estimated}_understated"]),
+                    **{
+                        f"gain_{key}": _number(g.isel(row=i).sel(output=output)) for key, g in gained[estimated].items()
+                    },
+                }
+                for estimated in ESTIMATED
+            }
+            for output in dataset.output.values
+            for of_output in [row.sel(output=output)]
+        }
+        methods.setdefault(name, []).append(
+            {
+                "cost": int(row["solves"]),
+                "cpu_seconds": float(row["cpu_seconds"]),
+                "error": next(iter(outputs.values()))["mean"]["rmse"],
+                "budget": int(row["budget"]),
+                "derived": bool(row["derived"]),
+                "outputs": outputs,
+            }
+        )
+    return {"methods": methods}
+
+
+def _number(value: Any) -> float | None:
+    """A number, or None where it is not finite: JSON has no NaN."""
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+_PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what each needs
+    ({"alone_eigenvalue"}, _inversion),
+    ({"clean"}, _synthetic),
+    ({"probability"}, _comparison),
+    ({"nominal", "mean"}, _moments),
+    ({"sobol_first"}, _sobol),
+    ({"total_bound"}, _bounds),
+    ({"derivative"}, _local),
+    ({"row_method"}, _methods),
+)
