@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.bodies.geometry import AXES, Body, Vector, holds, tolerance
+from forward.bodies.geometry import AXES, Body, Vector, holds
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
@@ -484,22 +484,10 @@ def _interpolation(
     """
     from scipy.sparse import csr_matrix
 
-    from forward.fem.dolfinx import spaces
-
-    body, layout, spec = model.body, model.body.layout, model.body.spec.body
+    body, layout = model.body, model.body.layout
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     which = which.ravel()
-    numbers = layout.nodes()
-    found, distances = spaces.point_weights(body.space, different) if len(places) else ([], np.zeros(0))
-    far = np.flatnonzero(distances > max(tolerance(spec), spec.longest_edge))
-    if len(far):
-        where = ", ".join(f"{x:g}" for x in different[far[0]])
-        message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
-        raise ValueError(message)
-    mine = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
-    held: dict[int, Any] = {}
-    for part in body.comm.allgather(mine):
-        held |= part
+    held, distances = model.space.interpolation(different)
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
     rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]

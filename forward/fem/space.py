@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.bodies.geometry import tolerance
 from forward.bodies.mesh_file import OwnMesh
 from forward.fem.dolfinx import meshes, spaces
 from forward.model import FloatArray
@@ -41,6 +42,32 @@ class BodySpace:
         if not isinstance(body.spec.body, OwnMesh):
             return None
         return self._layout.by_cell(meshes.region_numbers(body.comm, body.spec.body, body.mesh))
+
+    def interpolation(self, points: FloatArray) -> tuple[list[tuple[NDArray[np.int64], FloatArray]], FloatArray]:
+        """Return nodes and weights that interpolate at each of points (n, 3), and how far (n,) these lie outside.
+
+        Collective; on every rank.
+
+        Raises
+        ------
+        ValueError
+            If a point is farther (m) from the mesh than the mesh can be from the body.
+        """
+        body, spec = self._body, self._body.spec.body
+        if not len(points):
+            return [], np.zeros(0)
+        found, distances = spaces.point_weights(body.space, points)
+        far = np.flatnonzero(distances > max(tolerance(spec), spec.longest_edge))
+        if len(far):
+            where = ", ".join(f"{x:g}" for x in points[far[0]])
+            message = f"({where}) lies {distances[far[0]]:.3g} m outside the mesh"
+            raise ValueError(message)
+        numbers = self._layout.nodes()
+        mine = {i: (numbers[here[0]], here[1]) for i, here in enumerate(found) if here is not None}
+        held: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
+        for part in body.comm.allgather(mine):
+            held |= part
+        return [held[i] for i in range(len(points))], distances
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), by its name.

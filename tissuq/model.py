@@ -1,0 +1,153 @@
+"""A model by the names of its numbers: what scripts and notebooks have of a body without a study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import FloatArray, Guess, Reference, gathered
+from forward.settings import nearest
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from forward import model as contract
+
+
+class Model:
+    """A model that is built, ready to be solved again and again.
+
+    Parameters
+    ----------
+    spec
+        What it is: `study.model`, or a block made in Python.
+    parameters
+        Paths of the numbers that change, such as "material.C1"; by default all that can.
+    comm
+        mpi4py communicator of the ranks that share it; by default each process has its own model.
+
+    Attributes
+    ----------
+    parameters
+        The numbers that can change, as the specification has them, by their paths.
+    units
+        Of the outputs, by their names.
+    nodes
+        Coordinates (N, 3) of the nodes (m), sorted by x, then y, then z; None for a model without a body. All fields of
+        results have this order, on any number of ranks.
+    """
+
+    def __init__(self, spec: Any, parameters: Sequence[str] | None = None, comm: Any = None) -> None:
+        if comm is None:
+            from mpi4py import MPI
+
+            comm = MPI.COMM_SELF
+        self.spec = spec
+        names = tuple(spec.scalars if parameters is None else parameters)
+        self._model = spec.build(comm, names)
+        self.parameters = {name: spec.scalars[name].value for name in names}
+        self.units = {output.name: output.unit for output in spec.outputs}
+        self.nodes = None if self._model.space is None else self._model.space.coordinates
+
+    def solve(self, values: Mapping[str, float] | None = None, near: Solution | None = None) -> Solution:
+        """Solve with some numbers changed; collective over the ranks that share the model.
+
+        Parameters
+        ----------
+        values
+            The numbers by their paths; all others are as specified.
+        near
+            A solution that was found before, whose factor may save time; it does not change the answer beyond the
+            tolerance of the solver.
+
+        Raises
+        ------
+        KeyError
+            For a number that the model does not have.
+        SolveError
+            Where there is no answer.
+        """
+        values = values or {}
+        for path in values:
+            if path not in self.parameters:
+                message = f"'{path}' is not among the numbers that change; {nearest(path, tuple(self.parameters))}"
+                raise KeyError(message)
+        point = np.array([values.get(path, value) for path, value in self.parameters.items()])
+        guess = None if near is None else Guess(near.solved.state, Reference(near.point, near.solved.state))
+        return Solution(self, point, self._model.solve(point, guess))
+
+    @property
+    def model(self) -> contract.ForwardModel:
+        """The model as methods know it: vectors in, vectors out."""
+        return self._model  # type: ignore[no-any-return]
+
+
+class Solution(Mapping[str, float]):
+    """What a model answers: its outputs by name, its displacements, and derivatives of both.
+
+    Attributes
+    ----------
+    point
+        The parameters (d,) that it was solved at.
+    solved
+        The solution as methods know it.
+    """
+
+    def __init__(self, model: Model, point: FloatArray, solved: contract.Solution) -> None:
+        self._of, self.point, self.solved = model, point, solved
+        self._outputs = dict(zip(model.model.outputs, map(float, solved.outputs), strict=True))
+
+    def __getitem__(self, output: str) -> float:
+        return self._outputs[output]
+
+    def __iter__(self) -> Any:
+        return iter(self._outputs)
+
+    def __len__(self) -> int:
+        return len(self._outputs)
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{name} = {value:.6g} {self._of.units[name]}" for name, value in self.items())
+        return f"Solution({shown})"
+
+    def gradient(self, output: str) -> dict[str, float]:
+        """Return the derivatives of an output with respect to all numbers that change, by their paths.
+
+        Raises
+        ------
+        DerivativeError
+            If the model or the output has none.
+        """
+        weights = np.array([float(name == output) for name in self])
+        if not weights.any():
+            message = f"'{output}' is no output; {nearest(output, tuple(self))}"
+            raise KeyError(message)
+        return dict(zip(self._of.parameters, map(float, self.solved.adjoint(weights)), strict=True))
+
+    @cached_property
+    def displacement(self) -> FloatArray:
+        """Displacements (N, 3) of the nodes (m), in the order of `Model.nodes`; on the first rank only."""
+        if self._of.nodes is None:
+            message = "this model has no body"
+            raise ValueError(message)
+        whole = gathered(self._of.model, self.solved.state[None, :])
+        return np.zeros((0, 3)) if whole is None else whole[0, : self._of.nodes.size].reshape(-1, 3)
+
+    def displacement_at(self, points: ArrayLike) -> FloatArray:
+        """Return the displacements (n, 3) at points (n, 3) of the undeformed body (m); on the first rank only.
+
+        Raises
+        ------
+        ValueError
+            If a point is not in the body.
+        """
+        places = np.atleast_2d(np.asarray(points, dtype=float))
+        displacement = self.displacement
+        space: Any = self._of.model.space
+        around, _ = space.interpolation(places)
+        if not len(displacement):
+            return np.zeros((0, 3))
+        return np.array([weights @ displacement[nodes] for nodes, weights in around])
