@@ -6,7 +6,7 @@ Each function returns doubts: findings with a few words for the verdict. None of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data from which on the model explains nothing
 STRANGE = 0.01  # probability that any datum of all is as far out as one that does not belong
 LISTED = 5
+LINEAR = 2.0  # deviations of the posterior up to which a shift of ln Z to first order is about right
 MOVED = 1.0  # by which a finer mesh moves ln Z, "not worth more than a bare mention" (Kass and Raftery 1995)
 BIASED, WRONG = (
     0.5,
@@ -216,7 +217,9 @@ def mesh_too_coarse(
     return [Doubt(severity, f"{text}. The mesh is too coarse for the noise: {ADVICE}", short)]
 
 
-def meshes_too_coarse(log_evidence: Mapping[str, float], added: Mapping[str, float]) -> list[Doubt]:
+def meshes_too_coarse(
+    log_evidence: Mapping[str, float], added: Mapping[str, float], shifts: Mapping[str, float]
+) -> list[Doubt]:
     """Doubt the meshes of candidates, by what finer ones do to their evidences.
 
     Parameters
@@ -224,19 +227,36 @@ def meshes_too_coarse(log_evidence: Mapping[str, float], added: Mapping[str, flo
     log_evidence
         With the prior odds, by name.
     added
-        What a finer mesh adds to that; NaN where it is not known, and then zero.
+        What a finer mesh adds to that, to first order; NaN where it is not known, and then zero.
+    shifts
+        The largest shift of an unknown by it, in deviations of the posterior.
     """
     known = {name: change for name, change in added.items() if np.isfinite(change)}
     if not known:
         return []
     there = {name: value + known.get(name, 0.0) for name, value in log_evidence.items()}
     best, other = max(log_evidence, key=log_evidence.__getitem__), max(there, key=there.__getitem__)
-    listed = ", ".join(f"{name} {change:+.2g}" for name, change in known.items())
+    listed = ", ".join(f"{name} {change_in_words(change, shifts[name])}" for name, change in known.items())
+    settled = all(certain(change, shifts[name]) for name, change in known.items())
     text = f"finer meshes move ln Z by: {listed}"
     if best != other:
         found = f"{text}. On these {other} is the most probable, and not {best}"
         return [Doubt("error", f"{found}: the meshes are too coarse to tell; {ADVICE}", "meshes decide")]
-    if max(map(abs, known.values())) <= MOVED:
+    if settled:
         return [Doubt("note", f"{text}; {best} stays the most probable", "")]
     text = f"{text}; {best} stays the most probable. An evidence that moves by more than {MOVED:g} is not to be trusted"
     return [Doubt("warning", f"{text}: {ADVICE}", "meshes too coarse")]
+
+
+def certain(change: Any, shift: Any) -> Any:
+    """Whether a change of ln Z is small, and known: to first order, at shifts of 3 deviations, it was off by 1.6."""
+    return (np.abs(change) <= MOVED) & (np.abs(shift) <= LINEAR)
+
+
+def change_in_words(change: float, shift: float) -> str:
+    """Write a change of ln Z that is known to first order, given the largest shift of an unknown (deviations)."""
+    if abs(shift) <= LINEAR:
+        return f"about {change:+.2g}"
+    return (
+        f"a lot ({change:+.2g} to first order, which does not hold where unknowns move by {abs(shift):.2g} deviations)"
+    )

@@ -179,17 +179,19 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
         for one in [dataset.isel(group=0).sel(model=model)]
         if model != best and not bool(one["mesh_checked"])
     ]
-    doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict())
+    shifts = abs(dataset["mesh_shift"]).max(("group", "parameter")).to_series().to_dict()
+    doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
-    """Trust no evidence whose mesh was not looked at, or whose ln Z a finer one moves."""
-    from inverse.criticism.doubts import MOVED
+    """Trust no evidence whose mesh was not looked at, or whose ln Z a finer one moves or may move."""
+    from inverse.criticism.doubts import certain
 
     if "mesh_checked" not in dataset:
         return dataset
-    return dataset.assign(trusted=dataset["trusted"] & (np.abs(dataset["mesh_log_evidence"]) <= MOVED))
+    shift = abs(dataset["mesh_shift"]).max("parameter")
+    return dataset.assign(trusted=dataset["trusted"] & certain(dataset["mesh_log_evidence"], shift))
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:

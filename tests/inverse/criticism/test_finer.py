@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.doubts import meshes_too_coarse
+from inverse.criticism.doubts import certain, meshes_too_coarse
 from inverse.criticism.finer import Finer, moved
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
@@ -79,15 +79,28 @@ def test_what_is_not_known_is_said():
 
 
 def test_meshes_that_decide_are_an_error():
-    values = {"soft": -10.0, "stiff": -14.0}
-    (note,) = meshes_too_coarse(values, {"soft": -0.3, "stiff": 0.9})
+    values, near = {"soft": -10.0, "stiff": -14.0}, {"soft": 0.4, "stiff": 1.9}
+    (note,) = meshes_too_coarse(values, {"soft": -0.3, "stiff": 0.9}, near)
     assert note.severity == "note"
-    (doubt,) = meshes_too_coarse(values, {"soft": -3.0, "stiff": -4.0})
+    (doubt,) = meshes_too_coarse(values, {"soft": -3.0, "stiff": -4.0}, near)
     assert doubt.severity == "warning"
-    assert "soft -3, stiff -4; soft stays the most probable" in doubt.text
-    (doubt,) = meshes_too_coarse(values, {"soft": -3.0, "stiff": 2.0})
+    assert "soft about -3, stiff about -4; soft stays the most probable" in doubt.text
+    (doubt,) = meshes_too_coarse(values, {"soft": -3.0, "stiff": 2.0}, near)
     assert doubt.severity == "error"
     assert "stiff is the most probable, and not soft" in doubt.text
-    (note,) = meshes_too_coarse(values, {"soft": np.nan, "stiff": 0.5})
+    (note,) = meshes_too_coarse(values, {"soft": np.nan, "stiff": 0.5}, near)
     assert note.severity == "note"
-    assert not meshes_too_coarse(values, {"soft": np.nan, "stiff": np.nan})
+    assert not meshes_too_coarse(values, {"soft": np.nan, "stiff": np.nan}, near)
+
+
+def test_beyond_two_deviations_only_that_it_is_large():
+    """To first order an evidence may seem to stay where it moves by more than one."""
+    values = {"soft": -10.0, "stiff": -14.0}
+    (doubt,) = meshes_too_coarse(values, {"soft": -0.3, "stiff": -0.2}, {"soft": 0.4, "stiff": 3.1})
+    assert doubt.severity == "warning"
+    assert (
+        "soft about -0.3, stiff a lot (-0.2 to first order, which does not hold where unknowns move by 3.1"
+        in doubt.text
+    )
+    assert certain(np.array([0.5, 0.5, 1.5]), np.array([1.0, 3.0, 1.0])).tolist() == [True, False, False]
+    assert not certain(np.nan, np.nan)

@@ -27,13 +27,15 @@ class FinerMeshes(Section):
         yield Heading("What a finer mesh moves", level=3)
         yield Text(
             "One solve of each candidate, at its mode on a finer mesh with thinner cells at the faces that are held, "
-            "and what follows from it by the model that is linear there."
+            "and what follows from it to first order, by the model that is linear there."
         )
         yield meshes(results.dataset)
 
 
 def meshes(dataset: xr.Dataset) -> Table:
     """What a finer mesh does to data, evidence and unknowns of each candidate."""
+    from inverse.criticism.doubts import change_in_words
+
     rows = []
     for model in dataset.model.values:
         one = dataset.sel(model=model).isel(group=0)
@@ -43,6 +45,7 @@ def meshes(dataset: xr.Dataset) -> Table:
         error, shift = one["mesh_error"].to_numpy(), one["mesh_shift"].dropna("parameter")
         listed = [f"{name} {float(shift.sel(parameter=name)):+.2g}" for name in shift.parameter.values]
         size, most = (f"{value:.2g}" for value in (float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(abs(error)))))
-        rows.append((str(model), f"{float(one['mesh_log_evidence']):+.3g}", size, most, ", ".join(listed)))
+        moved = change_in_words(float(one["mesh_log_evidence"]), float(abs(shift).max()))
+        rows.append((str(model), moved, size, most, ", ".join(listed)))
     head = ("model", "ln Z", "data, over the errors", "at most", "unknowns, in deviations of the posterior")
     return Table(head, rows, text=frozenset({0, 4}), long=frozenset({4}))
