@@ -60,10 +60,9 @@ def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]
     a, b, c = cells
     changes = [f"model.body.cell={cell!r}", f"model.formulation={form!r}", *([change] if change else [])]
     study = beam((a, b, c), *changes)
-    assert study.body is not None
     inputs, d = study.inputs, len(study.inputs.names)
-    model = study.body.build(MPI.COMM_SELF, inputs.names)
-    textbook = study.body.model_copy(update={"solver": study.body.solver.model_copy(update={"kind": "newton"})})
+    model = study.spec.build(MPI.COMM_SELF, inputs.names)
+    textbook = study.spec.textbook()
     forced = textbook.build(MPI.COMM_SELF, inputs.names)
     tiny = beam((1, 1, 1), *changes)
     small = tiny.model.build(MPI.COMM_SELF, inputs.names).solve(inputs.mean)
@@ -83,7 +82,7 @@ def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]
     points = inputs.points(random_points(1, 0, DRAWS, d))
     samples = sum(_timed(lambda at=at: model.solve(at, guess(at)))[0] for at in points) / DRAWS
     slow, _ = _timed(lambda: forced.solve(points[0]))
-    model_times = times(study.body.body, mixed=study.body.mixed)
+    model_times = times(study.spec.body, mixed=study.spec.mixed)
     predicted = np.array(
         [
             model_times.first,
@@ -96,7 +95,7 @@ def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]
     measured = np.array([first, once, tangents, samples, slow])
     ratios = predicted / measured
     print(
-        f"| {'cube' if change else 'beam'} | {a} × {b} × {c}, {cell} | {form} | {study.body.unknowns:,} | "
+        f"| {'cube' if change else 'beam'} | {a} × {b} × {c}, {cell} | {form} | {study.spec.unknowns:,} | "
         + " | ".join(f"{p:.2g}, {m:.2g}" for p, m in zip(predicted, measured, strict=True))
         + f" | {', '.join(f'{ratio:.2f}' for ratio in ratios)} |",
         flush=True,

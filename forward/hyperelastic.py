@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union, get_args
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -15,6 +15,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
+from forward.fem.cost import Times, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials
 from forward.materials.energies import MATERIALS, constants, measures, splits
@@ -23,6 +24,7 @@ from forward.observables.outputs import Output, PointDisplacement, Reaction
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
+from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
@@ -124,7 +126,7 @@ def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], pa
     return Materials(energy, found)
 
 
-class Hyperelastic(Settings):
+class Hyperelastic(ModelSpec):
     """A hyperelastic body under loads, solved by finite elements.
 
     Parameters
@@ -157,6 +159,9 @@ class Hyperelastic(Settings):
         values of the inputs in a study, with the constants as given elsewhere.
     """
 
+    meshed: ClassVar[bool] = True
+    iterative: ClassVar[bool] = True
+    shareable: ClassVar[bool] = True
     kind: Literal["hyperelastic"] = "hyperelastic"
     formulation: Formulation = "auto"
     body: Body
@@ -286,6 +291,51 @@ class Hyperelastic(Settings):
     def refined(self, level: int) -> Self:
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
         return self.model_copy(update={"body": self.body.refined(level)})
+
+    def mistakes_of_samples(self) -> Iterator[Mistake]:
+        """Find random fields whose coefficients cannot be drawn."""
+        for i, field in enumerate(self.fields):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+
+    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
+        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        return (*dict.fromkeys((*self.findings, *too_far(self.body, ranges))), *self.locking(ranges))
+
+    def textbook(self) -> Self:
+        """Return the same problem solved by Newton's method from zero, with a new factor for every step."""
+        return self.model_copy(update={"solver": self.solver.model_copy(update={"kind": "newton"})})
+
+    def tighter(self, factor: float) -> Self:
+        """Return the same problem with the tolerances of its solver times a factor."""
+        tolerances = {name: factor * getattr(self.solver, name) for name in ("tolerance", "derivative_tolerance")}
+        return self.model_copy(update={"solver": self.solver.model_copy(update=tolerances)})
+
+    def solved_to(self, tolerance: Any) -> Self:
+        """Return the same problem with another tolerance of its solver."""
+        solver = SolverSettings.model_validate(self.solver.model_dump() | {"tolerance": tolerance})
+        return self.model_copy(update={"solver": solver})
+
+    def cost(self, factors: int = 2) -> Times:
+        """Predict what a solve takes; a factor of a solution and one of a reference are kept."""
+        predicted = self.solver.kind != "newton"
+        return times(self.body, mixed=self.mixed, symmetric=self.symmetric, predicted=predicted, factors=factors)
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Say what was found in the file of a mesh, how many unknowns there are, and which."""
+        decision, body = self.decision(ranges), self.body
+        form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
+        unknowns = self.over(ranges).unknowns
+        yield from body.listed.items()
+        yield "unknowns", f"{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
+        yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that decides on results; of the file of a mesh its hash counts, not its place."""
+        found = super().identity()
+        found["body"].pop("file", None)
+        return found
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> HyperelasticModel:
         """Mesh the body and compile the forms on a communicator; collective.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,10 +91,18 @@ class Kinds:
             raise KindError(f"the {self.family} '{module}.{name}' has no field called kind, expected kind: str")
         return found
 
-    def dotted(self, block: Any) -> str | None:
-        """Return the module that a block's kind comes from, where the kind is a dotted path."""
-        kind = block.get("kind") if isinstance(block, Mapping) else getattr(block, "kind", None)
-        return kind.rpartition(".")[0] if isinstance(kind, str) and "." in kind else None
+
+def dotted(document: Any) -> Iterator[str]:
+    """Return the modules of all kinds in a document that are dotted paths, wherever in it they are."""
+    if isinstance(document, Mapping):
+        kind = document.get("kind")
+        if isinstance(kind, str) and "." in kind and all(step.isidentifier() for step in kind.split(".")):
+            yield kind.rpartition(".")[0]
+        document = document.values()
+    elif not isinstance(document, list | tuple):
+        return
+    for block in document:
+        yield from dotted(block)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import copy
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +20,17 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.bodies.geometry import AXES, Body, Vector, holds
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
+from forward.fem.cost import Times, sum_of
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.hyperelastic import Hyperelastic, Material, materials
 from forward.materials.admissible import Materials
 from forward.materials.energies import splits
-from forward.model import Finding, FloatArray, Guess, OneByOne, Reference, SolveError, Stability, Work
-from forward.observables.outputs import Output
-from forward.scalars import Scalar
+from forward.model import Finding, FloatArray, Guess, ModelError, OneByOne, Reference, SolveError, Stability, Work
+from forward.observables.outputs import Output, PointDisplacement
+from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.newton import SolverSettings
+from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
@@ -101,7 +103,7 @@ class _Loaded(Hyperelastic):
     outputs: tuple[Output, ...] = ()
 
 
-class Specimen(Settings):
+class Specimen(ModelSpec):
     """A body that is tested in several load cases.
 
     Parameters
@@ -114,6 +116,7 @@ class Specimen(Settings):
         What is measured; not needed where data say it.
     """
 
+    shareable: ClassVar[bool] = True
     kind: Literal["specimen"] = "specimen"
     body: Body
     material: Material
@@ -183,6 +186,60 @@ class Specimen(Settings):
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the load cases before anything is solved, each once."""
         return tuple(dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings))
+
+    def mistakes_of_samples(self) -> Iterator[Mistake]:
+        """Find that outputs are not known, and random fields whose coefficients cannot be drawn."""
+        try:
+            outputs = self.outputs
+        except ModelError as error:
+            yield ("model", "observed"), str(error), [item.on for item in self.observed]
+        else:
+            if not outputs:
+                yield ("model", "observed"), "nothing is observed, expected points", ()
+        yield from self.loaded(self.cases[0]).mistakes_of_samples()
+
+    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
+        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        return (*self.findings, *self.locking(ranges))
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        cases = ", ".join(case.name for case in self.cases)
+        return f"{self.body.description}, {self.body.cells_in_words} cells, in the load cases {cases}"
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Displacements of the points that are observed, case after case.
+
+        Raises
+        ------
+        ModelError
+            If nodes of a boundary are observed: which these are, only the mesh can tell.
+        """
+        found = []
+        for i, item in enumerate(self.observed):
+            if item.on is not None:
+                message = f"observed[{i}].on: its nodes are not known before there is a mesh, expected points ('at')"
+                raise ModelError(message)
+        for case in self.cases:
+            for item in self.seen(case):
+                for i, at in enumerate(item.at):
+                    for axis in (one for one in AXES if one in item.components):
+                        name = f"{case.name}.{item.label}.{i}.{axis}"
+                        found.append(PointDisplacement(name=name, at=at, component=axis))
+        return tuple(found)
+
+    def cost(self) -> Times:
+        """Predict what a solve of all load cases takes, of which each has a factor."""
+        return sum_of([self.loaded(case).cost(factors=1) for case in self.cases])
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Say what was found in the file of a mesh, the load cases, and which unknowns they have."""
+        decision, names = self.decision(ranges), ", ".join(case.name for case in self.cases)
+        yield from self.body.listed.items()
+        yield "load cases", f"{names}, of {self.over(ranges).unknowns:,} unknowns each"
+        yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
         """Mesh the body and compile the forms of every case on a communicator; collective.

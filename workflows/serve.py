@@ -22,7 +22,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from forward.external.models import PROTOCOL
-from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, displacements
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
@@ -147,14 +146,14 @@ class Service:
 
     def _specified(self, options: dict[str, Any]) -> Any:
         """Return the specification of the model with options."""
-        model = self._study.body or self._study.model
+        model = self._study.spec
         if not options:
             return model
-        if not isinstance(model, Hyperelastic):
+        if not model.meshed:
             message = f"config: a model of kind '{model.kind}' has no options"
             raise RefusalError("InvalidInput", message)
-        level, tolerance = options.get("level", 0), options.get("tolerance", model.solver.tolerance)
-        if type(level) is not int or level < 0 or (level > 0 and model.fields):
+        level = options.get("level", 0)
+        if type(level) is not int or level < 0 or (level > 0 and model.coefficients):
             message = (
                 f"config.level: {shown(level)}, expected a number of refinements, and 0 where there are random fields"
             )
@@ -163,8 +162,8 @@ class Service:
             if level > 0 and 8 ** min(level, 20) * model.unknowns > MOST_UNKNOWNS:
                 message = f"config.level: {shown(level)}, expected a mesh of at most {MOST_UNKNOWNS:,} unknowns"
                 raise RefusalError("InvalidInput", message)
-            solver = type(model.solver).model_validate(model.solver.model_dump() | {"tolerance": tolerance})
-            return model.refined(level).model_copy(update={"solver": solver})
+            refined = model.refined(level)
+            return refined.solved_to(options["tolerance"]) if "tolerance" in options else refined
         except ValidationError as error:
             message = f"config: {error.errors()[0]['msg']}"
         except ModelError as error:  # a mesh from a file has no finer ones

@@ -147,6 +147,11 @@ class _SixSided(Settings):
         return " × ".join(f"{n}" for n in self.cells)
 
     @property
+    def listed(self) -> dict[str, str]:
+        """What a file holds, in words: there is none."""
+        return {}
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Nothing is odd about it."""
         return ()

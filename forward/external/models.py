@@ -10,20 +10,24 @@ import json
 import sys
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from forward.external.own_modules import Sources, sources
+from forward.external.own_modules import sources
 from forward.external.patience import TimeLimitError, time_limit
 from forward.machine import StopError, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
 from forward.scalars import Scalar
 from forward.settings import Settings, nearest
+from forward.spec import ModelSpec
+
+if TYPE_CHECKING:
+    from forward.fem.locking import Ranges
 
 SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
 PROTOCOL = 1.0
@@ -58,7 +62,7 @@ class _Number(Settings):
     value: float
 
 
-class _External(Settings):
+class _External(ModelSpec):
     """A map from d numbers to m outputs, without a mesh.
 
     Parameters
@@ -82,16 +86,6 @@ class _External(Settings):
         """Every number that can be made a parameter, by its name."""
         return {name: Scalar(value, _Number, "value") for name, value in self.parameters.items()}
 
-    @property
-    def coefficients(self) -> tuple[str, ...]:
-        """No random fields."""
-        return ()
-
-    @property
-    @abstractmethod
-    def description(self) -> str:
-        """The model in words."""
-
     @abstractmethod
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Return the map from all parameters (d,) to outputs (m,), and its Jacobian (m, d) if there is one.
@@ -101,6 +95,11 @@ class _External(Settings):
         ModelError
             If it cannot be found.
         """
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Find the model, and say what it is; no one knows how long a solve takes."""
+        _, jacobian = self.functions()
+        yield "model", f"{self.description}; {'with' if jacobian else 'without'} derivatives"
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> FunctionModel:
         """Find the model and make it a function of some of its parameters; the others keep their values."""
@@ -175,11 +174,6 @@ class PythonModel(_External):
     def modules(self) -> tuple[str, ...]:
         """The modules of function and Jacobian."""
         return tuple(path.rpartition(".")[0] for path in (self.function, self.jacobian) if path)
-
-    @property
-    def sources(self) -> Sources:
-        """All modules that the model is made of: what was solved before they changed is no part of its results."""
-        return sources(self.modules)
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Import function and Jacobian."""

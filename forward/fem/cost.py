@@ -10,7 +10,8 @@ with the counts of iterations of a block and of a beam that bends far (`python -
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Protocol
 
@@ -110,6 +111,10 @@ class Times:
         Of one factor, and of one right-hand side with it.
     slender
         Whether the body is.
+    predicted
+        Whether samples are solved from predictions, and not by the textbook.
+    bytes
+        Memory of mesh, matrices and factors.
     """
 
     assembly: float
@@ -118,6 +123,13 @@ class Times:
     factorisation: float
     substitution: float
     slender: bool
+    predicted: bool = True
+    bytes: float = 0.0
+
+    @property
+    def sample(self) -> float:
+        """A sample without derivatives."""
+        return self.corrected if self.predicted else self.textbook
 
     @property
     def textbook(self) -> float:
@@ -152,8 +164,8 @@ class Times:
         return NEAR * parameters * (self.substitution + self.residual)
 
 
-def times(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Times:
-    """Predict the times of a body; without symmetry of the stiffness, LU is twice LDLᵀ."""
+def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool = True, factors: int = 1) -> Times:
+    """Predict what solves of a body take, with some factors; without symmetry of the stiffness, LU is twice LDLᵀ."""
     triangles = 1 if symmetric else 2
     extents = [high - low for low, high in body.bounds]
     found, kind, more = factor(body, mixed=mixed), (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
@@ -164,7 +176,15 @@ def times(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Times:
         CALL + triangles * (PER_ENTRY * found.entries + PER_OPERATION * found.operations),
         CALL + triangles * PER_ENTRY_SOLVED * found.entries,
         max(extents) > SLENDER * min(extents),
+        predicted,
+        BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * found.bytes,
     )
+
+
+def sum_of(parts: Sequence[Times]) -> Times:
+    """Predict what several bodies take that are solved one after the other."""
+    totals = {f.name: sum(getattr(part, f.name) for part in parts) for f in fields(Times) if f.type == "float"}
+    return replace(parts[0], **totals)
 
 
 def factor(body: Meshed, *, mixed: bool) -> Factor:

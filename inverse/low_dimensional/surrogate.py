@@ -68,7 +68,7 @@ class Surrogate:
     displacements: int = 0
     node_volumes: FloatArray | None = None
 
-    def on(self, model: int) -> Surrogate:
+    def on(self, model: str) -> Surrogate:
         """Return itself: it stands for one model."""
         return self
 

@@ -8,7 +8,7 @@ order.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
@@ -18,7 +18,7 @@ import numpy as np
 from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError, displacements
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.evaluate import BLOCKS, BlockSolver, Evaluations, Merger, Request
+from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job
 
 T = TypeVar("T")
@@ -108,7 +108,7 @@ class Ensemble:
         model: ForwardModel,
         task: Callable[[EnsembleEvaluate], T],
         *,
-        others: Sequence[Callable[[], ForwardModel]] = (),
+        others: Mapping[str, Callable[[], ForwardModel]] | None = None,
         checkpoint: Checkpoint | None = None,
         progress: Progress = lambda done, failed: None,
         blocks: int = BLOCKS,
@@ -123,7 +123,7 @@ class Ensemble:
         task
             Called on rank 0 only, with the evaluation.
         others
-            Make this group's models number 1, 2, … (`Evaluate.on`), each when it is first asked for.
+            Make this group's other models by their names (`Evaluate.on`), each when it is first asked for.
         checkpoint
             Where finished blocks are kept and found.
         progress
@@ -131,7 +131,7 @@ class Ensemble:
         blocks
             Most blocks that an evaluation is cut into.
         node_volumes
-            On rank 0: those of model number 0, see `Evaluate`.
+            On rank 0: those of the first model, see `Evaluate`.
 
         Returns
         -------
@@ -139,14 +139,14 @@ class Ensemble:
             What the task returned, on rank 0; nothing on the other ranks.
         """
         with self.turns(progress) as turns:
-            worker = _Worker(self, _Models(model, others), checkpoint, turns)
+            worker = _Worker(self, _Models(model, others or {}), checkpoint, turns)
             if self.world.rank > 0:
                 with abort_all(self.world):
                     while (order := self.world.bcast(None)) is not None:
                         worker.work(order)
                 return None
             try:
-                return task(EnsembleEvaluate(worker, 0, progress, blocks, node_volumes))
+                return task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes))
             finally:
                 self.world.bcast(None)
 
@@ -164,14 +164,14 @@ class _Order:
 class _Models:
     """The models of this group, each made when it is first asked for; making one is collective over the group."""
 
-    def __init__(self, first: ForwardModel, others: Sequence[Callable[[], ForwardModel]]) -> None:
+    def __init__(self, first: ForwardModel, others: Mapping[str, Callable[[], ForwardModel]]) -> None:
         self._makers = others
-        self._made = {0: first}
+        self._made = {OWN: first}
 
-    def __getitem__(self, number: int) -> ForwardModel:
-        if number not in self._made:
-            self._made[number] = self._makers[number - 1]()
-        return self._made[number]
+    def __getitem__(self, name: str) -> ForwardModel:
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class EnsembleEvaluate:
     """The evaluation that a method sees on rank 0, of one of the models."""
 
     worker: _Worker
-    number: int
+    name: str
     progress: Progress
     blocks: int = BLOCKS
     volumes: Callable[[], FloatArray | None] = lambda: None
@@ -187,36 +187,36 @@ class EnsembleEvaluate:
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return self.worker.models[self.number].parameters
+        return self.worker.models[self.name].parameters
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return self.worker.models[self.number].outputs
+        return self.worker.models[self.name].outputs
 
     @property
     def differentiable(self) -> bool:
         """Whether solutions have derivatives."""
-        return self.worker.models[self.number].differentiable
+        return self.worker.models[self.name].differentiable
 
     @property
     def displacements(self) -> int:
         """Number of displacements at the head of a state."""
-        return displacements(self.worker.models[self.number])
+        return displacements(self.worker.models[self.name])
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Share (n_nodes,) of the body that each node of model number 0 stands for, see `Evaluate`."""
-        return self.volumes() if self.number == 0 else None
+        """Share (n_nodes,) of the body that each node of the first model stands for, see `Evaluate`."""
+        return self.volumes() if self.name == OWN else None
 
-    def on(self, model: int) -> EnsembleEvaluate:
+    def on(self, model: str) -> EnsembleEvaluate:
         """Return the evaluation of another of the models; all groups make it now."""
         self.worker.prepare(model)
-        return replace(self, number=model)
+        return replace(self, name=model)
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request on all groups; blocks that are on disk are read."""
-        request = replace(request, model=self.number)
+        request = replace(request, model=self.name)
         blocks = request.blocks(self.blocks)
         checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()
@@ -254,7 +254,7 @@ class _Worker:
         self._turns = turns
         self._saved = -np.inf  # when a block was last written
 
-    def prepare(self, model: int) -> None:
+    def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""
         with abort_all(self._ensemble.world):
             self._ensemble.world.bcast(model)
@@ -277,9 +277,9 @@ class _Worker:
             self._ensemble.world.bcast(order)
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 
-    def work(self, order: _Order | int) -> None:
-        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its number."""
-        if isinstance(order, int):
+    def work(self, order: _Order | str) -> None:
+        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its name."""
+        if isinstance(order, str):
             self.models[order]
             return
         self._turns.follow(order.pending, self._solving(order, lambda done, failed: None))

@@ -7,8 +7,8 @@ in order. So the result does not depend on who computed which block.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -30,6 +30,7 @@ from forward.model import (
 )
 from uq.inputs.coordinates import Coordinates
 
+OWN = ""  # name of the model that an evaluation has first
 LARGEST = 1e60  # size of outputs, and one over it the smallest: fourth powers of them are numbers
 MANY = 8  # points of which one is expected to have an output that is not small by chance
 TOGETHER = 16  # realisations whose part of a compact sum is formed at once
@@ -195,7 +196,7 @@ class Request:
     iterations
         Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
     model
-        Which of the models that the evaluation has; `Evaluate.on` sets it.
+        Name of the model among those that the evaluation has; `Evaluate.on` sets it.
     joint
         What is summed, in place of `fields`, of the states of points that follow each other.
     """
@@ -205,7 +206,7 @@ class Request:
     fields: FieldSum | None = None
     start: Start | None = None
     iterations: int | None = None
-    model: int = 0
+    model: str = OWN
     joint: JointSum | None = None
 
     def blocks(self, most: int | None = None) -> list[Request]:
@@ -241,8 +242,8 @@ class Evaluate(Protocol):
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
 
-    def on(self, model: int) -> Evaluate:
-        """Return the evaluation of another of the models (meshes, solvers), by its number; this one has number 0."""
+    def on(self, model: str) -> Evaluate:
+        """Return the evaluation of another of the models (meshes, solvers), by its name; the first is called `OWN`."""
 
 
 @dataclass(frozen=True)
@@ -256,19 +257,19 @@ class SerialEvaluate:
     progress
         Told the numbers of points that were done and that failed since it was last told.
     others
-        Models number 1, 2, … that a method may ask for.
+        Models that a method may ask for, by their names.
     node_volumes
         See `Evaluate`.
     """
 
     model: ForwardModel
     progress: Callable[[int, int], None] = lambda done, failed: None
-    others: tuple[ForwardModel, ...] = ()
+    others: Mapping[str, ForwardModel] = field(default_factory=dict)
     node_volumes: FloatArray | None = None
 
-    def on(self, model: int) -> SerialEvaluate:
+    def on(self, model: str) -> SerialEvaluate:
         """Return the evaluation of another of the models."""
-        return replace(self, model=(self.model, *self.others)[model])
+        return self if model == OWN else replace(self, model=self.others[model])
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -304,14 +305,14 @@ class Recorder:
     log
         Every evaluation, in order, of all models; shared by the evaluations of the other models.
     models
-        The number of the model of each.
+        The name of the model of each.
     """
 
-    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: int = 0) -> None:
+    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
         self._evaluate = evaluate
         self._model = model
         self.log: list[Evaluations] = [] if whole is None else whole.log
-        self.models: list[int] = [] if whole is None else whole.models
+        self.models: list[str] = [] if whole is None else whole.models
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -353,7 +354,7 @@ class Recorder:
         self.models.append(self._model)
         return evaluations
 
-    def on(self, model: int) -> Recorder:
+    def on(self, model: str) -> Recorder:
         """Return the evaluation of another of the models, with the same log."""
         return Recorder(self._evaluate.on(model), self, model)
 

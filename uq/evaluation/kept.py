@@ -75,7 +75,7 @@ class KeptEvaluate:
     log: list[Evaluations] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
 
-    def on(self, model: int) -> KeptEvaluate:
+    def on(self, model: str) -> KeptEvaluate:
         """Return itself: it has one model."""
         return self
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,11 +204,3 @@ class Inputs:
         assert self.admissible is not None
         corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
         return bool(self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all())
-
-
-@runtime_checkable
-class Restricted(Protocol):
-    """A method that some parameters do not allow."""
-
-    def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters do not allow it, or nothing."""

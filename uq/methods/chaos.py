@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +107,14 @@ class Chaos(Amount):
         if self.fit == "projection":
             return int(1 + (self.max_order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
+
+    def with_tangents(self, samples: int) -> int:
+        """All, where gradients are fitted to."""
+        return samples if self.gradients and self.fit == "regression" else 0
+
+    def stream(self) -> tuple[Any, ...] | None:
+        """Points of the design."""
+        return "design", self.gradients
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters cannot be expanded in, or nothing."""

@@ -11,37 +11,40 @@ Points that several methods or budgets ask for are solved once, and charged to e
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, assert_never
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_serializer, model_validator
 
 from forward.model import Finding, FloatArray, Severity, SolveError
+from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 from uq.estimators.moments import ESTIMATES, half_width, ratio
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request, merge
 from uq.findings import add, findings
-from uq.inputs.random_parameters import Inputs, Restricted
+from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.chaos import Chaos
-from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.methods.multilevel_chaos import MultilevelChaos
-from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.methods.method import SAMPLING, Method
+from uq.methods.stopping import Amount
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# Methods that estimate moments from samples.
-Sampling = MonteCarlo | SensitivityMonteCarlo | QuasiMonteCarlo | Chaos | MultilevelChaos
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec, Times
+
+COMPARED = Kinds("method", SAMPLING, Amount)  # methods that estimate moments from samples
+REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **SAMPLING}, Method)
 ESTIMATED = ("mean", "std")
 TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # of results, what no restart gives again
 RESOLVED = 2.0  # an error is measured where it is so many times the reference's own
 ROUNDING = 16 * np.finfo(float).eps  # relative error of a reference that claims less
 UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
-TIGHT, TEXTBOOK, REFINED = 1, 2, 3  # numbers of the models beside the study's own
+TIGHT, TEXTBOOK, REFINED = "tight", "textbook", "refined"  # names of the models beside the study's own
 TIGHTER = 1e-3  # tolerances of the solver that makes the reference, relative to those of the study
 # Severity of a finding of a comparison, and those of the methods' own that it repeats.
 TOLD: tuple[tuple[Severity, set[str]], ...] = (("warning", {"error", "warning"}), ("note", {"note"}))
@@ -56,11 +59,32 @@ class Known(Settings):
     std_error: Annotated[float, Field(ge=0)] = 0.0
 
 
-class Given(Settings):
+class Given(Method):
     """A reference that is known: the moments of every output, by its name."""
 
     kind: Literal["given"] = "given"
     values: dict[str, Known]
+
+    def planned(self, dimension: int) -> int:
+        """None."""
+        return 0
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find outputs whose moments are not given, and others that are."""
+        outputs = [output.name for output in spec.outputs]
+        if set(self.values) != set(outputs):
+            yield ("method", "values"), f"expected values of every output: {', '.join(outputs)}", list(self.values)
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Return what is known; errors as of every method."""
+        import xarray as xr
+
+        missing = [name for name in evaluate.outputs if name not in self.values]
+        if missing:
+            message = f"the reference gives no values of {', '.join(missing)}, expected those of every output"
+            raise ValueError(message)
+        values = [self.values[name] for name in evaluate.outputs]
+        return xr.Dataset({name: ("output", [getattr(known, name) for known in values]) for name in ESTIMATES})
 
 
 class Entry(Settings):
@@ -78,23 +102,17 @@ class Entry(Settings):
 
     name: str = ""
     budgets: tuple[int, ...]
-    sampling: Annotated[Sampling, Field(discriminator="kind")]
+    sampling: Annotated[Amount, OfKind(COMPARED)]
 
     @property
     def label(self) -> str:
         """The name in results."""
         return self.name or self.sampling.kind
 
-    def at(self, budget: int, seed: int = 0) -> Sampling:
+    def at(self, budget: int, seed: int = 0) -> Amount:
         """Return the method with so many samples, for its moments only."""
-        kept = {"samples": budget, "seed": seed, **_MOMENTS_ONLY}
+        kept = {"samples": budget, "seed": seed, **_moments_only(self.sampling)}
         return type(self.sampling).model_validate(self.sampling.model_dump() | kept)
-
-    def shortage(self, dimension: int) -> str | None:
-        """Say that there are too few samples for what is fitted to them, or nothing."""
-        if not isinstance(self.sampling, MultilevelChaos):
-            return None
-        return self.sampling.model_copy(update={"samples": min(self.budgets)}).shortage(dimension)
 
     @model_validator(mode="before")
     @classmethod
@@ -136,7 +154,7 @@ class Entry(Settings):
         reference = handler(core)
         entry = handler.resolve_ref_schema(reference)
         own = {name: entry["properties"][name] for name in ("name", "budgets")}
-        methods = [handler.resolve_ref_schema(m) for m in entry["properties"]["sampling"]["oneOf"]]
+        methods = [handler.resolve_ref_schema(m) for m in entry["properties"]["sampling"]["anyOf"]]
         entry.clear()
         entry["oneOf"] = [
             method
@@ -156,10 +174,15 @@ class Entry(Settings):
 
 
 _NOT_ITS_OWN = ("samples", "tolerance", "budget_seconds", "seed", "quantiles", "fields")
-_MOMENTS_ONLY = {"fields": False, "quantiles": ()}
 
 
-class Compare(Settings):
+def _moments_only(method: Method) -> dict[str, Any]:
+    """Return what a method is told that is to estimate moments of outputs and nothing else."""
+    told: dict[str, Any] = {"fields": False, "quantiles": ()}
+    return {name: value for name, value in told.items() if name in type(method).model_fields}
+
+
+class Compare(Method):
     """Error against run time: methods at growing budgets, repeated, against a reference.
 
     Parameters
@@ -183,7 +206,7 @@ class Compare(Settings):
 
     kind: Literal["compare"] = "compare"
     methods: tuple[Entry, ...]
-    reference: Annotated[Given | Sampling, Field(discriminator="kind")] = Chaos(samples=256, max_order=8)
+    reference: Annotated[Method, OfKind(REFERENCES)] = Chaos(samples=256, max_order=8)
     repeats: Annotated[int, Field(ge=2)] = 20
     seed: Annotated[int, Field(ge=0)] = 0
     textbook: Annotated[int, Field(ge=0)] = 8
@@ -211,21 +234,49 @@ class Compare(Settings):
         shared: dict[tuple[object, ...], int] = {}
         apart = 0
         for entry in self.methods:
-            stream, top = _stream(entry.sampling), max(entry.budgets)
+            stream, top = entry.sampling.stream(), max(entry.budgets)
             if stream is None:
                 apart += sum(entry.at(budget).planned(dimension) - 1 for budget in entry.budgets)
             else:
                 shared[stream] = max(shared.get(stream, 0), top)
                 apart += entry.at(top).planned(dimension) - 1 - top
-        reference = 0 if isinstance(self.reference, Given) else self.reference.planned(dimension)
+        reference = self.reference.planned(dimension)
         others = 2 * self.textbook + int(self.mesh_error)
         return 1 + reference + others + self.repeats * (sum(shared.values()) + apart)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why one of the methods cannot take these parameters, or nothing."""
+        """Say why one of the methods cannot take these parameters, or None if all can."""
         methods = [self.reference, *(entry.sampling for entry in self.methods)]
-        objections = (method.objection(inputs) for method in methods if isinstance(method, Restricted))
-        return next((objection for objection in objections if objection), None)
+        return next(filter(None, (method.objection(inputs) for method in methods)), None)
+
+    def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
+        """Return the model that makes the reference, the textbook's and, if it is asked for, one on a finer mesh."""
+        found = {TIGHT: spec.tighter(TIGHTER), TEXTBOOK: spec.textbook()}
+        return found | ({REFINED: spec.refined(1)} if self.mesh_error else {})
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find that there is no mesh to be refined."""
+        if self.mesh_error and not spec.meshed:
+            yield ("method", "mesh_error"), f"a model of kind '{spec.kind}' has no mesh, expected false", True
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what of the methods and of the reference does not fit the parameters and the outputs."""
+        yield from super().mistakes(inputs, spec)
+        for i, entry in enumerate(self.methods):
+            for (block, *place), message, given in entry.at(min(entry.budgets)).mistakes(inputs, spec):
+                if place == ["samples"]:
+                    yield ("method", "methods", i, "budgets"), message, list(entry.budgets)
+                elif block == "method":
+                    yield ("method", "methods", i, *place), message, given
+        for (block, *place), message, given in self.reference.mistakes(inputs, spec):
+            if block == "method":
+                yield ("method", "reference", *place), message, given
+
+    def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
+        """Predict the processor time (s) of all samples, those by the textbook, and the one on a finer mesh."""
+        own, samples = costs[OWN], self.planned(dimension) - 1 - self.textbook
+        refined = costs[REFINED].first - own.sample if self.mesh_error else 0.0
+        return samples * own.sample + refined + self.textbook * own.textbook
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Run all methods at all budgets, repeat by repeat, and compare.
@@ -272,15 +323,9 @@ class Compare(Settings):
 
     def _find_reference(self, inputs: Inputs, evaluate: Evaluate) -> dict[str, FloatArray]:
         """Return the estimates of the reference by output."""
-        if not isinstance(self.reference, Given):
-            found = self.reference.model_copy(update=_MOMENTS_ONLY).run(inputs, evaluate.on(TIGHT))
-            return {name: found[name].to_numpy() for name in ESTIMATES}
-        missing = [name for name in evaluate.outputs if name not in self.reference.values]
-        if missing:
-            message = f"the reference gives no values of {', '.join(missing)}, expected those of every output"
-            raise ValueError(message)
-        values = [self.reference.values[name] for name in evaluate.outputs]
-        return {name: np.array([getattr(known, name) for known in values]) for name in ESTIMATES}
+        method = self.reference.model_copy(update=_moments_only(self.reference))
+        found = method.run(inputs, evaluate.on(TIGHT) if method.planned(len(inputs.names)) else evaluate)
+        return {name: found[name].to_numpy() for name in ESTIMATES}
 
     def _floors(
         self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation
@@ -312,21 +357,6 @@ class Compare(Settings):
 def _seed(seed: int, repeat: int) -> int:
     """Seed of a repeat: the same for all methods, which may so share their points."""
     return int(np.random.SeedSequence([seed, repeat]).generate_state(1)[0])
-
-
-def _stream(method: Sampling) -> tuple[object, ...] | None:
-    """Name the points that a method takes the first of, for all methods that take them; nothing where it is unknown."""
-    match method:
-        case QuasiMonteCarlo():
-            return "sobol", method.scrambles
-        case MonteCarlo():
-            return ("random",)
-        case Chaos():
-            return "design", method.gradients
-        case MultilevelChaos():
-            return None  # every level draws afresh
-        case _:
-            assert_never(method)
 
 
 # --- one run of a method ---------------------------------------------------------------------------------------------
@@ -361,7 +391,7 @@ class _Trial:
     doubts: tuple[Finding, ...] = ()
 
 
-def _try(method: Sampling, inputs: Inputs, memory: _Memory) -> _Trial:
+def _try(method: Amount, inputs: Inputs, memory: _Memory) -> _Trial:
     recorder = Recorder(memory)
     begin, before = time.process_time(), memory.clock.seconds
     try:
@@ -411,7 +441,7 @@ class _Memory:
 
     def __init__(self, evaluate: Evaluate, clock: _Clock | None = None) -> None:
         self._evaluate = evaluate
-        self._others: dict[int, _Memory] = {}
+        self._others: dict[str, _Memory] = {}
         self._known: dict[tuple[bytes, bytes], Evaluations] = {}
         self.clock = clock or _Clock()
 
@@ -440,7 +470,7 @@ class _Memory:
         """Share (n_nodes,) of the body that each node stands for, see `Evaluate`."""
         return self._evaluate.node_volumes
 
-    def on(self, model: int) -> _Memory:
+    def on(self, model: str) -> _Memory:
         """Return the evaluation of another of the models, with a memory of its own."""
         if model not in self._others:
             self._others[model] = _Memory(self._evaluate.on(model), self.clock)
@@ -586,7 +616,7 @@ def _compared(
     own = np.median(each(lambda t: t.own_seconds), axis=1)
     seconds = np.median(each(lambda t: t.seconds + t.own_seconds), axis=1)
     halves = each(lambda t: t.half_width)
-    plain = [i for i, (entry, _) in enumerate(rows) if type(entry.sampling) is MonteCarlo]
+    plain = [i for i, (entry, _) in enumerate(rows) if entry.sampling.kind == "monte-carlo"]
     # What plain Monte Carlo costs by the textbook follows from its solves.
     textbook = float(floors["textbook_seconds"][1])
     derived = plain if np.isfinite(textbook) else []

@@ -108,8 +108,11 @@ class DerivativeBased(Amount):
         """Number of solves, the largest where a tolerance may end the study earlier."""
         return 1 + (self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles))
 
-    @staticmethod
-    def objection(inputs: Inputs) -> str | None:
+    def with_tangents(self, samples: int) -> int:
+        """All of them."""
+        return samples
+
+    def objection(self, inputs: Inputs) -> str | None:
         """Say why the bounds do not hold for these parameters, or nothing."""
         if not inputs.independent:
             return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,10 @@ class MonteCarlo(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
         return 1 + self.limit
+
+    def stream(self) -> tuple[Any, ...] | None:
+        """Random points."""
+        return ("random",)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.

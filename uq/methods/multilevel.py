@@ -13,7 +13,7 @@ of which the controls, in brackets, have the expectation zero. `moments.combine`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -23,15 +23,19 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.moments import ESTIMATES, Estimates, Moments, Term, combine, estimate, monomials, ratio, term
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
+from uq.methods.method import MESH
 from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
 from uq.methods.stopping import TEXTBOOK, Amount, seconds_per_solve
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec, Times
 
 FIRST_MESHES = 3  # two differences, the fewest that show a rate
 ASSUMED_RATE = 1.0  # of convergence per mesh, where there is one difference only
@@ -86,6 +90,28 @@ class MultilevelMonteCarlo(Amount):
     def planned(self, dimension: int) -> int:
         """Number of solves of the linearisations and pilots on all meshes: how many more, these decide."""
         return self.levels + self.pilot * (2 * self.levels - 1)
+
+    @property
+    def undecided(self) -> str:
+        """What the planned solves are for."""
+        return "linearisations and pilots"
+
+    def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
+        """Return the body on the finer meshes."""
+        return {_name(level): spec.refined(level) for level in range(1, self.levels)}
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find that there are no meshes, or that they have parameters of their own."""
+        if not spec.meshed:
+            yield ("method", "kind"), f"a model of kind '{spec.kind}' has no meshes, expected another method", self.kind
+        elif spec.coefficients:
+            message = "random fields have other coefficients on every mesh, expected a method with one mesh"
+            yield ("model", "fields"), message, self.kind
+
+    def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
+        """Predict the processor time (s) of the pilots."""
+        each = [costs[_name(level)].sample for level in range(self.levels)]
+        return self.pilot * (2 * sum(each) - each[-1])
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -158,7 +184,7 @@ class MultilevelMonteCarlo(Amount):
     ) -> xr.Dataset:
         by_output, by_level, both = ("output",), ("level",), ("level", "output")
         finest = len(meshes) - 1
-        dataset = local_dataset(inputs, evaluate.on(finest), meshes[-1].centre, fields=False)
+        dataset = local_dataset(inputs, evaluate.on(_name(finest)), meshes[-1].centre, fields=False)
         single, telescoped = [mesh.single for mesh in meshes], found.by_mesh
         differences = [mesh.term for mesh in meshes]
         plain, kurtosis = np.array([mesh.plain_variance for mesh in meshes]), np.array([m.kurtosis for m in meshes])
@@ -211,6 +237,11 @@ class MultilevelMonteCarlo(Amount):
         return dataset
 
 
+def _name(level: int) -> str:
+    """Name of the model on a mesh."""
+    return f"{MESH}{level}" if level else OWN
+
+
 def _notes(
     outputs: Sequence[str], consistency: FloatArray, kurtosis: FloatArray, shares: FloatArray, count: int
 ) -> list[str]:
@@ -256,7 +287,7 @@ class _Mesh:
     def __init__(self, method: MultilevelMonteCarlo, inputs: Inputs, evaluate: Evaluate, coarser: _Mesh | None) -> None:
         self._method, self._inputs, self._coarser = method, inputs, coarser
         self.level: int = 0 if coarser is None else coarser.level + 1
-        self._evaluate = evaluate.on(self.level)
+        self._evaluate = evaluate.on(_name(self.level))
         self.centre: Linearisation = linearise(inputs, self._evaluate)
         self.unknowns = self._evaluate.displacements or SIZE * 8**self.level
         self._solves, self._seconds = 0, 0.0

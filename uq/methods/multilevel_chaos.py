@@ -14,7 +14,7 @@ to the solver's tolerance, and what is reported rests on equilibria.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -37,6 +37,8 @@ from uq.surrogates.regression import Data, Fit, Regression, fit_best, whole
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec
     from uq.surrogates.basis import Basis
 
 SAMPLES_PER_TERM = 3  # of a level, if nothing else is said; rounded up to a power of two
@@ -99,6 +101,19 @@ class MultilevelChaos(Amount):
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters cannot be expanded in, or nothing."""
         return objection(inputs, self.kind)
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find that there is no solver that could be stopped."""
+        if not spec.iterative:
+            message = f"a model of kind '{spec.kind}' has no iterations of a solver, expected another method"
+            yield ("method", "kind"), message, self.kind
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find too few samples, too."""
+        yield from super().mistakes(inputs, spec)
+        shortage = self.shortage(len(inputs.names))
+        if shortage is not None:
+            yield ("method", "samples"), shortage, self.samples
 
     def shortage(self, dimension: int) -> str | None:
         """Say that there are too few samples for the terms of the expansion, or nothing."""

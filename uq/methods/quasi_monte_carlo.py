@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import comb
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,14 @@ class QuasiMonteCarlo(MonteCarlo):
     def planned(self, dimension: int) -> int:
         """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
         return 1 + self.limit + self._fitted(dimension)
+
+    def with_tangents(self, samples: int) -> int:
+        """Number of samples that the control variate is fitted to."""
+        return max(0, samples - self.limit)
+
+    def stream(self) -> tuple[Any, ...] | None:
+        """Scrambled Sobol' points."""
+        return "sobol", self.scrambles
 
     def _fitted(self, dimension: int) -> int:
         """Number of solves that the control takes besides the one at the mean parameters."""

@@ -12,7 +12,7 @@ parts complement each other, which this does not see: it claims the error of R i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -52,6 +52,9 @@ from uq.surrogates.regression import NOTHING, Regression
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec
 
 SAME = 1e-6  # relative difference of outputs of one model at its mean parameters, at most
 DIMENSIONS = {
@@ -144,12 +147,18 @@ class Sobol(Amount):
         """What is averaged over the rows of exchanged points."""
         return RowProducts(dimension + len(self.groups), dimension if self.second_order else 0)
 
-    @staticmethod
-    def objection(inputs: Inputs) -> str | None:
+    def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters have no Sobol' indices, or nothing."""
         if not inputs.independent:
             return "Sobol' indices need independent parameters, expected no correlations for method.kind = 'sobol'"
         return None
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find groups of strange parameters, too."""
+        yield from super().mistakes(inputs, spec)
+        stranger = self.unknown(inputs)
+        if stranger is not None:
+            yield ("method", "groups"), stranger, self.model_dump()["groups"]
 
     def unknown(self, inputs: Inputs) -> str | None:
         """Say which member of a group is no parameter, or nothing."""

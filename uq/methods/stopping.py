@@ -7,12 +7,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.settings import Settings
+from uq.methods.method import Method
 
 TEXTBOOK = 15  # times as long as a predicted solve takes one from zero, at 10⁴ unknowns
 
 
-class Amount(Settings):
+class Amount(Method):
     """The amount of sampling that is asked for, at least one of the three.
 
     Parameters

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
-from forward.settings import Settings
+from forward.model import FloatArray, ForwardModel, Solution, SolveError
 from uq.evaluation.evaluate import Evaluate, Prediction, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
@@ -119,33 +118,6 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
     return Linearisation(centre, found.outputs[0], tangents, fields[0], fields[1:], inputs.coordinates, inputs.std)
-
-
-class LocalSensitivity(Settings):
-    """Derivatives of all outputs and of the displacement field at the mean parameters: one solve and its tangents.
-
-    Results: `derivative` dψ/dω, `derivative_per_std` (times the standard deviation of the parameter),
-    `derivative_per_range` (times upper − lower, for bounded distributions), and `field_derivative` du/dω at every node.
-    """
-
-    kind: Literal["local-sensitivity"] = "local-sensitivity"
-
-    def planned(self, dimension: int) -> int:
-        """Number of solves, whatever the number of parameters."""
-        return 1
-
-    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Linearise at the mean parameters.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer there.
-        """
-        if not evaluate.differentiable:
-            message = "the model has no derivatives, expected one that has for method.kind = 'local-sensitivity'"
-            raise ModelError(message)
-        return local_dataset(inputs, evaluate, linearise(inputs, evaluate), fields=True)
 
 
 def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> xr.Dataset:

@@ -9,24 +9,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from forward.external.models import PythonModel, UmBridgeModel
-from forward.fem.locking import Decision
-from forward.hyperelastic import Hyperelastic, too_far
 from forward.model import Finding, ModelError
+from forward.registry import OfKind
 from forward.scalars import Mistake, Scalar
 from forward.settings import UNKNOWN_KIND, Settings, cut, nearest, one_line, shown
+from forward.spec import MODELS, ModelSpec
 from uq.evaluation.evaluate import BLOCKS
 from uq.inputs.distributions import Distribution, Normal
-from uq.inputs.random_parameters import Inputs, Restricted
-from uq.methods.compare import TIGHTER, Compare, Given, Sampling
-from uq.methods.derivative_based import DerivativeBased
-from uq.methods.multilevel import MultilevelMonteCarlo
-from uq.methods.multilevel_chaos import MultilevelChaos
-from uq.methods.sobol import Sobol
-from uq.surrogates.linearisation import LocalSensitivity
+from uq.inputs.random_parameters import Inputs
+from uq.methods.method import MESH, METHODS, Method
 from workflows.config.priors import findings_of_draws, mistakes_of_materials
 from workflows.config.report import Report, located
 
@@ -37,14 +31,6 @@ if TYPE_CHECKING:
 
     AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
 
-Model = Annotated[
-    Hyperelastic | PythonModel | UmBridgeModel,
-    Field(discriminator="kind"),
-    BeforeValidator(lambda given: {"kind": "hyperelastic"} | given if isinstance(given, dict) else given),
-]
-Method = Annotated[
-    Sampling | MultilevelMonteCarlo | LocalSensitivity | Sobol | DerivativeBased | Compare, Field(discriminator="kind")
-]
 WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 
@@ -108,70 +94,48 @@ class Study(Settings):
         Sections of one's own in the report.
     """
 
-    model: Model
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
-    method: Method
+    method: Annotated[Method, OfKind(METHODS)]
     parallel: Parallel = Parallel()
     report: Report | None = None
 
     @property
     def inputs(self) -> Inputs:
         """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
-        standard = Normal(mean=0.0, std=1.0)
-        marginals = self.parameters | dict.fromkeys(self.model.coefficients, standard)
-        return Inputs(marginals, tuple((*c.between, c.value) for c in self.correlations))
+        return Inputs(self._marginals, tuple((*c.between, c.value) for c in self.correlations))
 
     @property
-    def _restricted(self) -> Inputs:
-        """The random parameters, of which some may be of no material."""
-        return self.inputs if self.body is None else self.inputs.within(self.body.materials(self.inputs.names))
+    def _marginals(self) -> dict[str, Distribution]:
+        return self.parameters | dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
 
     @cached_property
-    def body(self) -> Hyperelastic | None:
-        """The model, if it is a body, in the formulation that suits all values of its parameters."""
-        return self.model.over(ranges(self.parameters)) if isinstance(self.model, Hyperelastic) else None
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        return self.model.over(ranges(self.parameters))
 
     @property
-    def decision(self) -> Decision:
-        """Which unknowns the body has, and why."""
-        assert isinstance(self.model, Hyperelastic)
-        return self.model.decision(ranges(self.parameters))
+    def models(self) -> dict[str, ModelSpec]:
+        """The models that the method may ask for beside that one, by name."""
+        return self.method.models(self.spec)
 
     @property
-    def meshes(self) -> tuple[Hyperelastic, ...]:
-        """The body, and the same on the finer meshes that a multilevel method may use."""
-        if self.body is None:
-            return ()
-        levels = self.method.levels if isinstance(self.method, MultilevelMonteCarlo) else 1
-        return self.body, *(self.body.refined(level) for level in range(1, levels))
-
-    @property
-    def models(self) -> tuple[Hyperelastic | PythonModel | UmBridgeModel, ...]:
-        """The models that the method may ask for, in the order of their numbers."""
-        if isinstance(self.model, PythonModel | UmBridgeModel) or self.body is None:
-            return (self.model,) * 3 if isinstance(self.method, Compare) else (self.model,)
-        if not isinstance(self.method, Compare):
-            return self.meshes
-        solver = self.body.solver
-        tolerances = {name: TIGHTER * getattr(solver, name) for name in ("tolerance", "derivative_tolerance")}
-        tight, textbook = (solver.model_copy(update=change) for change in (tolerances, {"kind": "newton"}))
-        others = [self.body.model_copy(update={"solver": changed}) for changed in (tight, textbook)]
-        return self.body, *others, *([self.body.refined(1)] if self.method.mesh_error else [])
+    def meshes(self) -> tuple[ModelSpec, ...]:
+        """The model, and the same on the finer meshes that a multilevel method may use."""
+        return self.spec, *(model for name, model in self.models.items() if name.startswith(MESH))
 
     @property
     def planned(self) -> int:
         """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
-        return self.method.planned(len(self.parameters) + len(self.model.coefficients))
+        return self.method.planned(len(self._marginals))
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the study before anything is solved."""
-        if not isinstance(self.model, Hyperelastic):
-            return ()
-        locking = self.model.locking(ranges(self.parameters))
-        far = too_far(self.model.body, ranges(self.parameters))
-        return (*dict.fromkeys((*self.model.findings, *far)), *locking, *findings_of_draws(self._restricted))
+        materials = self.spec.materials(self.inputs.names)
+        of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
+        return (*self.model.findings_over(ranges(self.parameters)), *of_draws)
 
     @model_validator(mode="after")
     def _check(self) -> Study:
@@ -179,6 +143,29 @@ class Study(Settings):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
+        unfit = list(self.method.unfit(self.spec))
+        yield from unfit
+        if not unfit:
+            yield from self._mistakes_of_models()
+        yield from self._mistakes_of_parameters()
+        not_sampled = list(self.spec.mistakes_of_samples())
+        yield from not_sampled
+        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
+            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        inputs = Inputs(self._marginals)
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            materials = self.spec.materials(inputs.names)
+            if materials is not None:
+                yield from mistakes_of_materials(inputs.within(materials), materials)
+        if not not_sampled:
+            yield from self.method.mistakes(inputs, self.spec)
+
+    def _mistakes_of_models(self) -> Iterator[Mistake]:
         try:
             _ = self.models
         except ValidationError as error:
@@ -186,69 +173,15 @@ class Study(Settings):
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
         except ModelError as error:
             yield ("method", "kind"), str(error), self.method.kind
-        yield from self._mistakes_of_parameters()
-        yield from self._mistakes_without_body()
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            if self.body is not None:
-                yield from mistakes_of_materials(self._restricted, self.body.materials(inputs.names))
-            objection = self.method.objection(inputs) if isinstance(self.method, Restricted) else None
-            if objection is not None:
-                yield ("correlations",), objection, [c.model_dump() for c in self.correlations]
-            stranger = self.method.unknown(inputs) if isinstance(self.method, Sobol) else None
-            if stranger is not None:
-                yield ("method", "groups"), stranger, self.method.model_dump()["groups"]
-        if isinstance(self.method, MultilevelChaos):
-            shortage = self.method.shortage(len(self.parameters) + len(self.model.coefficients))
-            if shortage is not None:
-                yield ("method", "samples"), shortage, self.method.samples
-        if isinstance(self.method, Compare):
-            yield from self._compare_mistakes(self.method)
 
     def _mistakes_of_parameters(self) -> Iterator[Mistake]:
-        scalars = self.model.scalars
-        fields = self.body.fields if self.body is not None else ()
-        if not self.parameters and not fields:
-            or_field = ", or one of model.fields" if self.body is not None else ""
+        spec = self.spec
+        if not self._marginals:
+            or_field = ", or one of model.fields" if spec.meshed else ""
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
-        if fields and isinstance(self.method, MultilevelMonteCarlo):
-            message = "random fields have other coefficients on every mesh, expected a method with one mesh"
-            yield ("model", "fields"), message, self.method.kind
-        for i, field in enumerate(fields):
-            if field.basis == "nodes":
-                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
-                yield ("model", "fields", i, "basis"), message, field.basis
-        constants = () if self.body is None else self.body.materials(self.parameters).names
-        yield from mistakes_of_parameters(scalars, self.parameters, constants)
-
-    def _mistakes_without_body(self) -> Iterator[Mistake]:
-        """What only a body has: meshes, a solver, ranks that share it."""
-        if self.body is not None:
-            return
-        kind = self.model.kind
-        if isinstance(self.method, MultilevelMonteCarlo | MultilevelChaos):
-            what = "meshes" if isinstance(self.method, MultilevelMonteCarlo) else "iterations of a solver"
-            message = f"a model of kind '{kind}' has no {what}, expected another method"
-            yield ("method", "kind"), message, self.method.kind
-        if isinstance(self.method, Compare) and self.method.mesh_error:
-            yield ("method", "mesh_error"), f"a model of kind '{kind}' has no mesh, expected false", True
-        if self.parallel.ranks_per_model > 1:
-            message = f"a model of kind '{kind}' is not shared by ranks, expected 1"
-            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
-
-    def _compare_mistakes(self, method: Compare) -> Iterator[Mistake]:
-        for i, entry in enumerate(method.methods):
-            shortage = entry.shortage(len(self.parameters) + len(self.model.coefficients))
-            if shortage is not None:
-                yield ("method", "methods", i, "budgets"), shortage, list(entry.budgets)
-        if isinstance(method.reference, Given):
-            given, outputs = method.reference.values, [output.name for output in self.model.outputs]
-            if set(given) != set(outputs):
-                message = f"expected values of every output: {', '.join(outputs)}"
-                yield ("method", "reference", "values"), message, list(given)
+        materials = spec.materials(self.parameters)
+        constants = () if materials is None else materials.names
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants)
 
 
 def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
@@ -571,9 +504,9 @@ def _kinds() -> set[str]:
     from forward.materials.energies import MATERIALS
     from forward.observables import outputs
 
-    unions = (Model, geometry.Body, inclusions.Inclusion, outputs.Output, Distribution, Method)
+    unions = (geometry.Body, inclusions.Inclusion, outputs.Output, Distribution)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return set(MATERIALS) | {member.model_fields["kind"].default for member in (*members, Given)}
+    return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
 
 
 _TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

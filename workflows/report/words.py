@@ -67,10 +67,11 @@ def named(name: str, unit: str) -> str:
 
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     """Say what was solved: headings, each with its lines."""
-    if study.body is None:
+    model = study.spec
+    if not isinstance(model, Hyperelastic):
         yield from _external_in_words(study)
         return
-    model, body = study.body, study.body.body
+    body = model.body
     cells = body.cells_in_words
     coarsest = " on the coarsest mesh" if len(study.meshes) > 1 else ""
     yield "body", [f"{body.description}; {cells} cells ({body.cell}, degree {body.degree}){coarsest}"]
@@ -103,9 +104,8 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
 
 def _external_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     model = study.model
-    assert not isinstance(model, Hyperelastic)
     yield "model", [model.description]
-    yield "parameters", [f"{name} = {_scalar(study, name)}" for name in model.parameters]
+    yield "parameters", [f"{name} = {_scalar(study, name)}" for name in model.scalars]
     yield "outputs", [f"{output.name}{'' if output.unit == '1' else f' ({output.unit})'}" for output in model.outputs]
 
 

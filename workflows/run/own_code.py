@@ -1,4 +1,4 @@
-"""What is written down of a Python model's modules beside its results, so that results of two versions never mix."""
+"""What is written down of a user's modules beside its results, so that results of two versions never mix."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forward.external.models import PythonModel
-from forward.external.own_modules import Loaded, Sources, other_code
-from workflows.config.study import Study, StudyError
+from forward.external.own_modules import Loaded, Sources, other_code, sources
+from forward.registry import dotted
+from workflows.config.study import Study, StudyError, document
 from workflows.results.directory import write_text
 
 if TYPE_CHECKING:
@@ -17,43 +17,44 @@ if TYPE_CHECKING:
 FILE = "sources.json"
 
 
-def python(study: AnyStudy) -> PythonModel | None:
-    """Return the model of a study if it is a Python function."""
-    return study.model if isinstance(study, Study) and isinstance(study.model, PythonModel) else None
+def modules(study: AnyStudy) -> tuple[str, ...]:
+    """Return the modules of a user that a study names: those of its model, and of kinds that are dotted paths."""
+    model = study.model.modules if isinstance(study, Study) else ()
+    return tuple(dict.fromkeys([*model, *dotted(document(study))]))
 
 
 def digest(study: AnyStudy) -> str | None:
-    """Return a hash of the modules of a Python model."""
-    model = python(study)
-    return None if model is None else model.sources.digest
+    """Return a hash of these modules and of what they import, if there are any."""
+    found = modules(study)
+    return sources(found).digest if found else None
 
 
 def refuse_other(directory: Path, study: AnyStudy) -> None:
-    """Compare the modules of a Python model with those that the results in a directory follow from.
+    """Compare the modules of a user with those that the results in a directory follow from.
 
     Raises
     ------
     StudyError
         If one has changed; the message names it.
     """
-    model, before = python(study), _kept(directory)
-    if model is None or before is None:
+    found, before = modules(study), _kept(directory)
+    if not found or before is None:
         return
     if not (directory / "summary.json").exists() and not any(directory.glob("evaluations/*.h5")):
         (directory / FILE).unlink()  # nothing was computed yet
         return
-    change = before.change(model.sources)
+    change = before.change(sources(found))
     if change is not None:
         message = f"{directory}: {other_code(change)}"
         raise StudyError(message)
 
 
 def keep(directory: Path, study: AnyStudy, loaded: Loaded | None) -> None:
-    """Write down the modules of a Python model, with those that were loaded in the course of a run."""
-    model = python(study)
-    if model is not None and loaded is not None:
-        found = (_kept(directory) or model.sources).with_files(loaded())
-        write_text(directory / FILE, json.dumps(found.document(), indent=2, ensure_ascii=False) + "\n")
+    """Write down the modules of a user, with those that were loaded in the course of a run."""
+    found = modules(study)
+    if found and loaded is not None:
+        known = (_kept(directory) or sources(found)).with_files(loaded())
+        write_text(directory / FILE, json.dumps(known.document(), indent=2, ensure_ascii=False) + "\n")
 
 
 def _kept(directory: Path) -> Sources | None:

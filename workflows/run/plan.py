@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple
 
 from forward.bodies.mesh_file import OwnMesh
-from forward.fem.cost import (
-    ADDRESSES_OF_PROGRAM,
-    BYTES_OF_PROGRAM,
-    BYTES_PER_UNKNOWN,
-    COMPILATION,
-    REPORT,
-    START,
-    Times,
-    factor,
-    times,
-)
+from forward.fem.cost import ADDRESSES_OF_PROGRAM, BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Times
 from forward.fem.finer import finer
-from forward.hyperelastic import Hyperelastic
 from forward.machine import MIB, Headroom, compiled_forms, limits
 from forward.model import Finding
-from uq.methods.chaos import Chaos
-from uq.methods.compare import Compare
-from uq.methods.derivative_based import DerivativeBased
-from uq.methods.multilevel import MultilevelMonteCarlo
-from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from forward.spec import ModelSpec
+from uq.evaluation.evaluate import OWN
 from workflows.config.study import Study, ranges
 
 if TYPE_CHECKING:
-    from forward.bodies.geometry import Body
     from forward.fem.locking import Decision
     from forward.specimen import Specimen
     from workflows.config.study import AnyStudy
@@ -44,21 +30,17 @@ def memory(study: AnyStudy) -> float:
     A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen has one.
     """
     if isinstance(study, Study):
-        return sum(_of_body(one, 2) for one in study.models if isinstance(one, Hyperelastic))
+        return _of_models([study.spec, *study.models.values()])
     from workflows.studies.inversion import Inversion
     from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion | Synthesis):
-        return _of_specimen(study.model)
-    return sum(_of_specimen(one) for one in getattr(study, "specimens", {}).values())
+        return _of_models([study.model])
+    return _of_models([*getattr(study, "specimens", {}).values()])
 
 
-def _of_specimen(spec: Specimen) -> float:
-    return sum(_of_body(spec.loaded(case), 1) for case in spec.cases)
-
-
-def _of_body(spec: Hyperelastic, factors: int) -> float:
-    return BYTES_PER_UNKNOWN * spec.unknowns + factors * factor(spec.body, mixed=spec.mixed).bytes
+def _of_models(specs: Sequence[ModelSpec]) -> float:
+    return sum(cost.bytes for cost in (spec.cost() for spec in specs) if cost is not None)
 
 
 def shortage(study: AnyStudy, groups: int = 1) -> Finding | None:
@@ -93,35 +75,36 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
 def _planned(study: AnyStudy, groups: int) -> list[str]:
     if not isinstance(study, Study):
         return _of_other_kinds(study)
-    if study.body is None:
-        return _external(study)
-    method, model, body = study.method, study.body, study.body.body
-    sizes = [model.unknowns for model in study.meshes]
-    each = [_each(study, one) for one in study.meshes]
-    form = "mixed form: displacements and pressures" if model.mixed else "displacement form"
-    up_to, later = "up to " if getattr(method, "open_ended", False) else "", ""
-    if isinstance(method, MultilevelMonteCarlo):
-        up_to, later = "", " for linearisations and pilots, which decide how many more"
-    names = [*study.parameters]
-    for field in model.fields:
-        paths = field.paths(body)
-        names.append(f"{paths[0]} to {len(paths) - 1}")
-    return [
+    method, spec, planned = study.method, study.spec, study.planned
+    up_to = "up to " if method.open_ended and not method.undecided else ""
+    later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
+    lines = [
         f"method      {method.kind}",
-        *_found(body),
-        f"unknowns    {sizes[0]:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
-        _formulation(study.decision),
-        *(
-            f"            {size:,} on mesh {k} ({s:.2g} s a solve)"
-            for k, (size, s) in enumerate(zip(sizes, each, strict=True))
-            if k
-        ),
-        f"parameters  {', '.join(names)}",
-        f"outputs     {', '.join(output.name for output in model.outputs)}",
-        f"solves      {up_to}{study.planned:,}{later}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+    ]
+    for k, mesh in enumerate(study.meshes[1:], 1):
+        cost = mesh.cost()
+        taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
+        lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
+    lines += [
+        f"parameters  {', '.join([*study.parameters, *_in_series(spec.coefficients)])}",
+        f"outputs     {', '.join(output.name for output in spec.outputs)}",
+        f"solves      {up_to}{planned:,}{later}",
+    ]
+    if spec.cost() is None:  # no one knows how long a solve takes
+        return lines
+    return [
+        *lines,
         f"memory      about {(memory(study) + BYTES_OF_PROGRAM) / MIB:,.0f} MiB for each group of ranks",
         *_told(parts(study), groups, up_to, later and ", then more"),
     ]
+
+
+def _in_series(paths: Sequence[str]) -> Iterator[str]:
+    """Name the coefficients of each random field by the first and the last."""
+    for _, series in groupby(paths, lambda path: path.rpartition(".")[0]):
+        first, *rest = series
+        yield f"{first} to {len(rest)}"
 
 
 class Part(NamedTuple):
@@ -132,14 +115,10 @@ class Part(NamedTuple):
     shared: bool = False
 
 
-def _times(spec: Hyperelastic) -> Times:
-    return times(spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-
-
-def _each(study: Study, spec: Hyperelastic) -> float:
-    """Seconds of a sample without derivatives."""
-    found = _times(spec)
-    return found.textbook if spec.solver.kind == "newton" else found.corrected
+def _times(spec: ModelSpec) -> Times:
+    found = spec.cost()
+    assert found is not None
+    return found
 
 
 def parts(study: Study) -> list[Part]:
@@ -148,42 +127,21 @@ def parts(study: Study) -> list[Part]:
     Samples are the most that there may be; those that multilevel methods add after their pilots are not known.
     """
     method, dimension = study.method, len(study.inputs.names)
-    found = [_times(one) for one in study.meshes]
-    each = [_each(study, one) for one in study.meshes]
-    samples, textbook = study.planned - len(found), 0
-    seconds = samples * each[0]
-    if isinstance(method, MultilevelMonteCarlo):
-        seconds = method.pilot * (2 * sum(each) - each[-1])
-    elif isinstance(method, Compare):
-        textbook = method.textbook
-        seconds -= textbook * each[0]
-        if method.mesh_error:
-            other = study.models[-1]
-            assert isinstance(other, Hyperelastic)
-            seconds += _times(other).first - each[0]
-    seconds += textbook * found[0].textbook
-    seconds += _with_tangents(study, samples) * found[0].tangents_of_sample(dimension)
-    seconds = min(seconds, getattr(method, "budget_seconds", None) or float("inf"))
-    corrected = samples > 0 and study.meshes[0].solver.kind != "newton"
+    costs = {OWN: _times(study.spec)} | {name: _times(model) for name, model in study.models.items()}
+    found = [_times(mesh) for mesh in study.meshes]
+    samples = study.planned - len(found)
+    seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and found[0].predicted
+    further = f"{samples:,} further solves, {found[0].sample:.2g} s each"
     return [
         Part(START, "start of the program"),
         *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
         Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
         Part(sum(one.tangents(dimension) for one in found), "its tangents"),
         *([Part(sum(one.reference(dimension) for one in found), "reference factor")] if corrected else []),
-        *([Part(seconds, f"{samples:,} further solves, {each[0]:.2g} s each", shared=True)] if samples > 0 else []),
+        *([Part(seconds, further, shared=True)] if samples > 0 else []),
         Part(REPORT, "results and report"),
     ]
-
-
-def _with_tangents(study: Study, samples: int) -> int:
-    """Number of samples whose derivatives are asked for, too."""
-    method = study.method
-    if isinstance(method, Chaos):
-        return samples if method.gradients and method.fit == "regression" else 0
-    if isinstance(method, QuasiMonteCarlo):
-        return max(0, samples - method.limit)  # those that its control variate is fitted to
-    return samples if isinstance(method, DerivativeBased) else 0
 
 
 def _compiled_before() -> bool:
@@ -207,25 +165,6 @@ def _told(found: Sequence[Part], groups: int, up_to: str, more: str) -> list[str
 def _formulation(decision: Decision) -> str:
     """Say which formulation is taken, and why."""
     return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
-
-
-def _found(body: Body) -> list[str]:
-    """Say what was found in the file of a mesh, a line each."""
-    return [f"{what:10}  {found}" for what, found in body.listed.items()] if isinstance(body, OwnMesh) else []
-
-
-def _external(study: Study) -> list[str]:
-    """Find the model, and describe a study of it: no one knows how long a solve takes."""
-    assert not isinstance(study.model, Hyperelastic)
-    model = study.model.build(None, study.inputs.names)
-    up_to = "up to " if getattr(study.method, "open_ended", False) else ""
-    return [
-        f"method      {study.method.kind}",
-        f"model       {study.model.description}; {'with' if model.differentiable else 'without'} derivatives",
-        f"parameters  {', '.join(study.parameters)}",
-        f"outputs     {', '.join(output.name for output in study.model.outputs)}",
-        f"solves      {up_to}{study.planned:,}",
-    ]
 
 
 def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
@@ -264,7 +203,7 @@ def _inversion(study: Inversion) -> list[str]:
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
-        *_found(spec.body),
+        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
         _formulation(study.model.decision(ranges(study.parameters))),
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
@@ -301,7 +240,7 @@ def _synthesis(study: Synthesis) -> list[str]:
     seconds = sets * sum(_times(spec.loaded(case)).textbook for case in spec.cases)
     return [
         f"method      {study.method.kind}",
-        *_found(spec.body),
+        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
         _formulation(study.model.decision(ranges(study.parameters))),
         f"data sets   {sets}",

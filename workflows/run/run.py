@@ -14,13 +14,13 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import Stability
 from uq.estimators import branch
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder
 from uq.findings import add, findings
 from uq.inputs.sampling import random_points
 from workflows.config.study import WITHOUT_EFFECT, Study, StudyError, differences, document, dump
@@ -113,7 +113,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
 
     world = MPI.COMM_WORLD
     begin = time.monotonic()
-    loaded = Loaded() if own_code.python(study) is not None else None
+    loaded = Loaded() if own_code.modules(study) else None
     finished = _agreed(world, lambda: _prepare(study, directory, world.size))
     if finished is not None:
         if world.rank == 0:
@@ -262,15 +262,14 @@ def _sampling(study: Study, ensemble: Ensemble) -> Job:
         recorders["/"] = Recorder(evaluate)
         return study.method.run(inputs, recorders["/"])
 
-    others: list[Callable[[], ForwardModel]] = [
-        partial(other.build, ensemble.group, inputs.names) for other in study.models[1:]
-    ]
-    if study.body is None:
-        function = study.model.build(ensemble.group, inputs.names)
+    others: dict[str, Callable[[], ForwardModel]] = {
+        name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
+    }
+    function = study.spec.build(ensemble.group, inputs.names)
+    if not study.spec.meshed:
         return MethodJob(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
 
-    spec = study.body
-    model = spec.build(ensemble.group, inputs.names)
+    model = cast("HyperelasticModel", function)
     # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
     cells, kind = model.space.cells()
     regions = model.space.regions()
@@ -280,7 +279,7 @@ def _sampling(study: Study, ensemble: Ensemble) -> Job:
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = label(found, units, model.space.coordinates, cells, kind)
         add(found, *locking)
-        found = with_regions(found, spec.body.regions, regions)
+        found = with_regions(found, model.spec.body.regions, regions)
         return with_random_fields(found, factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
@@ -293,8 +292,8 @@ def _identity(study: AnyStudy) -> dict[str, Any]:
     source = own_code.digest(study)
     if source is not None:
         blocks["source"] = source
-    if isinstance(study, Study) and study.body is not None:
-        blocks["model"]["body"].pop("file", None)  # its hash counts, not its place
+    if isinstance(study, Study):
+        blocks["model"] = study.model.identity()
     return blocks
 
 
@@ -498,11 +497,13 @@ def _meshes(study: Study, job: Job) -> list[dict[str, Any]]:
     assert isinstance(job, MethodJob)
     recorder = job.recorders["/"]
     found = []
-    for number in sorted(set(recorder.models)):
-        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == number]
+    for name, mesh in zip([OWN, *study.models], study.meshes, strict=True):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == name]
+        if not parts:  # it was not needed
+            continue
         seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
         solves = sum(len(part.points) for part in parts)
-        found.append({"unknowns": study.meshes[number].unknowns, "solves": solves, "cpu_seconds": seconds})
+        found.append({"unknowns": mesh.unknowns, "solves": solves, "cpu_seconds": seconds})
     return found
 
 

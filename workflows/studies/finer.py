@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from forward.specimen import SpecimenModel
     from uq.evaluation.evaluate import Evaluate
 
+FINER = "finer mesh"  # in names of models
+
 
 def finer_mesh(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
     """Return a specimen on a finer mesh, or why there is none."""

@@ -17,7 +17,7 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.evaluation.tasks import Outcome
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
-from workflows.studies.finer import finer_mesh, on_finer_mesh, solved_by
+from workflows.studies.finer import FINER, finer_mesh, on_finer_mesh, solved_by
 from workflows.studies.inversion_results import BATCH, Rows, batch_table, dataset, groups
 from workflows.studies.job import MethodJob, TasksJob
 
@@ -134,13 +134,13 @@ def _one(study: Inversion, ensemble: Ensemble) -> MethodJob:
     data = study.measurements[0].observations.components()
     observed = specimen.model.observing(data.places, data.axes, data.cases)
     recorders: dict[str, Recorder] = {}
-    others: list[Callable[[], ForwardModel]] = []
+    others: dict[str, Callable[[], ForwardModel]] = {}
     if specimen.mesh is not None:
-        others = [partial(on_finer_mesh, observed, partial(specimen.mesh.outputs, observed))]
+        others = {FINER: partial(on_finer_mesh, observed, partial(specimen.mesh.outputs, observed))}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        finer = solved_by(recorders["/"].on(1)) if others else Finer(None, specimen.why)
+        finer = solved_by(recorders["/"].on(FINER)) if others else Finer(None, specimen.why)
         errors = study.data.errors
         found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
         return dataset(study, [Outcome(found, "", None, 0.0)], specimen.vertices)

@@ -57,7 +57,7 @@ class MethodJob:
     Attributes
     ----------
     model, others
-        Models number 0, and 1, 2, …
+        The first model, and makers of others by their names.
     task
         Runs the method on rank 0.
     recorders
@@ -71,7 +71,7 @@ class MethodJob:
     """
 
     model: ForwardModel
-    others: list[Callable[[], ForwardModel]]
+    others: Mapping[str, Callable[[], ForwardModel]]
     task: Callable[[Evaluate], xr.Dataset]
     recorders: dict[str, Recorder]
     labelled: Callable[[xr.Dataset], xr.Dataset]

@@ -10,7 +10,7 @@ from inverse.criticism.finer import Finer
 from uq.evaluation.evaluate import Evaluate, Recorder, SerialEvaluate
 from uq.findings import add
 from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
-from workflows.studies.finer import once_on_finer_mesh, solved_by
+from workflows.studies.finer import FINER, once_on_finer_mesh, solved_by
 from workflows.studies.job import MethodJob
 from workflows.studies.selection import groups
 
@@ -24,15 +24,14 @@ if TYPE_CHECKING:
 
 def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
     """The candidates, each for each group of data; making them is collective over the group."""
-    pairs = study.pairs
-    makers = [cache(partial(study.build, *pair, ensemble.group)) for pair in pairs]
+    makers = {pair: cache(partial(study.build, *pair, ensemble.group)) for pair in study.pairs}
     recorders: dict[str, Recorder] = {}
     why = study.unchecked
-    checked = [number for number, (name, _) in enumerate(pairs) if not why.get(name, "none")]
+    checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         def recorded(name: str, group: str) -> Evaluate:
-            recorders[f"{name}/{group}"] = Recorder(evaluate.on(pairs.index((name, group))))
+            recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
             return recorders[f"{name}/{group}"]
 
         def free(name: str, group: str) -> Evaluate:
@@ -40,10 +39,9 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
             return SerialEvaluate(study.build(name, group), ensemble.count)
 
         def finer(name: str, group: str) -> Finer:
-            number = pairs.index((name, group))
-            if number not in checked:
+            if (name, group) not in checked:
                 return Finer(None, why[name])
-            return solved_by(recorders[f"{name}/{group}"].on(len(pairs) + checked.index(number)))
+            return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
         return study.method.run(study.models, study.groups, recorded, free, finer if why else None)
 
@@ -54,6 +52,7 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         add(found, *findings(found), *doubts)
         return trusted_on_meshes(found)
 
-    others: list[Callable[[], ForwardModel]] = [*makers[1:]]
-    others += [partial(once_on_finer_mesh, makers[number]) for number in checked]
-    return MethodJob(makers[0](), others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)
+    others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
+    others |= {f"{n}/{g}/{FINER}": partial(once_on_finer_mesh, makers[n, g]) for n, g in checked}
+    first = makers[study.pairs[0]]()
+    return MethodJob(first, others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)

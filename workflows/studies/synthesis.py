@@ -198,4 +198,4 @@ def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
         return {f"data/{file}": text for file, text in made.items()}
 
     labelled = partial(with_factor, study, places=places, fields=factor)
-    return MethodJob(model, [], task, recorders, labelled, texts=texts)
+    return MethodJob(model, {}, task, recorders, labelled, texts=texts)

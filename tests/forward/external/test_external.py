@@ -10,6 +10,7 @@ import xarray as xr
 
 from forward.conformance import check_derivatives
 from forward.external.models import PythonModel
+from forward.external.own_modules import sources
 from forward.model import ModelError, SolveError
 from tests import functions
 from tests.launch import ROOT
@@ -174,11 +175,11 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     path.write_text("def f(p):\n    return p[0]\n")
     blocks = 'parameters={a={kind="uniform", lower=0, upper=1}}', 'model.outputs=["f"]', "model.parameters={a=1.0}"
     changing = parse(tomllib.loads(STUDY.replace("jacobian", "# ")), ["model.function=changing_model.f", *blocks])
-    before = changing.model.sources
+    before = sources(changing.model.modules)
     assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
     assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
     path.write_text("def f(p):\n    return 2 * p[0]\n")
-    assert before != changing.model.sources
+    assert before != sources(changing.model.modules)
     with pytest.raises(StudyError, match=r"changing_model\.py has changed; choose another --out"):
         run(changing, "changing", tmp_path / "out", quiet=True)
     sys.modules.pop("changing_model")
@@ -225,7 +226,7 @@ def test_the_function_is_that_of_the_file_as_it_is_now(tmp_path, monkeypatch):
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / "my_own.py").write_text(f"def f(p):\n    return {factor} * p\n")
         monkeypatch.syspath_prepend(tmp_path / folder)
-        found.append((model.build(None, ("a",)).solve(np.array([2.0])).outputs[0], model.sources.digest))
+        found.append((model.build(None, ("a",)).solve(np.array([2.0])).outputs[0], sources(model.modules).digest))
     assert [value for value, _ in found] == [2, 20, 400]
     assert len({source for _, source in found}) == 3
 

@@ -53,7 +53,7 @@ elif case == "models":
     def task(evaluate):
         points = np.random.default_rng(0).random((50, 2))
         one = evaluate(Request(points)).outputs
-        two = evaluate.on(1)
+        two = evaluate.on("other")
         assert two.outputs == ("g",)
         assert (two(Request(points)).outputs == 2 * one).all()
         assert (evaluate(Request(points)).outputs == one).all()
@@ -67,7 +67,7 @@ else:
 
 try:
     other = FunctionModel(lambda p: 2 * function(p), ("a", "b"), ("g",))
-    data = ensemble.run(model, task, others=[lambda: other], progress=count)
+    data = ensemble.run(model, task, others={"other": lambda: other}, progress=count)
 except SolveError as error:
     print("caught", error)
     sys.exit(1)

@@ -56,8 +56,12 @@ def comparison(*methods, **settings):
     return Compare.model_validate({"reference": KNOWN, "textbook": 0, "seed": 3} | settings | {"methods": methods})
 
 
+def others(*models):
+    return dict(zip(("tight", "textbook", "refined"), models, strict=True))
+
+
 def serial(model=MODEL):
-    return SerialEvaluate(model, others=(MODEL, MODEL, MODEL))
+    return SerialEvaluate(model, others=others(MODEL, MODEL, MODEL))
 
 
 def of(dataset, name, output="f"):
@@ -183,7 +187,7 @@ def test_points_are_solved_once_and_charged_to_all():
 def test_what_the_textbook_costs_and_finds():
     off = FunctionModel(lambda p: function(p) + 1e-3, ("a", "b"), ("f", "g"), jacobian)
     fine = FunctionModel(lambda p: function(p) + 0.5, ("a", "b"), ("f", "g"), jacobian)
-    evaluate = SerialEvaluate(MODEL, others=(MODEL, off, fine))
+    evaluate = SerialEvaluate(MODEL, others=others(MODEL, off, fine))
     found = comparison(PLAIN, CONTROLLED, textbook=5, mesh_error=True, repeats=2).run(INPUTS, evaluate)
     np.testing.assert_allclose(found["solver_error"], 1e-3)
     np.testing.assert_allclose(found["mesh_error"], 0.5)
@@ -262,9 +266,10 @@ def test_a_study_survives_its_own_dump():
     assert document(case)["method"]["methods"][0] == {"name": "", "kind": "monte-carlo", "budgets": [16, 32]}
     assert case.planned == 2 + 20 * (32 + 32) + 2 * 8
     assert "solves      up to 1,298" in plan(case)
-    assert [model.solver.kind for model in case.models[1:]] == ["predict-correct", "newton", "predict-correct"]
-    assert case.models[1].solver.tolerance == pytest.approx(1e-11)
-    assert case.models[3].body.cells == (8, 2, 4)
+    kinds = {name: model.solver.kind for name, model in case.models.items()}
+    assert kinds == {"tight": "predict-correct", "textbook": "newton", "refined": "predict-correct"}
+    assert case.models["tight"].solver.tolerance == pytest.approx(1e-11)
+    assert case.models["refined"].body.cells == (8, 2, 4)
 
 
 @pytest.mark.parametrize(
@@ -321,7 +326,7 @@ def results(tmp_path):
         outputs,
         lambda p: jacobian((p - lower) / width) / width,
     )
-    recorder = Recorder(SerialEvaluate(model, others=(model, replace(model), model)))
+    recorder = Recorder(SerialEvaluate(model, others=others(model, replace(model), model)))
     dataset = case.method.run(case.inputs, recorder)
     dataset = label(dataset, {o.name: o.unit for o in case.model.outputs}, np.zeros((0, 3)), np.zeros((0, 8)), 12)
     dataset.attrs |= {"study": "formula", "method": "compare", "config": dump(case)}

@@ -8,8 +8,8 @@ from forward.model import FunctionModel, SolveError
 from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
+from uq.methods.local_sensitivity import LocalSensitivity
 from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
-from uq.surrogates.linearisation import LocalSensitivity
 
 INPUTS = Inputs({"a": Uniform(lower=0.0, upper=1.0), "b": Uniform(lower=1.0, upper=2.0)})
 MODEL = FunctionModel(lambda p: [p[0] + p[1] ** 2 / 2], ("a", "b"), ("f",), lambda p: [[1, p[1]]])

@@ -44,9 +44,13 @@ def on_mesh(level, alpha=ALPHA):
     return FunctionModel(value, ("a", "b"), ("f", "g"), jacobian)
 
 
+def meshes(*finer):
+    return {f"mesh {level}": model for level, model in enumerate(finer, 1)}
+
+
 def hierarchy(count, alpha=ALPHA):
     first, *others = (on_mesh(level, alpha) for level in range(count))
-    return SerialEvaluate(first, others=tuple(others))
+    return SerialEvaluate(first, others=meshes(*others))
 
 
 def exact(level):
@@ -221,7 +225,7 @@ def test_planned_solves_and_their_points():
 
 
 def test_a_model_without_derivatives_needs_no_control():
-    bare = SerialEvaluate(replace(on_mesh(0), jacobian=None), others=(replace(on_mesh(1), jacobian=None),))
+    bare = SerialEvaluate(replace(on_mesh(0), jacobian=None), others=meshes(replace(on_mesh(1), jacobian=None)))
     with pytest.raises(ValueError, match="no derivatives"):
         MultilevelMonteCarlo(samples=16, levels=2).run(INPUTS, bare)
     data = MultilevelMonteCarlo(samples=16, levels=2, control="none").run(INPUTS, bare)
@@ -233,7 +237,7 @@ def test_a_control_that_is_exact_leaves_no_error():
     def linear(h):
         return FunctionModel(lambda p: (1 + h) * p[0] + h, ("a", "b"), ("f",), lambda p: [[1 + h, 0]])
 
-    evaluate = SerialEvaluate(linear(0.4), others=(linear(0.1), linear(0.025)))
+    evaluate = SerialEvaluate(linear(0.4), others=meshes(linear(0.1), linear(0.025)))
     data = MultilevelMonteCarlo(tolerance=0.02, samples=100).run(INPUTS, evaluate)
     assert data["mean"].item() == pytest.approx(1.05, rel=1e-12)
     assert data["mean_error"].item() < 1e-12
@@ -279,7 +283,7 @@ def test_a_few_samples_that_make_the_variance_are_noticed():
     def spiky(level):
         return FunctionModel(lambda p: p[0] + 2.0**-level * (p[1] > 0.995), ("a", "b"), ("f",))
 
-    evaluate = SerialEvaluate(spiky(0), others=(spiky(1), spiky(2)))
+    evaluate = SerialEvaluate(spiky(0), others=meshes(spiky(1), spiky(2)))
     data = MultilevelMonteCarlo(samples=1000, pilot=1000, control="none").run(INPUTS, evaluate)
     assert (data["difference_kurtosis"][1:] > 100).all()
     assert "a few samples make most of the variance" in data.attrs["note"]
@@ -295,7 +299,7 @@ def test_pairs_with_a_failure_are_dropped_and_counted(control, broken):
 
     models = [on_mesh(level) for level in range(3)]
     models[broken] = replace(models[broken], function=fragile)
-    evaluate = SerialEvaluate(models[0], others=tuple(models[1:]))
+    evaluate = SerialEvaluate(models[0], others=meshes(*models[1:]))
     data = MultilevelMonteCarlo(samples=200, pilot=40, control=control).run(INPUTS, evaluate)
     touched = {0: [0, 1], 1: [1, 2]}[broken]
     assert [level for level in range(3) if data["mesh_failed"][level] > 0] == touched
@@ -312,7 +316,7 @@ def test_failures_that_leave_nothing_are_an_error():
             raise SolveError("gone")
         return on_mesh(1).function(p)
 
-    evaluate = SerialEvaluate(on_mesh(0), others=(replace(on_mesh(1), function=gone),))
+    evaluate = SerialEvaluate(on_mesh(0), others=meshes(replace(on_mesh(1), function=gone)))
     with pytest.raises(SolveError, match="level 1: 0 of 8 samples have an answer, expected 2: gone"):
         MultilevelMonteCarlo(samples=16, levels=2).run(INPUTS, evaluate)
 
@@ -323,7 +327,7 @@ RANKS = """
 import sys
 from pathlib import Path
 from mpi4py import MPI
-from tests.uq.methods.test_multilevel import INPUTS, hierarchy, on_mesh
+from tests.uq.methods.test_multilevel import INPUTS, hierarchy, meshes, on_mesh
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.methods.multilevel import MultilevelMonteCarlo
@@ -336,7 +340,7 @@ def maker(level):
 
 ensemble = Ensemble.split(MPI.COMM_WORLD)
 data = ensemble.run(
-    on_mesh(0), lambda evaluate: method.run(INPUTS, evaluate), others=[maker(level) for level in range(1, 5)],
+    on_mesh(0), lambda evaluate: method.run(INPUTS, evaluate), others=meshes(*map(maker, range(1, 5))),
     checkpoint=Checkpoint(Path(sys.argv[1]), "a study"),
 )
 if data is not None:

@@ -59,10 +59,10 @@ def test_whichever_comes_first() -> None:
 
 def test_other_models_are_evaluated_and_charged() -> None:
     double = replace(MODEL, function=lambda p: 2 * np.exp(p[0]) * (1 + p[1]))
-    first: Evaluate = SerialEvaluate(MODEL, others=(double,))
+    first: Evaluate = SerialEvaluate(MODEL, others={"double": double})
     recorder = Recorder(first)
     points = np.random.default_rng(0).random((5, 2))
-    one, two = recorder(Request(points)), recorder.on(1)(Request(points))
+    one, two = recorder(Request(points)), recorder.on("double")(Request(points))
     np.testing.assert_array_equal(two.outputs, 2 * one.outputs)
     assert recorder.solves == 10
     assert recorder.seconds > 0

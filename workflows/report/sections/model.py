@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 from forward.words import number, settings
@@ -32,11 +33,10 @@ def parameters(results: Results) -> Table:
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
         rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, unit_of(name)))
-    body = results.study.body
-    for field, paths in [(field, field.paths(body.body)) for field in body.fields] if body is not None else []:
-        kept = float(results.dataset["variance_kept"].sel(random_field=field.label))
+    for field, count in Counter(path.split(".")[1] for path in results.study.model.coefficients).items():
+        kept = float(results.dataset["variance_kept"].sel(random_field=field))
         law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
-        rows.append((f"fields.{field.label}.0 to {len(paths) - 1}", law, "0", "1", "1"))
+        rows.append((f"fields.{field}.0 to {count - 1}", law, "0", "1", "1"))
     rows += [
         (" and ".join(c.between), f"joined by a Gaussian copula with correlation {c.value:g}", "", "", "")
         for c in results.study.correlations

@@ -1,0 +1,155 @@
+"""What a study asks of a model before it is made: the base of every block `[model]`, and the kinds there are.
+
+A specification needs no FEniCSx. A kind of one's own is a subclass in a module beside the study or in an installed
+package (`forward.registry`): it says its numbers and its outputs, and `build` makes it.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from forward.model import ModelError
+from forward.registry import Kinds
+from forward.scalars import Mistake, Scalar
+from forward.settings import Settings
+
+if TYPE_CHECKING:
+    from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
+    from forward.fem.locking import Ranges
+    from forward.materials.admissible import Materials
+    from forward.model import Finding, ForwardModel, NamedOutput
+
+
+class ModelSpec(Settings):
+    """A model as a study describes it. What is not abstract holds for a map from numbers to numbers.
+
+    Attributes
+    ----------
+    meshed
+        Whether its state lives on a mesh, of which `refined` gives finer ones.
+    iterative
+        Whether a solve can be stopped after some iterations.
+    shareable
+        Whether several ranks can work on one solve.
+    """
+
+    meshed: ClassVar[bool] = False
+    iterative: ClassVar[bool] = False
+    shareable: ClassVar[bool] = False
+
+    if TYPE_CHECKING:  # fields or properties, as the kind has them
+
+        @property
+        def kind(self) -> str:
+            """As the study has it."""
+
+        @property
+        def outputs(self) -> Sequence[NamedOutput]:
+            """What is computed: names and units."""
+
+    @property
+    @abstractmethod
+    def scalars(self) -> Mapping[str, Scalar]:
+        """Every number that can be made a parameter, by its path."""
+
+    @abstractmethod
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> ForwardModel:
+        """Make the model on a communicator; collective.
+
+        Parameters
+        ----------
+        comm
+            mpi4py communicator of the ranks that share the model.
+        parameters
+            Paths of the numbers that the model's parameter vector holds; the others keep their values.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be made.
+        """
+
+    @abstractmethod
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Say what it is, for values of parameters within ranges by their paths: words and what they are of."""
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        return f"model of kind '{self.kind}'"
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Paths of the coefficients of random fields, which can be parameters too."""
+        return ()
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that the user has written for it: results are not continued once their text has changed."""
+        return ()
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of its equations; 0 where there are none."""
+        return 0
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials | None:
+        """Return its materials as functions of some of its numbers, by their paths, if it has any."""
+        return None
+
+    def over(self, ranges: Ranges) -> Self:
+        """Return the same model in the form that suits all values of parameters within ranges, by their paths."""
+        return self
+
+    def mistakes_of_samples(self) -> Iterator[Mistake]:
+        """Find what cannot be where parameters are drawn: the places of these mistakes begin with "model"."""
+        yield from ()
+
+    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
+        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        return ()
+
+    def refined(self, level: int) -> Self:
+        """Return the same model on a mesh whose cells are divided by 2^level along each edge."""
+        message = f"a model of kind '{self.kind}' has no meshes"
+        raise ModelError(message)
+
+    def textbook(self) -> Self:
+        """Return the same model solved as in a textbook, by which it is measured what a better solver saves."""
+        return self
+
+    def tighter(self, factor: float) -> Self:
+        """Return the same model with the tolerances of its solver times a factor."""
+        return self
+
+    def solved_to(self, tolerance: Any) -> Self:
+        """Return the same model with another tolerance of its solver.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If it cannot be that.
+        """
+        return self
+
+    def cost(self) -> Times | None:
+        """Predict what a solve takes; None where that is not known."""
+        return None
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that decides on results, as a table."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+MODELS = Kinds(
+    "model",
+    {
+        "hyperelastic": "forward.hyperelastic:Hyperelastic",
+        "specimen": "forward.specimen:Specimen",
+        "python": "forward.external.models:PythonModel",
+        "um-bridge": "forward.external.models:UmBridgeModel",
+    },
+    ModelSpec,
+)

@@ -1,0 +1,125 @@
+"""What a study asks of a method: the base of every block `[method]` that solves at points, and the kinds there are.
+
+A kind of one's own is a subclass in a module beside the study or in an installed package (`forward.registry`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from forward.registry import Kinds
+from forward.scalars import Mistake
+from forward.settings import Settings
+from uq.evaluation.evaluate import OWN
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.spec import ModelSpec, Times
+    from uq.evaluation.evaluate import Evaluate
+    from uq.inputs.random_parameters import Inputs
+
+MESH = "mesh "  # how the names of models begin that are the same on finer meshes, of which a report has a table
+
+
+class Method(Settings):
+    """A method: random parameters and an evaluation of models in, a dataset out."""
+
+    if TYPE_CHECKING:  # a field of every kind
+
+        @property
+        def kind(self) -> str:
+            """As the study has it."""
+
+    @abstractmethod
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Solve, and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            What docs/results.md names, as far as the method has it.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer where the method cannot do without one.
+        ValueError
+            If the method cannot take the parameters, or needs derivatives that the model does not have.
+        """
+
+    @abstractmethod
+    def planned(self, dimension: int) -> int:
+        """Number of solves for so many parameters, the largest where it may end earlier, with that at the mean."""
+
+    @property
+    def open_ended(self) -> bool:
+        """Whether fewer solves than planned may be enough."""
+        return False
+
+    @property
+    def undecided(self) -> str:
+        """What the planned solves are for, where they decide how many more there are; else empty."""
+        return ""
+
+    def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
+        """Return the models that it solves beside that of the study, by the names that it asks `Evaluate.on` for.
+
+        Raises
+        ------
+        ModelError, pydantic.ValidationError
+            If one of them cannot be.
+        """
+        return {}
+
+    def objection(self, inputs: Inputs) -> str | None:
+        """Say why these parameters do not allow it, or None if they do."""
+        return None
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what the method needs that the model does not have."""
+        yield from ()
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what of the method does not fit the parameters and the outputs."""
+        objection = self.objection(inputs)
+        if objection is not None:
+            given = [{"between": (a, b), "value": value} for a, b, value in inputs.correlations]
+            yield ("correlations",), objection, given
+
+    def with_tangents(self, samples: int) -> int:
+        """Of so many samples, the number whose derivatives are asked for too."""
+        return 0
+
+    def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
+        """Predict the processor time (s) of what follows the first solves, by the costs of the models by name."""
+        own, samples = costs[OWN], self.planned(dimension) - 1
+        return samples * own.sample + self.with_tangents(samples) * own.tangents_of_sample(dimension)
+
+    def stream(self) -> tuple[Any, ...] | None:
+        """Name the points that it takes the first of, for all methods that take them; None where they are its own."""
+        return None
+
+
+# Those that estimate moments from a number of samples.
+SAMPLING = {
+    "monte-carlo": "uq.methods.monte_carlo:MonteCarlo",
+    "sensitivity-monte-carlo": "uq.methods.monte_carlo:SensitivityMonteCarlo",
+    "quasi-monte-carlo": "uq.methods.quasi_monte_carlo:QuasiMonteCarlo",
+    "chaos": "uq.methods.chaos:Chaos",
+    "multilevel-chaos": "uq.methods.multilevel_chaos:MultilevelChaos",
+}
+METHODS = Kinds(
+    "method",
+    {
+        **SAMPLING,
+        "multilevel-monte-carlo": "uq.methods.multilevel:MultilevelMonteCarlo",
+        "local-sensitivity": "uq.methods.local_sensitivity:LocalSensitivity",
+        "sobol": "uq.methods.sobol:Sobol",
+        "derivative-based": "uq.methods.derivative_based:DerivativeBased",
+        "compare": "uq.methods.compare:Compare",
+    },
+    Method,
+)
