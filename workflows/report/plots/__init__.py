@@ -7,7 +7,7 @@ Functions that take `ax` draw there, or on a new figure that needs no display: i
 
 from workflows.report.plots import inversion, selection
 from workflows.report.plots.against_cost import Cost, errors
-from workflows.report.plots.figure import axes, grid, png, span
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span
 from workflows.report.plots.indices import (
     BARS,
     active_summary,
@@ -29,6 +29,12 @@ from workflows.report.plots.multilevel import levels, mesh_cost, mesh_mean, mesh
 
 __all__ = [
     "BARS",
+    "COLOURS",
+    "CONTROLLED",
+    "DARK",
+    "HIGH",
+    "LOW",
+    "PLAIN",
     "Cost",
     "Estimated",
     "active_summary",
