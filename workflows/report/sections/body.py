@@ -25,7 +25,7 @@ class Body(Section):
 
     def applies(self, results: Results) -> bool:
         """Whether one body was deformed, whether or not its displacement was kept."""
-        return "nominal" in results.dataset and bool(results.study.meshes)
+        return "nominal" in results.dataset and bool(results.study.spec.meshed)
 
     def content(self, results: Results) -> Iterator[Block]:
         """Pictures, or why there are none."""
