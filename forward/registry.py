@@ -73,12 +73,15 @@ class Kinds:
         return {point.name.removeprefix(prefix): point for point in points if point.name.startswith(prefix)}
 
     def _imported(self, kind: str, module: str, name: str) -> Any:
+        if kind in self.own:
+            return getattr(importlib.import_module(module), name)
+        from forward.external.own_modules import imported
+
         try:
-            loaded = importlib.import_module(module)
-        except ImportError as error:
-            if kind in self.own:
-                raise
-            raise KindError(f"the {self.family} '{kind}' cannot be imported: {error}") from error
+            loaded = imported(module) if "." in kind else importlib.import_module(module)
+        except (Exception, SystemExit) as error:
+            said = f"{'' if isinstance(error, ImportError) else f'{type(error).__name__}: '}{error}"
+            raise KindError(f"the {self.family} '{kind}' cannot be imported: {said}") from error
         try:
             found = getattr(loaded, name)
         except AttributeError:

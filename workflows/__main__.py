@@ -81,11 +81,21 @@ def _world() -> Any:
     return None if mpi is None or mpi.COMM_WORLD.size == 1 else mpi.COMM_WORLD
 
 
+class _Version(argparse.Action):
+    """Print the version, which is looked up only if it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from workflows.run.version import version
+
+        parser.exit(message=f"tissuq {version()}\n")
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="tissuq",
         description="Uncertainty quantification and Bayesian model selection for hyperelastic soft tissue.",
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     check = commands.add_parser("check", help="validate a study and print what it will cost")
     run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
@@ -103,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         )
     run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
     run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.add_argument("--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it")
     serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
     serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 takes requests of other machines too")
     serve.add_argument("--quiet", action="store_true", help="print nothing but errors")
@@ -155,7 +166,14 @@ def _run(options: argparse.Namespace) -> int:
     if "mpi4py.MPI" not in sys.modules:  # or else it has its file
         require_files(SHARED_BY_RANKS, "MPI")
     heed()
-    return run(study, options.study.stem, options.out or Path("results") / options.study.stem, quiet=options.quiet)
+    out = options.out or Path("results") / options.study.stem
+    return run(
+        study,
+        options.study.stem,
+        out,
+        quiet=options.quiet,
+        report=not options.no_report,
+    )
 
 
 def _report(options: argparse.Namespace) -> int:

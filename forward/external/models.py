@@ -5,20 +5,16 @@ UM-Bridge: L. Seelinger et al., J. Open Source Softw. 8 (2023) 4748; protocol 1.
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from forward.external.own_modules import sources
+from forward.external.own_modules import imported
 from forward.external.patience import TimeLimitError, time_limit
 from forward.machine import StopError, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
@@ -137,7 +133,6 @@ class _External(ModelSpec):
         return self
 
 
-_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of what they held
 Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
 
 
@@ -181,31 +176,13 @@ class PythonModel(_External):
         return function, _guarded(self.jacobian, "jacobian", self.solve_seconds) if self.jacobian else None
 
 
-def _imported(module: str) -> ModuleType:
-    """Import a module, again if it or what it imports is another file, or another text, than when it was imported."""
-    importlib.invalidate_caches()
-    now = sources([module]).files
-    for name, (file, _) in now.items():
-        known = getattr(sys.modules.get(name), "__file__", None) or file
-        if _texts.get(name, now[name]) != now[name] or (name not in _texts and Path(known).absolute() != Path(file)):
-            for changed in now.keys() & sys.modules.keys():
-                del sys.modules[changed]
-            break
-    _texts.update(now)
-    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes within a second
-    try:
-        return importlib.import_module(module)
-    finally:
-        sys.dont_write_bytecode = kept
-
-
 def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray], Any]:
     """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves."""
     module, _, name = path.rpartition(".")
     try:
-        function = getattr(_imported(module), name)
+        function = getattr(imported(module), name)
     except AttributeError:
-        known = tuple(word for word in dir(_imported(module)) if not word.startswith("_"))
+        known = tuple(word for word in dir(imported(module)) if not word.startswith("_"))
         message = f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}"
         raise ModelError(message) from None
     except (Exception, SystemExit) as error:

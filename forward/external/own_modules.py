@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib
 import importlib.metadata
 import json
 import sys
@@ -17,10 +18,12 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from forward.model import ModelError
 
+_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of what they held
 _TISSUQ = ("forward", "uq", "inverse", "workflows")
 
 
@@ -48,6 +51,15 @@ class Sources:
     def with_files(self, more: Mapping[str, tuple[str, str]]) -> Sources:
         """Add files of modules that were loaded otherwise."""
         return Sources({**more, **self.files}, self.versions)
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Where these modules were found, those of packages in the folder that the package is in."""
+        found = (
+            Path(path).parents[name.count(".") + (Path(path).stem == "__init__")]
+            for name, (path, _) in self.files.items()
+        )
+        return tuple(dict.fromkeys(found))
 
     def document(self) -> dict[str, Any]:
         """Return tables for JSON."""
@@ -169,6 +181,24 @@ def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "
             raise ModelError(message)
 
 
+def imported(module: str) -> ModuleType:
+    """Import a module, again if it or what it imports is another file, or another text, than when it was imported."""
+    importlib.invalidate_caches()
+    now = sources([module]).files
+    for name, (file, _) in now.items():
+        known = getattr(sys.modules.get(name), "__file__", None) or file
+        if _texts.get(name, now[name]) != now[name] or (name not in _texts and Path(known).absolute() != Path(file)):
+            for changed in now.keys() & sys.modules.keys():
+                del sys.modules[changed]
+            break
+    _texts.update(now)
+    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes within a second
+    try:
+        return importlib.import_module(module)
+    finally:
+        sys.dont_write_bytecode = kept
+
+
 def find(module: str) -> ModuleSpec | None:
     """Find a module by its dotted name as it would be found now, without importing the packages that it is in."""
     top, *rest = module.split(".")
@@ -198,7 +228,7 @@ def _elsewhere(top: str, path: list[str], beside: Path) -> str | None:
     if top in sys.builtin_module_names or top in sys.stdlib_module_names:
         return "a module of Python's standard library"
     if top in _TISSUQ:
-        return "a package of this program"
+        return None if _is_tissuq(beside) else "a package of this program"
     file = _file(PathFinder.find_spec(top, path))
     return None if file in {None, beside} else f"another module, {file}"
 

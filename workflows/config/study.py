@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.model import Finding, ModelError
-from forward.registry import OfKind
+from forward.registry import OfKind, dotted
 from forward.scalars import Mistake, Scalar
 from forward.settings import UNKNOWN_KIND, Settings, cut, nearest, one_line, shown
 from forward.spec import MODELS, ModelSpec
@@ -245,12 +245,14 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     overrides
         Assignments such as ``method.samples=512`` that come on top; values are TOML, or else plain text.
     folder
-        Where tables of data and meshes are that it names.
+        Where tables of data, meshes and modules of kinds are that it names.
 
     Raises
     ------
     StudyError
         With every mistake found.
+    ModelError
+        If a kind is a dotted path to a module that is there twice.
     """
     blocks = dict(document)
     for assignment in overrides:
@@ -258,6 +260,11 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     if _deeper_than(blocks, DEEPEST):
         message = f"lists and tables are nested too deeply, expected at most {DEEPEST} levels"
         raise StudyError(message)
+    modules = list(dict.fromkeys(dotted(blocks)))
+    if modules:
+        from forward.external.own_modules import make_visible
+
+        make_visible(modules, [folder.resolve(), Path.cwd()], "kind")
     try:
         blocks = located(_located(blocks, folder), folder)
         kind = blocks["method"].get("kind") if isinstance(blocks.get("method"), Mapping) else None
@@ -483,7 +490,7 @@ def _line(item: Any, place: str) -> str:
     message, given = item["msg"], item["input"]
     if item["type"] in {"missing", "unknown_key"}:
         return f"{place}: {message}"
-    if item["type"] == UNKNOWN_KIND and place == "method.kind":
+    if item["type"] == UNKNOWN_KIND and place == "method.kind" and "." not in given:
         message = f"unknown kind; {nearest(given, [*item['ctx']['known'], *_APART])}"
     message = f"{place}: {message[:1].lower()}{message[1:]}"
     if isinstance(given, Mapping) and not message.endswith(

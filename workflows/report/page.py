@@ -15,6 +15,7 @@ from workflows.report import comparison
 from workflows.report.blocks import Block, Folded, Heading, Html, Text
 from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
+from workflows.run import own_code
 
 Parts = list[tuple[str, list[Block]]]  # sections by their names
 
@@ -91,6 +92,7 @@ def _read(directory: Path) -> Results:
     if summary is None:
         message = f"{directory}: holds no summary.json, expected the directory of a finished study"
         raise FileNotFoundError(message)
+    own_code.make_visible(directory)
     try:
         return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"])))
     except StudyError as error:

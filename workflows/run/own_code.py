@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,23 @@ def keep(directory: Path, study: AnyStudy, loaded: Loaded | None) -> None:
     if found and loaded is not None:
         known = (_kept(directory) or sources(found)).with_files(loaded())
         write_text(directory / FILE, json.dumps(known.document(), indent=2, ensure_ascii=False) + "\n")
+
+
+def make_visible(directory: Path) -> None:
+    """Have the modules found that the results in a directory follow from, where they were when these were computed."""
+    known = _kept(directory)
+    if known is not None:
+        sys.path += [str(folder) for folder in known.folders if folder.is_dir() and str(folder) not in sys.path]
+
+
+def listed(study: AnyStudy) -> list[str]:
+    """Say which kinds of a study are a user's own, and where they are from."""
+    names = list(dict.fromkeys(dotted(document(study))))
+    if not names:
+        return []
+    files = sources(names).files
+    code = [f"{name} ({path})" for name, (path, _) in files.items()]
+    return [f"own code    {', '.join([*code, *(name for name in names if name not in files)])}"]
 
 
 def _kept(directory: Path) -> Sources | None:

@@ -14,6 +14,7 @@ from forward.model import Finding
 from forward.spec import ModelSpec
 from uq.evaluation.evaluate import OWN
 from workflows.config.study import Study, ranges
+from workflows.run import own_code
 
 if TYPE_CHECKING:
     from forward.fem.locking import Decision
@@ -69,7 +70,7 @@ def plan(study: AnyStudy, groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
     short = shortage(study, groups)
     found = [*study.findings, *([] if short is None else [short])]
-    return [*_planned(study, groups), *(f"{one.severity:10}  {one.text}" for one in found)]
+    return [*_planned(study, groups), *own_code.listed(study), *(f"{one.severity:10}  {one.text}" for one in found)]
 
 
 def _planned(study: AnyStudy, groups: int) -> list[str]:

@@ -9,10 +9,8 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -44,6 +42,7 @@ from workflows.results.summary import inverted, summarise
 from workflows.run import own_code
 from workflows.run.plan import memory, of_program, shortage
 from workflows.run.progress import Progress
+from workflows.run.version import commit, version, versions
 from workflows.studies.findings_solves import findings_of_solves, measured
 from workflows.studies.job import Job, MethodJob
 
@@ -64,7 +63,7 @@ _STOPPED = {"select": "all evidences found", "invert": "all data sets inverted",
 LISTED = 50  # failures that summary.json lists; evaluations.h5 has all
 
 
-def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> int:
+def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False, report: bool = True) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
     Parameters
@@ -77,6 +76,8 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
         Where results go; made if it does not exist.
     quiet
         Print nothing but errors.
+    report
+        Whether report.html is written.
 
     Returns
     -------
@@ -100,7 +101,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
     Where it fails before anything is solved, the directory is left as it was.
     """
     try:
-        return _run(study, name, directory, quiet=quiet)
+        return _run(study, name, directory, quiet=quiet, report=report)
     except Exception as error:
         if isinstance(error, StopError) or not out_of_memory(error):
             raise
@@ -108,7 +109,7 @@ def run(study: AnyStudy, name: str, directory: Path, *, quiet: bool = False) -> 
         raise StopError(reason) from error
 
 
-def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
+def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool, report: bool) -> int:
     from mpi4py import MPI
 
     world = MPI.COMM_WORLD
@@ -117,7 +118,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     finished = _agreed(world, lambda: _prepare(study, directory, world.size))
     if finished is not None:
         if world.rank == 0:
-            if not (directory / "report.html").exists():
+            if report and not (directory / "report.html").exists():
                 _report(directory)
             if not quiet:
                 sys.stdout.write(f"{directory}: finished before, nothing to do\n")
@@ -130,7 +131,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     _warn_of_memory(study, world, quiet=quiet)
     planned = study.solves if hasattr(study, "solves") else study.planned
     progress = Progress(planned, quiet=quiet or world.rank > 0, failures=not _explains(study))
-    checkpoint = Checkpoint(directory, json.dumps([_identity(study), _version()]), loaded)
+    checkpoint = Checkpoint(directory, json.dumps([_identity(study), version()]), loaded)
     try:
         job = ensemble.together(lambda: _job(study, ensemble, name, directory, checkpoint))
         if world.rank == 0:
@@ -145,7 +146,7 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     progress.close()
     dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
     add(dataset, *study.findings)
-    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": _version(), "config": dump(study)}
+    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study)}
     evaluations = job.evaluations
     own_code.keep(directory, study, loaded)
     add(dataset, *(findings_of_solves(evaluations.values()) if _explains(study) else ()))
@@ -156,6 +157,8 @@ def _run(study: AnyStudy, name: str, directory: Path, *, quiet: bool) -> int:
     if isinstance(study, Study) and len(study.meshes) > 1:
         summary["meshes"] = _meshes(study, job)
     _leave(directory, dataset, evaluations, summary, checkpoint, job)
+    if report:
+        _report(directory)
     if not quiet:
         sys.stdout.write(_closing_words(directory, dataset, summary))
     return exit_code(summary)
@@ -225,7 +228,6 @@ def _leave(
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
-    _report(directory)
 
 
 def _report(directory: Path) -> None:
@@ -397,13 +399,6 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
     return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
-def _version() -> str:
-    try:
-        return version("tissuq")
-    except PackageNotFoundError:
-        return "unknown"
-
-
 def _summary(
     study: AnyStudy,
     name: str,
@@ -440,9 +435,9 @@ def _summary(
             "ranks": ranks,
             "groups": groups,
             "processor": platform.machine(),
-            "commit": _commit(),
+            "commit": commit(),
             **({} if source is None else {"source": source}),
-            "versions": {"python": platform.python_version(), **_versions()},
+            "versions": {"python": platform.python_version(), **versions()},
         },
     }
 
@@ -519,30 +514,6 @@ def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
     return tuple(study.candidates[label.partition("/")[0]].parameters)
 
 
-def _versions() -> dict[str, str]:
-    dolfinx = ("fenics-dolfinx", "dolfinx-solver-real")  # Debian's name and that of the wheel
-    names = ("tissuq", *dolfinx, "petsc4py", "mpi4py", "numpy", "scipy", "chaospy", "xarray")
-    found = {}
-    for name in names:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
-def _commit() -> str | None:
-    """Return the commit of the source tree, where there is one."""
-    import subprocess
-
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
 def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
@@ -578,5 +549,6 @@ def _closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]
     if "note" in summary:
         lines.append(summary["note"])
     lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
-    lines.append(f"report: {directory / 'report.html'}")
+    if (directory / "report.html").exists():
+        lines.append(f"report: {directory / 'report.html'}")
     return "\n".join(lines) + "\n"
