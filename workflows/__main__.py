@@ -134,14 +134,15 @@ def _load(options: argparse.Namespace) -> AnyStudy:
     """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
     from forward.external.models import PythonModel
     from forward.machine import reserve_for_linear_algebra
-    from workflows.config.study import Study, load
+    from workflows.config.study import load
 
     reserve_for_linear_algebra()
     study = load(options.study, options.set)
-    if isinstance(study, Study) and isinstance(study.model, PythonModel):
+    model = getattr(study, "model", None)
+    if isinstance(model, PythonModel):
         from forward.external.own_modules import make_visible
 
-        make_visible(study.model.modules, [options.study.resolve().parent, Path.cwd()])
+        make_visible(model.modules, [options.study.resolve().parent, Path.cwd()])
     if study.report is not None:  # a section that is missing is said before the study runs
         from workflows.report.section import of_study
 

@@ -189,6 +189,11 @@ class Components:
     sigma: FloatArray
 
     @property
+    def which(self) -> None:
+        """They are the outputs of a model that observes them."""
+        return
+
+    @property
     def described(self) -> dict[str, FloatArray]:
         """Places and axes, by their names in results."""
         return {"place": self.places, "datum_axis": self.axes.astype(float)}

@@ -76,10 +76,21 @@ def invert_by_group(
     method: Invert,
     look: Look | None,
     errors: NormalErrors | StudentErrors = NORMAL,
-    finer: Finer = NOT_LOOKED,
+    finer: Finer | None = NOT_LOOKED,
     evaluate: Evaluate | None = None,
 ) -> xr.Dataset:
     """Invert a data set on the model of one group of ranks, or by an evaluation of it; collective over the group.
+
+    Parameters
+    ----------
+    inputs, model, data, method, errors
+        What is unknown, of what, from what, how, and of which errors.
+    look
+        What is seen of the interior; None where nothing is.
+    finer
+        The model on a finer mesh; None where it has no mesh.
+    evaluate
+        Of the model.
 
     Raises
     ------
@@ -97,7 +108,7 @@ def invert_by_all(
     method: Invert,
     look: Look | None,
     errors: NormalErrors | StudentErrors = NORMAL,
-    finer: Finer = NOT_LOOKED,
+    finer: Finer | None = NOT_LOOKED,
 ) -> xr.Dataset:
     """Invert a data set with all groups of ranks, each of which solves at other points; raises as the other."""
     return _invert(
@@ -119,12 +130,13 @@ def _invert(
     method: Invert,
     look: Look | None,
     errors: NormalErrors | StudentErrors,
-    finer: Finer,
+    finer: Finer | None,
     start: Callable[[FloatArray], Start | None],
 ) -> xr.Dataset:
     counted = Recorder(evaluate)
-    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, errors=errors)
+    posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     d = len(inputs.names)
+    which = slice(None) if data.which is None else list(data.which)
     with suppress(SolveError):  # or else every solve begins at zero
         posterior = replace(posterior, start=start(inputs.mean))
     gaussian = laplace(posterior, starts=method.starts, seed=method.seed)
@@ -143,23 +155,27 @@ def _invert(
         points = chains.flat
         weights = np.full(len(points), 1 / len(points))
         draws = _thinned(chains, method.draws)
-        outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs
+        outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs[:, which]
     else:
         weights, points = found.weights, posterior.physical(found.density.x)
         chosen = resampled(weights, method.draws, method.seed)
         draws, outputs = points[chosen], found.density.outputs[chosen]
     moments = _moments(posterior, gaussian, weights, points, look)
     std = np.asarray(moments["std"])
-    gap, why = finer.gap(best[:d], at.outputs[0])
-    shift = np.full(len(best), np.nan)
-    if gap is not None:
-        A = spectrum.images.T @ spectrum.vectors
-        shift[:d] = parameters_moved(posterior, gaussian, A, root * gap / scale) / std[:d]
+    mesh: Record = {}
+    if finer is not None:
+        gap, why = finer.gap(best[:d], at.everything[0])
+        shift = np.full(len(best), np.nan)
+        if gap is not None:
+            gap = gap[which]
+            A = spectrum.images.T @ spectrum.vectors
+            shift[:d] = parameters_moved(posterior, gaussian, A, root * gap / scale) / std[:d]
+        mesh = of_mesh(gap, why, scale, shift)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
-        **of_mesh(gap, why, scale, shift),
+        **mesh,
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(draws, outputs, data, method, errors),

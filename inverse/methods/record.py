@@ -121,6 +121,10 @@ class Data(Protocol):
         """Numbers (m,) of the parts (load cases, outputs) of which it is asked what each alone would say."""
 
     @property
+    def which(self) -> tuple[int, ...] | None:
+        """Numbers (m,) of the outputs of the model that were measured; None where these are all, in their order."""
+
+    @property
     def described(self) -> dict[str, FloatArray]:
         """What else is known of the data, by its name in results."""
 

@@ -25,11 +25,11 @@ from workflows.config.priors import findings_of_draws, mistakes_of_materials
 from workflows.config.report import Report, located
 
 if TYPE_CHECKING:
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.selection import Comparison
     from workflows.studies.synthesis import Synthesis
 
-    AnyStudy: TypeAlias = "Study | Comparison | Inversion | Synthesis"
+    AnyStudy: TypeAlias = "Study | Comparison | InversionStudy | Synthesis"
 
 WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
@@ -322,11 +322,14 @@ def load(path: Path, overrides: Sequence[str] = ()) -> AnyStudy:
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, by which editors complete and check it."""
     from workflows.studies.inversion import Inversion
+    from workflows.studies.output_inversion import OutputInversion
     from workflows.studies.selection import DataFile, Selection
     from workflows.studies.specimen_selection import DisplacementFile, SpecimenSelection
     from workflows.studies.synthesis import Synthesis
 
-    adapter: TypeAdapter[Any] = TypeAdapter(Study | Selection | SpecimenSelection | Inversion | Synthesis)
+    adapter: TypeAdapter[Any] = TypeAdapter(
+        Study | Selection | SpecimenSelection | Inversion | OutputInversion | Synthesis
+    )
     found = adapter.json_schema(ref_template="#/$defs/{model}")
     # A file may name a table in place of the data themselves.
     for name, file in (("Selection", DataFile), ("SpecimenSelection", DisplacementFile)):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from forward.external.own_modules import Loaded, Sources, other_code, sources
 from forward.registry import dotted
-from workflows.config.study import Study, StudyError, document
+from forward.spec import ModelSpec
+from workflows.config.study import StudyError, document
 from workflows.results.directory import write_text
 
 if TYPE_CHECKING:
@@ -20,8 +21,9 @@ FILE = "sources.json"
 
 def modules(study: AnyStudy) -> tuple[str, ...]:
     """Return the modules of a user that a study names: those of its model, and of kinds that are dotted paths."""
-    model = study.model.modules if isinstance(study, Study) else ()
-    return tuple(dict.fromkeys([*model, *dotted(document(study))]))
+    model = getattr(study, "model", None)
+    of_model = model.modules if isinstance(model, ModelSpec) else ()
+    return tuple(dict.fromkeys([*of_model, *dotted(document(study))]))
 
 
 def digest(study: AnyStudy) -> str | None:

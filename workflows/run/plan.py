@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from forward.fem.locking import Decision
     from forward.specimen import Specimen
     from workflows.config.study import AnyStudy
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import Inversion, InversionStudy
+    from workflows.studies.output_inversion import OutputInversion
     from workflows.studies.selection import Comparison
     from workflows.studies.synthesis import Synthesis
 
@@ -32,10 +33,10 @@ def memory(study: AnyStudy) -> float:
     """
     if isinstance(study, Study):
         return _of_models([study.spec, *study.models.values()])
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.synthesis import Synthesis
 
-    if isinstance(study, Inversion | Synthesis):
+    if isinstance(study, InversionStudy | Synthesis):
         return _of_models([study.model])
     return _of_models([*getattr(study, "specimens", {}).values()])
 
@@ -168,12 +169,16 @@ def _formulation(decision: Decision) -> str:
     return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
 
-def _of_other_kinds(study: Comparison | Inversion | Synthesis) -> list[str]:
-    from workflows.studies.inversion import Inversion
+def _of_other_kinds(study: Comparison | InversionStudy | Synthesis) -> list[str]:
+    from workflows.studies.inversion import Inversion, InversionStudy
+    from workflows.studies.output_inversion import OutputInversion
     from workflows.studies.synthesis import Synthesis
 
     if isinstance(study, Inversion):
         return _inversion(study)
+    if isinstance(study, InversionStudy):
+        assert isinstance(study, OutputInversion)
+        return _inversion_of_outputs(study)
     return _synthesis(study) if isinstance(study, Synthesis) else _comparison(study)
 
 
@@ -213,6 +218,34 @@ def _inversion(study: Inversion) -> list[str]:
         f"time        about {_duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
+
+
+def _inversion_of_outputs(study: OutputInversion) -> list[str]:
+    from workflows.studies.output_inversion import derivable
+
+    spec, sets, method = study.spec, study.data.sets, study.method
+    counts = [len(found.values) for found in study.measurements if found is not None]
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        f"unknown     {len(study.names)}: {', '.join(study.names)}",
+        f"outputs     {', '.join(study.parts)}",
+        f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
+        f"solves      about {study.solves // len(counts):,} for each",
+    ]
+    cost = spec.cost()
+    if cost is None:
+        derivable(study.spec.build(None, study.inputs.names), spec.kind)
+    else:
+        d = len(study.inputs.names)
+        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4)
+        if method.mesh_check:
+            seconds += 8**2 * cost.textbook
+            lines.append(f"mesh check  one solve of about {8 * spec.unknowns:,} unknowns")
+        else:
+            lines.append(f"mesh check  {NOT_ASKED}")
+        lines.append(f"time        about {_duration(seconds)} for each on 1 core (rough)")
+    return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]
 
 
 NOT_ASKED = "not asked for: nothing will be said to be trusted"

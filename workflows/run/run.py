@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import Stability
+from forward.spec import ModelSpec
 from uq.estimators import branch
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder
 from uq.findings import add, findings
@@ -239,10 +240,10 @@ def _report(directory: Path) -> None:
 def _job(study: AnyStudy, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
     if isinstance(study, Study):
         return _sampling(study, ensemble)
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.synthesis import Synthesis
 
-    if isinstance(study, Inversion):
+    if isinstance(study, InversionStudy):
         from workflows.studies import inversion_job
 
         return inversion_job.job(study, ensemble, directory, checkpoint)
@@ -294,8 +295,8 @@ def _identity(study: AnyStudy) -> dict[str, Any]:
     source = own_code.digest(study)
     if source is not None:
         blocks["source"] = source
-    if isinstance(study, Study):
-        blocks["model"] = study.model.identity()
+    if isinstance(model := getattr(study, "model", None), ModelSpec):
+        blocks["model"] = model.identity()
     return blocks
 
 
@@ -506,10 +507,10 @@ def _parameters(study: AnyStudy, label: str) -> tuple[str, ...]:
     """Names of the parameters of a model by the name that its evaluations are kept under."""
     if isinstance(study, Study):
         return study.inputs.names
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.synthesis import Synthesis
 
-    if isinstance(study, Inversion | Synthesis):
+    if isinstance(study, InversionStudy | Synthesis):
         return study.inputs.names
     return tuple(study.candidates[label.partition("/")[0]].parameters)
 

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
     from inverse.criticism.doubts import Doubt
     from uq.inputs.distributions import Distribution
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
 
 NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
 
-def judged(dataset: xr.Dataset, study: Inversion) -> xr.Dataset:
+def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
     """Look for all that makes the posteriors of an inversion doubtful; return the results with verdicts that say so."""
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
@@ -50,7 +50,7 @@ def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
     return words, trust
 
 
-def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
+def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
     """Say what is doubtful of one data set, by its number."""
     from inverse.criticism import doubts as criticism
     from uq.inputs.distributions import Normal
@@ -76,13 +76,15 @@ def doubts_of(one: xr.Dataset, study: Inversion, number: int) -> list[Doubt]:
         found += criticism.too_large_errors(
             *(float(one[f"residual_{n}"]) for n in ("square", "degrees", "probability"))
         )
-    labels = study.measurements[number].observations.data_labels()
+    labels = study.labels(number)
     found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
-    if int(one["points_moved"]):
+    if "points_moved" in one and int(one["points_moved"]):
         count, farthest = int(one["points_moved"]), float(one["largest_move"])
         points = "1 point" if count == 1 else f"{count} points"
         moved = f"{points} outside the body moved to its surface, by up to {farthest:.2g} m"
         found.append(criticism.Doubt("note", moved, ""))
+    if "mesh_checked" not in one:
+        return found
     shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
     nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
     why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]

@@ -30,7 +30,7 @@ def finer_mesh(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
         return None, str(error)
 
 
-def on_finer_mesh(observed: SpecimenModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
+def on_finer_mesh(observed: ForwardModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
     """Return a model of what is observed on a finer mesh; where that cannot be made, its solves fail."""
 
     def solve(point: FloatArray) -> FloatArray:

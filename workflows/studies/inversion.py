@@ -7,7 +7,7 @@ from functools import cached_property
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
@@ -35,12 +35,175 @@ from workflows.studies.measured import DataFiles, DataSet, read_measurement
 
 if TYPE_CHECKING:
     from forward.model import Finding, FloatArray
+    from inverse.data.observations import Components
+    from inverse.methods.record import Data
+    from workflows.studies.measured import Measurement
     from workflows.studies.synthesis import Synthesis
 
 SOLVES_OF_FIELD = 12  # for a mode
 
 
-class Inversion(Settings):
+class InversionStudy(Settings):
+    """What inversions of all kinds of models have in common.
+
+    Parameters
+    ----------
+    model
+        What is measured.
+    parameters
+        Priors by the paths of the numbers of the model that are unknown.
+    correlations
+        Correlations between them.
+    data
+        What was measured.
+    method
+        How it is inverted.
+    parallel
+        Use of ranks.
+    report
+        Sections of one's own in the report.
+    """
+
+    model: Any
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    data: Any
+    method: Invert = Invert()
+    parallel: Parallel = Parallel()
+    report: Report | None = None
+    measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
+
+    quantity: ClassVar[str]  # what was measured
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the same is asked of the same files."""
+        return type(self) is type(other) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def field(self) -> bool:
+        """Whether values of a field at the vertices are what is unknown."""
+        return False
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """The unknown parameters; none for a field of nodal values."""
+        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
+        pairs = tuple((*c.between, c.value) for c in self.correlations)
+        return Inputs(self.parameters | standard, pairs, self.model.materials(self.parameters))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in results."""
+        return names_of(self.inputs, self.method)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the model before anything is solved."""
+        raise NotImplementedError
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts of the data (load cases, outputs) of which it is said what each alone tells."""
+        raise NotImplementedError
+
+    @property
+    def together(self) -> bool:
+        """Whether all groups of ranks work on one data set, point by point."""
+        return len(self.data.sets) == 1 and self.parallel.ranks_per_model == 1
+
+    @property
+    def planned(self) -> int:
+        """Number of evaluations: data sets, or solves where all groups work on one."""
+        return self.solves if self.together else len(self.data.sets) + 1
+
+    @property
+    def solves(self) -> int:
+        """Number of solves of all data sets, roughly: the searches for the modes take as many as they take."""
+        method, field = self.method, self.field
+        each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
+        each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
+        return each * sum(measurement is not None for measurement in self.measurements)
+
+    def measured(self, number: int) -> Data:
+        """Return a data set that can be used."""
+        raise NotImplementedError
+
+    def labels(self, number: int) -> list[str]:
+        """Say of each datum of a data set where it stands."""
+        raise NotImplementedError
+
+    def read(self, path: Path) -> Any:
+        """Read a file of data.
+
+        Raises
+        ------
+        DataError
+            With every kind of mistake in the file.
+        """
+        raise NotImplementedError
+
+    def with_data(self, folder: Path) -> Self:
+        """Return the same with its files read.
+
+        Raises
+        ------
+        StudyError
+            If no file can be used.
+        """
+        if self.data.sets:
+            return self
+        try:
+            paths = files(self.data.files, [folder, Path()])
+        except DataError as error:
+            raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
+        sets, found, lines = [], [], []
+        names = [path.stem for path in paths]
+        for path, stem in zip(paths, names, strict=True):
+            name = stem if names.count(stem) == 1 else path.name
+            try:
+                measurement, wrong = self.read(path), ""
+            except DataError as error:
+                measurement, wrong = None, "; ".join(error.args)
+                lines += [f"data: {line}" for line in error.args]
+            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
+            sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
+            found.append(measurement)
+        if all(measurement is None for measurement in found):
+            raise StudyError(*lines)
+        data = self.data.model_copy(update={"sets": tuple(sets)})
+        return self.model_copy(update={"data": data, "measurements": tuple(found)})
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refused(type(self).__name__, list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        """Find what no inversion can do with."""
+        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
+            if find_spec(package) is None:
+                message = f"needs {package}, which is not installed: pip install {package}"
+                yield ("method", "chains"), message, self.method.chains
+        materials = self.model.materials(self.parameters)
+        constants = () if materials is None else materials.names
+        yield from mistakes_of_parameters(self.model.scalars, self.parameters, constants)
+        yield from mistakes_of_factor(self.method.noise, "method", "noise")
+        for name, value in self.data.truth.items():
+            if name not in self.model.scalars:
+                message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
+                yield ("data", "truth", name), message, value
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            if materials is not None:
+                yield from mistakes_of_materials(inputs, materials)
+
+
+class Inversion(InversionStudy):
     """What to invert.
 
     Parameters
@@ -62,19 +225,9 @@ class Inversion(Settings):
     """
 
     model: Specimen
-    parameters: dict[str, Distribution] = Field(default={})
-    correlations: tuple[Correlation, ...] = ()
     data: DataFiles
-    method: Invert = Invert()
-    parallel: Parallel = Parallel()
-    report: Report | None = None
-    measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
-    def __eq__(self, other: object) -> bool:
-        """Whether the same is asked of the same files."""
-        return isinstance(other, Inversion) and self.model_dump() == other.model_dump()
-
-    __hash__ = None  # type: ignore[assignment]
+    quantity: ClassVar[str] = "displacement"
 
     @cached_property
     def specimen(self) -> Specimen:
@@ -92,78 +245,41 @@ class Inversion(Settings):
         """Whether values of a field at the vertices are what is unknown."""
         return any(field.basis == "nodes" for field in self.model.fields)
 
-    @cached_property
-    def inputs(self) -> Inputs:
-        """The unknown parameters; nothing for a field of nodal values."""
-        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
-        pairs = tuple((*c.between, c.value) for c in self.correlations)
-        return Inputs(self.parameters | standard, pairs, self.model.materials(self.parameters))
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters in results: of a field, its mean."""
         if self.field:
             label = f"fields.{self.model.fields[0].label}.mean"
             return names_of(Inputs({label: Normal(mean=0.0, std=1.0)}), self.method)
-        return names_of(self.inputs, self.method)
+        return super().names
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the load cases."""
+        return tuple(case.name for case in self.model.cases)
 
     @property
     def together(self) -> bool:
         """Whether all groups of ranks work on one data set, point by point."""
-        return len(self.data.sets) == 1 and not self.model.fields and self.parallel.ranks_per_model == 1
+        return super().together and not self.model.fields
 
-    @property
-    def planned(self) -> int:
-        """Number of evaluations: data sets, or solves where all groups work on one."""
-        return self.solves if self.together else len(self.data.sets) + 1
+    def measured(self, number: int) -> Components:
+        """Return a data set that can be used."""
+        found: Components = self.measurements[number].observations.components()
+        return found
 
-    @property
-    def solves(self) -> int:
-        """Number of solves of all data sets, roughly: the searches for the modes take as many as they take."""
-        method, field = self.method, self.field
-        each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
-        each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
-        return each * sum(measurement is not None for measurement in self.measurements)
+    def labels(self, number: int) -> list[str]:
+        """Say of each datum of a data set where it stands."""
+        found: list[str] = self.measurements[number].observations.data_labels()
+        return found
+
+    def read(self, path: Path) -> Measurement:
+        """Read a file of displacements; errors as of every inversion."""
+        return read_measurement(path, self.model, self.data)
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
-
-    def with_data(self, folder: Path) -> Inversion:
-        """Return the same with its files read.
-
-        Raises
-        ------
-        StudyError
-            If no file can be used.
-        """
-        if self.data.sets:
-            return self
-        try:
-            paths = files(self.data.files, [folder, Path()])
-        except DataError as error:
-            raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
-        sets, found, lines = [], [], []
-        names = [path.stem for path in paths]
-        for path, stem in zip(paths, names, strict=True):
-            name = stem if names.count(stem) == 1 else path.name
-            try:
-                measurement, wrong = read_measurement(path, self.model, self.data), ""
-            except DataError as error:
-                measurement, wrong = None, "; ".join(error.args)
-                lines += [f"data: {line}" for line in error.args]
-            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
-            sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
-            found.append(measurement)
-        if all(measurement is None for measurement in found):
-            raise StudyError(*lines)
-        data = self.data.model_copy(update={"sets": tuple(sets)})
-        return self.model_copy(update={"data": data, "measurements": tuple(found)})
-
-    @model_validator(mode="after")
-    def _check(self) -> Inversion:
-        refused("Inversion", list(self._mistakes()))
-        return self
 
     def _mistakes(self) -> Iterator[Mistake]:
         nodal = [i for i, field in enumerate(self.model.fields) if field.basis == "nodes"]
@@ -174,31 +290,15 @@ class Inversion(Settings):
             yield ("model", "fields", nodal[0], "of"), "expected stiffness", self.model.fields[nodal[0]].of
         if nodal and self.method.chains == "emcee":
             yield ("method", "chains"), "expected 'pcn', the chains for fields", "emcee"
-        for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
-            if find_spec(package) is None:
-                message = f"needs {package}, which is not installed: pip install {package}"
-                yield ("method", "chains"), message, self.method.chains
         if nodal and self.method.noise is not None and self.data.errors.kind != "normal":
             message = "the size of such errors is not inferred with a field, expected { kind = 'normal' } or no noise"
             yield ("data", "errors"), message, self.data.errors.kind
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
-        materials = self.model.materials(self.parameters)
-        yield from mistakes_of_parameters(self.model.scalars, self.parameters, materials.names)
-        yield from mistakes_of_factor(self.method.noise, "method", "noise")
-        for name, value in self.data.truth.items():
-            if name not in self.model.scalars:
-                message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
-                yield ("data", "truth", name), message, value
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            yield from mistakes_of_materials(inputs, materials)
+        yield from super()._mistakes()
 
 
-def made(blocks: Mapping[str, Any], folder: Path) -> Inversion | Synthesis:
+def made(blocks: Mapping[str, Any], folder: Path) -> InversionStudy | Synthesis:
     """Check the blocks of a study of one of these kinds; data files are beside the study, in a folder.
 
     Raises
@@ -212,4 +312,10 @@ def made(blocks: Mapping[str, Any], folder: Path) -> Inversion | Synthesis:
         from workflows.studies.synthesis import Synthesis
 
         return Synthesis.model_validate(blocks)
+    model = blocks.get("model")
+    body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
+    if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
+        from workflows.studies.output_inversion import OutputInversion
+
+        return OutputInversion.model_validate(blocks).with_data(folder)
     return Inversion.model_validate(blocks).with_data(folder)

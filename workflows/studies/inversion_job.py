@@ -4,60 +4,126 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from forward.model import SolveError
-from inverse.criticism.finer import Finer
-from inverse.methods.invert_few import invert_by_all, invert_by_group
+from forward.model import FloatArray, ForwardModel, SolveError
+from forward.settings import one_line
+from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
+from uq.evaluation.turns import Progress
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_mesh, on_finer_mesh, solved_by
-from workflows.studies.inversion_results import BATCH, Rows, batch_table, dataset, groups
+from workflows.studies.inversion import Inversion, InversionStudy
+from workflows.studies.inversion_results import BATCH, Rows, Vertices, batch_table, dataset, groups
 from workflows.studies.job import MethodJob, TasksJob
+from workflows.studies.output_inversion import OutputInversion, derivable
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
     from forward.fem.finer import FinerMesh
-    from forward.model import FloatArray, ForwardModel
     from forward.specimen import SpecimenModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.tasks import Outcome
-    from workflows.studies.inversion import Inversion
+    from uq.evaluation.kept import KeptEvaluate, KeptModel
+
+UNCHECKED = "method.mesh_check = false"
+Outputs = Callable[[FloatArray], FloatArray]  # parameters (d,) → outputs (m,)
 
 
-def job(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
-    """Make the specimen; collective over the group."""
-    return _one(study, ensemble) if study.together else _many(study, ensemble, directory, checkpoint)
+def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
+    """Make the model; collective over the group."""
+    if isinstance(study, OutputInversion):
+        made: _Made = _Outputs.of(study, ensemble)
+    else:
+        assert isinstance(study, Inversion)
+        made = _Specimen.of(study, ensemble)
+    derivable(made.model, study.model.kind)
+    return _one(study, made) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
 
-@dataclass(frozen=True)
-class _Specimen:
-    """What inversions of a specimen need of it; making it is collective over the group.
+class _Made(Protocol):
+    """A model that is measured, as inversions need it.
 
     Attributes
     ----------
     model
-        The specimen.
+        The model.
     vertices
-        Places (N, 3) of its vertices, cells, and VTK's number of their kind.
+        Places (N, 3) of the vertices of a specimen, cells, and VTK's number of their kind; None of other models.
     look
-        Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices.
-    mesh
-        The specimen on a finer mesh, or `why` there is none.
+        Parameters (n, d) → ln of the stiffness factor (n, N) at the vertices, of a specimen.
     """
 
+    @property
+    def model(self) -> ForwardModel: ...
+    @property
+    def vertices(self) -> Vertices | None: ...
+    @property
+    def look(self) -> Look | None: ...
+
+    def observing(self, number: int) -> ForwardModel:
+        """Return the model that a data set, by its number, is compared with.
+
+        Raises
+        ------
+        SolveError
+            If there is none.
+        """
+
+    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
+        """Return outputs on a finer mesh, or why they are not known; None where the model has no mesh."""
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """A model with outputs."""
+
+    study: OutputInversion
+    model: ForwardModel
+    fine: Callable[[], ForwardModel]
+    vertices: None = None
+    look: None = None
+
+    @classmethod
+    def of(cls, study: OutputInversion, ensemble: Ensemble) -> _Outputs:
+        names = study.inputs.names
+        fine = cache(lambda: study.spec.refined(1).build(ensemble.group, names))
+        return cls(study, study.spec.build(ensemble.group, names), fine)
+
+    def observing(self, number: int) -> ForwardModel:
+        """Return the model: which of its outputs were measured is known with the data."""
+        return self.model
+
+    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
+        """Return outputs of the same model on the mesh whose cells are halved."""
+        if not self.study.spec.meshed:
+            return None
+        if not self.study.method.mesh_check:
+            return None, UNCHECKED
+        try:
+            self.study.spec.refined(1)
+        except ValueError as error:  # a mesh that is not divided, or would be too large
+            return None, one_line(str(error))
+        return lambda point: np.asarray(self.fine().solve(point).outputs), ""
+
+
+@dataclass(frozen=True)
+class _Specimen:
+    """A specimen; making it is collective. `mesh` is the same on a finer mesh, or `why` there is none."""
+
+    study: Inversion
     model: SpecimenModel
-    vertices: tuple[FloatArray, NDArray[np.int64], int]
-    look: Callable[[FloatArray], FloatArray]
+    vertices: Vertices
+    look: Look
     mesh: FinerMesh | None
     why: str
 
@@ -69,42 +135,44 @@ class _Specimen:
         def look(points: FloatArray) -> FloatArray:
             return study.stiffness(vertices[0], points) + model.log_fields(points)
 
-        mesh, why = finer_mesh(model) if study.method.mesh_check else (None, "method.mesh_check = false")
-        return cls(model, vertices, look, mesh, why)
+        mesh, why = finer_mesh(model) if study.method.mesh_check else (None, UNCHECKED)
+        return cls(study, model, vertices, look, mesh, why)
+
+    def observing(self, number: int) -> SpecimenModel:
+        """Return the model of the displacements of a data set; errors as of every model."""
+        data = self.study.measured(number)
+        try:
+            return self.model.observing(data.places, data.axes, data.cases)  # type: ignore[arg-type]
+        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
+            raise SolveError(str(error)) from None
+
+    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str]:
+        """Return what is observed on a finer mesh."""
+        return None if self.mesh is None else partial(self.mesh.outputs, cast("SpecimenModel", observed)), self.why
 
 
-def _many(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
+def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
-    from inverse.fields.field_posterior import FieldPosterior
-    from inverse.methods.invert_field import Vertices, invert_field
-    from uq.evaluation.kept import KeptEvaluate, KeptModel
-
     method, errors = study.method, study.data.errors
-    specimen = _Specimen.of(study, ensemble)
-    model, vertices = specimen.model, specimen.vertices
-    prior = study.model.fields[0].prior(study.model.body) if study.field else None
     names = [one.name for one in study.data.sets]
-    rows = Rows(study, vertices, lambda text: write_text(directory / BATCH, text))
+    rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
+    invert_field = _inverting_field(study, made) if study.field else None
 
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
-        data = study.measurements[number].observations.components()
-        try:
-            observed = model.observing(data.places, data.axes, data.cases)
-        except ValueError as error:  # a place that is far from the mesh: the other data sets go on
-            raise SolveError(str(error)) from None
-        finer = Finer(None if specimen.mesh is None else partial(specimen.mesh.outputs, observed), specimen.why)
-        if prior is None:
-            kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
-            solving.append(kept)
-            return invert_by_group(study.inputs, observed, data, method, specimen.look, errors, finer, kept)
-        states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
-        solving.append(states)
-        posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
-        offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
-        return invert_field(posterior, data, method, Vertices(offset, prior.matern.mass), finer)
+        observed = made.observing(number)
+        there = made.finer(observed)
+        finer = None if there is None else Finer(*there)
+        if invert_field is not None:
+            states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
+            solving.append(states)
+            return invert_field(number, states, finer or NOT_LOOKED, ensemble.count)
+        kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
+        solving.append(kept)
+        data = study.measured(number)
+        return invert_by_group(study.inputs, observed, data, method, made.look, errors, finer, kept)
 
     def forget() -> None:
         """Remove the solves of a data set: what follows from them is kept."""
@@ -114,7 +182,7 @@ def _many(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Che
     def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
         if all(one.dataset is None for one in outcomes):
             raise SolveError("; ".join(f"{name}: {one.reason}" for name, one in zip(names, outcomes, strict=True)))
-        return dataset(study, outcomes, vertices)
+        return dataset(study, outcomes, made.vertices)
 
     return TasksJob(
         names,
@@ -128,22 +196,39 @@ def _many(study: Inversion, ensemble: Ensemble, directory: Path, checkpoint: Che
     )
 
 
-def _one(study: Inversion, ensemble: Ensemble) -> MethodJob:
+def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, ForwardModel, Finer, Progress], xr.Dataset]:
+    """Return what inverts a data set, by its number, for a field of a specimen."""
+    from inverse.fields.field_posterior import FieldPosterior
+    from inverse.methods.invert_field import Vertices, invert_field
+
+    assert isinstance(made, _Specimen)
+    model, prior = made.model, study.model.fields[0].prior(study.model.body)
+    offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
+
+    def invert(number: int, states: ForwardModel, finer: Finer, progress: Progress) -> xr.Dataset:
+        data = study.measured(number)
+        posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=progress, errors=study.data.errors)
+        return invert_field(posterior, data, study.method, Vertices(offset, prior.matern.mass), finer)
+
+    return invert
+
+
+def _one(study: InversionStudy, made: _Made) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
-    specimen = _Specimen.of(study, ensemble)
-    data = study.measurements[0].observations.components()
-    observed = specimen.model.observing(data.places, data.axes, data.cases)
+    observed, data = made.observing(0), study.measured(0)
+    there = made.finer(observed)
+    outputs, why = (None, "") if there is None else there
     recorders: dict[str, Recorder] = {}
     others: dict[str, Callable[[], ForwardModel]] = {}
-    if specimen.mesh is not None:
-        others = {FINER: partial(on_finer_mesh, observed, partial(specimen.mesh.outputs, observed))}
+    if outputs is not None:
+        others = {FINER: partial(on_finer_mesh, observed, outputs)}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        finer = solved_by(recorders["/"].on(FINER)) if others else Finer(None, specimen.why)
+        finer = solved_by(recorders["/"].on(FINER)) if others else None if there is None else Finer(None, why)
         errors = study.data.errors
-        found = invert_by_all(study.inputs, recorders["/"], data, study.method, specimen.look, errors, finer)
-        return dataset(study, [Outcome(found, "", None, 0.0)], specimen.vertices)
+        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer)
+        return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(
         observed,

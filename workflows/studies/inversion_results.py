@@ -9,25 +9,28 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.bodies.inclusions import derived, log_factor
+from forward.model import FloatArray
 from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.record import COLUMNS, ENDS, stacked, usual_sizes
 from workflows.studies.findings_inversion import judged
+from workflows.studies.inversion import Inversion
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import FloatArray
     from uq.evaluation.tasks import Outcome
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
     from workflows.studies.measured import Measurement
 
 BATCH = "batch.csv"
 PRIOR_DRAWS = 1024
+Vertices = tuple[FloatArray, NDArray[np.int64], int]
 
 
-def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Any) -> xr.Dataset:
+def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
     """Put what inversions of all data sets have left into a dataset, with what is known beside it.
 
     Parameters
@@ -37,46 +40,59 @@ def dataset(study: Inversion, outcomes: Sequence[Outcome], vertices: Any) -> xr.
     outcomes
         Of the inversions.
     vertices
-        Places (N, 3) of the vertices, cells (n_cells, k), and VTK's number of their kind.
+        Places (N, 3) of the vertices of a specimen, cells (n_cells, k), and VTK's number of their kind; None of other
+        models.
     """
     import xarray as xr
 
     each = [one.dataset for one in outcomes]
-    places, cells, kind = vertices
-    record = stacked(each, usual_sizes(study.method, field=study.field))
+    record = stacked(each, usual_sizes(study.method, field=study.field) | {"case": len(study.parts)})
     held: dict[str, Any] = dict(record)
     held["why"] = (
         "data_set",
         [one.reason if one.dataset is None else str(one.dataset["why"].item()) for one in outcomes],
     )
-    held["mesh_why"] = ("data_set", ["" if one is None else str(one["mesh_why"].item()) for one in each])
+    if "mesh_checked" in held:
+        held["mesh_why"] = ("data_set", ["" if one is None else str(one["mesh_why"].item()) for one in each])
     held["ok"] = ("data_set", [one is not None for one in each])
     found = list(study.measurements)
     count = len(found)
-    held["points_moved"] = ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found])
-    held["largest_move"] = ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found])
-    mean, std, stiffness_std = prior_moments(study, places)
+    mean, std = prior_moments(study)
     held["prior_mean"], held["prior_std"] = ("parameter", mean), ("parameter", std)
-    held["stiffness_prior_std"] = ("node", stiffness_std)
     true = np.full((count, len(study.names)), np.nan)
     for k, m in enumerate(found):
         for name, value in ({} if m is None else m.truth).items():
             if name in study.names:
                 true[k, study.names.index(name)] = value
     held["true"] = (("data_set", "parameter"), true)
-    held |= _volumes(study, {name: values for name, (_, values) in record.items()}, found)
-    held["stiffness_true"] = (("data_set", "node"), np.array([_true_at(study, m, places) for m in found]))
-    held["node_position"] = (("node", "axis"), places)
-    held["cell_nodes"] = (("cell", "corner"), cells, {"vtk_cell_type": kind})
+    if vertices is not None:
+        assert isinstance(study, Inversion)
+        held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices)
     coordinates = {
         "data_set": [item.name for item in study.data.sets],
         "parameter": list(study.names),
         "partner": list(study.names),
-        "case": [case.name for case in study.model.cases],
+        "case": list(study.parts),
         "axis": ["x", "y", "z"],
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
-    return xr.Dataset(held, coordinates)
+    # Displacements of a specimen are what is meant where nothing is said.
+    return xr.Dataset(held, coordinates, {} if vertices is not None else {"quantity": study.quantity})
+
+
+def _of_specimen(study: Inversion, record: Mapping[str, FloatArray], vertices: Vertices) -> dict[str, Any]:
+    """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
+    places, cells, kind = vertices
+    found = list(study.measurements)
+    return {
+        "points_moved": ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found]),
+        "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found]),
+        "stiffness_prior_std": ("node", prior_stiffness_std(study, places)),
+        **_volumes(study, record, found),
+        "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
+        "node_position": (("node", "axis"), places),
+        "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
+    }
 
 
 def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
@@ -108,8 +124,8 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
     }
 
 
-def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean and standard deviation (c,) of the parameters before the data, and that of ln stiffness (N,) at places."""
+def prior_moments(study: InversionStudy) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (c,) of the parameters before the data."""
     if study.field:
         field = study.model.fields[0]
         prior = field.prior(study.model.body)
@@ -117,17 +133,22 @@ def prior_moments(study: Inversion, places: FloatArray) -> tuple[FloatArray, Flo
         g = volumes / volumes.sum()
         width = float(np.linalg.norm(prior.root_transposed(g)))
         moments = [(float(np.log(field.mean) - field.log_std**2 / 2), width)]
-        stiffness_std = np.sqrt(prior.variance)
     else:
         moments = list(zip(study.inputs.mean, study.inputs.std, strict=True))
-        stiffness_std = study.stiffness(places, prior_draws(study)).std(axis=0)
     if study.method.noise is not None:
         moments.append(study.method.noise.moments)
     mean, std = np.array(moments).T
-    return mean, std, stiffness_std
+    return mean, std
 
 
-def prior_draws(study: Inversion) -> FloatArray:
+def prior_stiffness_std(study: Inversion, places: FloatArray) -> FloatArray:
+    """Return the standard deviation (N,) of ln stiffness at places (N, 3) before the data."""
+    if study.field:
+        return np.asarray(np.sqrt(study.model.fields[0].prior(study.model.body).variance))
+    return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
+
+
+def prior_draws(study: InversionStudy) -> FloatArray:
     """Draws (n, d) of the parameters before the data."""
     rng = np.random.default_rng(study.method.seed)
     kept = np.zeros((0, len(study.inputs.names)))
@@ -218,7 +239,14 @@ def _row(one: xr.Dataset) -> list[Any]:
     shown = [f"{float(value):.8g}" if np.isfinite(float(value)) else "" for value in values]
     count = int(np.isfinite(one["measured"]).sum())
     ok = "yes" if bool(one["ok"]) else "no"
-    return [str(one.data_set.item()), ok, count, int(one["points_moved"]), *shown, str(one["why"].item())]
+    return [
+        str(one.data_set.item()),
+        ok,
+        count,
+        int(one["points_moved"]) if "points_moved" in one else 0,
+        *shown,
+        str(one["why"].item()),
+    ]
 
 
 class Rows:
@@ -234,16 +262,16 @@ class Rows:
         Writes the table.
     """
 
-    def __init__(self, study: Inversion, vertices: Any, write: Callable[[str], None]) -> None:
+    def __init__(self, study: InversionStudy, vertices: Vertices | None, write: Callable[[str], None]) -> None:
         self._study, self._vertices, self._write = study, vertices, write
         self._rows: dict[int, list[Any]] = {}
-        self._head = _head(study.names, [case.name for case in study.model.cases])
+        self._head = _head(study.names, study.parts)
 
     def add(self, number: int, outcome: Outcome) -> None:
         """Add a finished data set."""
         sets, measurement = self._study.data.sets[number], self._study.measurements[number]
         if outcome.dataset is None:
-            moved = 0 if measurement is None else int((measurement.moved > 0).sum())
+            moved = int((getattr(measurement, "moved", np.zeros(0)) > 0).sum())
             empty = [""] * (len(self._head) - 5)
             self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason]
         else:
@@ -254,7 +282,7 @@ class Rows:
         self._write(_table([self._head, *(self._rows[number] for number in sorted(self._rows))]))
 
 
-def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
+def groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
     import xarray as xr
 
@@ -273,7 +301,7 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
         return xr.DataArray(values.to_numpy().reshape(shape), here, dims)
 
     left: dict[str, xr.Dataset] = {}
-    observed = {"displacement": of_set["measured"]}
+    observed = {study.quantity: of_set["measured"]}
     left["observed_data"] = xr.Dataset(observed).drop_vars("parameter", errors="ignore")
     if study.field:
         left["posterior"] = xr.Dataset({"stiffness": draws("stiffness_draw")})
@@ -287,11 +315,10 @@ def groups(study: Inversion, found: xr.Dataset) -> dict[str, xr.Dataset]:
         columns[NOISE] = (("chain", "draw"), study.method.noise.from_normal(z)[0][None])
     left["prior"] = xr.Dataset(columns)
     dense = draws("draw_log_likelihood")
-    left["log_likelihood"] = xr.Dataset({"displacement": dense})
+    left["log_likelihood"] = xr.Dataset({study.quantity: dense})
     seen = np.isfinite(found["measured"].to_numpy())
-    if (
-        len(seen) > 1 and not seen.all()
-    ):  # of different numbers of data: one variable of each, without what is filled up
+    # Of different numbers of data: one variable of each, without what is filled up.
+    if len(seen) > 1 and not seen.all():
         parts = {
             str(name): dense.sel(data_set=name, drop=True)[..., here].rename(datum=f"datum_{name}")
             for name, here in zip(found.data_set.values, seen, strict=True)

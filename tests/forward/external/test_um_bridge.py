@@ -17,6 +17,7 @@ import jsonschema
 import numpy as np
 import pytest
 import umbridge
+import xarray as xr
 from scipy.optimize import minimize
 
 from forward.conformance import check_derivatives
@@ -25,6 +26,7 @@ from forward.model import ModelError, SolveError
 from tests.launch import ROOT, TISSUQ, environment
 from uq.evaluation.evaluate import SerialEvaluate
 from workflows.config.study import load, parse
+from workflows.run.run import run
 from workflows.serve import RefusalError, Service
 
 POINT = [750.0, 2e5]
@@ -397,6 +399,28 @@ def test_a_study_of_the_server_gives_the_moments_of_the_study_served(beam):
     ]
     for name in ("mean", "std", "mean_error"):
         np.testing.assert_allclose(results[1][name], results[0][name], rtol=1e-6)
+
+
+@pytest.mark.fem
+def test_outputs_measured_at_a_server_are_inverted(beam, tmp_path):
+    """The most probable parameters explain what was measured; there is no mesh to look at."""
+    truth = np.array([780.0, 3.1e5])
+    model = um_bridge(beam).build(None, ("density", "D1"))
+    measured = dict(zip(model.outputs, model.solve(truth).outputs.tolist(), strict=True))
+    blocks = {
+        "model": um_bridge(beam).model_dump(exclude_none=True) | {"outputs": ["uy_max", "ux_max"]},
+        "parameters": {
+            "density": {"kind": "normal", "mean": 750.0, "std": 50.0},
+            "D1": {"kind": "log-normal", "mean": 3e5, "std": 3e4},
+        },
+        "data": {"outputs": measured, "noise": {"relative": 1e-3}},
+        "method": {"kind": "invert", "samples": 32, "starts": 1, "draws": 50},
+    }
+    assert run(parse(blocks), "server", tmp_path / "out", quiet=True) in (0, 3)
+    one = xr.load_dataset(tmp_path / "out" / "results.nc", engine="h5netcdf").isel(data_set=0)
+    np.testing.assert_allclose(one["predicted"], one["measured"], rtol=1e-3)
+    assert (np.abs(one["mode"] - truth) < 3 * one["std"]).all()
+    assert "mesh_checked" not in one
 
 
 @contextmanager

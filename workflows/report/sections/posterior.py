@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,27 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import InversionStudy
 
 DIRECTIONS = 10  # of few parameters that a table lists
 SMALL = 1e-3  # volume (m³) that is rather written in cm³
 DRAWN = 8  # data sets that have more than a row of the table
+
+
+class Words(NamedTuple):
+    """What data are of: a part of them, several parts, and data themselves."""
+
+    part: str
+    several: str
+    data: str
+
+
+DISPLACEMENTS = Words("load case", "load cases", "components of displacements")
+OUTPUTS = Words("output", "outputs", "values of outputs")
+
+
+def _words(one: xr.Dataset) -> Words:
+    return OUTPUTS if one.attrs.get("quantity") == "output" else DISPLACEMENTS
 
 
 class Posterior(Section):
@@ -38,6 +54,8 @@ class Posterior(Section):
             yield from verdict(results, one)
             yield Pairs([*amounts(one, one.sizes["direction"])])
             yield posterior(one)
+            if _words(one) is OUTPUTS:
+                yield measurements(one)
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before)])
             names = [str(name) for name in one.parameter.values if name != "noise"]
             alone = [[_shown(of["alone_std"].sel(parameter=name), 2) for name in names] for of in each_case(one)]
@@ -72,9 +90,8 @@ def amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, list[str]]]
 
 
 def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
-    yield "data", f"{int(np.isfinite(one['measured']).sum()):,} components of displacements"
-    moved = int(one["points_moved"])
-    if moved:
+    yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {_words(one).data}"
+    if "points_moved" in one and (moved := int(one["points_moved"])):
         yield (
             "outside the body",
             f"{moved} points, up to {number(float(one['largest_move']), 2)} m, moved to its surface",
@@ -149,10 +166,10 @@ def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator
     together = ["all together", f"{int(one['misfit_count'].sum()):,}"]
     together += [f"{_shown(one['misfit'].sum())} of {_shown(one['misfit_degrees'].sum())}"]
     together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3), *widths[-1]]
-    yield Heading("Load cases", level=3)
+    yield Heading(_words(one).several.capitalize(), level=3)
     yield Text("What each of them alone would have said, with the model linearised at the mode.")
     yield Table(
-        ["load case", "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together]
+        [_words(one).part, "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together]
     )
 
 
@@ -188,7 +205,7 @@ def _estimate(of: Any) -> str:
     return with_error(float(of["mean"]), float(of["std"]))
 
 
-def prior_densities(study: Inversion) -> dict[str, plots.Density]:
+def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
     """Curves (values, density) of the priors by the names of the parameters."""
     known = dict(study.inputs.marginals)
     if study.method.noise is not None:
@@ -203,25 +220,43 @@ def prior_densities(study: Inversion) -> dict[str, plots.Density]:
     return curves
 
 
+def measurements(one: xr.Dataset) -> Table:
+    """What was measured of each output, and what the most probable parameters predict."""
+    rows = []
+    for k in np.flatnonzero(np.isfinite(one["measured"].to_numpy())):
+        of = one.isel(datum=k)
+        pairs = (("measured", "sigma"), ("predicted", "predicted_std"))
+        shown = [with_error(float(of[value]), float(of[error])) for value, error in pairs]
+        rows.append((str(one.case.values[int(of["datum_case"])]), *shown, _shown(of["residual"], 3)))
+    return Table(("output", "measured", "predicted", "residual over its error"), rows)
+
+
+def of_spectrum(one: xr.Dataset) -> tuple[Axes, str]:
+    """Draw the spectrum of the data."""
+    words = f"λ of all {_words(one).several} together and of each alone; above 1 the data say more than the prior."
+    return plots.spectrum(one), words
+
+
 def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
     """Draw the stiffness, if it is not the same everywhere, and the spectrum of the data."""
     if float(one["stiffness_prior_std"].max()) > 0:
         drawn = ", ".join(plots.panels(one))
         yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {drawn}."
-    yield (
-        plots.spectrum(one),
-        "λ of all load cases together and of each alone; above 1 the data say more than the prior.",
-    )
+    yield of_spectrum(one)
 
 
 def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
     """Draw the misfits of the load cases."""
-    return plots.misfits(one), "|r|² of each load case, and what is expected: mean and two standard deviations."
+    words = f"|r|² of each {_words(one).part}, and what is expected: mean and two standard deviations."
+    return plots.misfits(one), words
 
 
 def pictures(one: xr.Dataset, before: dict[str, plots.Density]) -> Iterator[tuple[Axes, str]]:
     """Draw what was found for one data set, each with what it shows."""
-    yield from on_a_plane(one, plots.Cut.of(one))
+    if _words(one) is OUTPUTS:
+        yield of_spectrum(one)
+    else:
+        yield from on_a_plane(one, plots.Cut.of(one))
     yield (
         plots.marginals(one, before),
         "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",

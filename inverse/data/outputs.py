@@ -1,0 +1,189 @@
+"""Measured outputs of a model: a table with a row for each measurement, or numbers by name.
+
+A table of comma-separated values has the columns `output` and `value`, in the unit of the output, and may have `sigma`,
+the standard deviation of the error. An output may be measured several times. Lines that begin with # say where the
+data are from; ``# truth.PATH = number`` says what a number of the model really was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from forward.settings import nearest
+from inverse.data.neighbours import Neighbours, neighbours
+from inverse.data.observations import TRUTH, DataError, read_table
+
+COLUMNS = ("output", "value", "sigma")
+
+
+@dataclass(frozen=True, eq=False)
+class OutputData:
+    """Measured outputs of a model, each a part of the data of its own.
+
+    Attributes
+    ----------
+    names
+        Outputs (m,) that were measured; one may be there several times.
+    values, sigma
+        What was measured (m,), and the standard deviations (m,) of the errors, NaN where they are not known.
+    labels
+        Where each (m,) stands.
+    source
+        Where they are from, line by line.
+    truth
+        Numbers of the model, by path.
+    outputs
+        All outputs of the model, in its order.
+    parts
+        Those of which there are data in any data set of a study, in the order of the model.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    sigma: FloatArray
+    labels: tuple[str, ...]
+    source: tuple[str, ...] = ()
+    truth: Mapping[str, float] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
+
+    def of(self, outputs: Sequence[str], parts: Sequence[str]) -> OutputData:
+        """Return the same as data of a model with these outputs."""
+        return replace(self, outputs=tuple(outputs), parts=tuple(parts))
+
+    @property
+    def which(self) -> tuple[int, ...]:
+        """Numbers (m,) of the outputs of the model."""
+        return tuple(self.outputs.index(name) for name in self.names)
+
+    @property
+    def cases(self) -> NDArray[np.int64]:
+        """Numbers (m,) of the parts."""
+        return np.array([self.parts.index(name) for name in self.names], dtype=np.int64)
+
+    @property
+    def described(self) -> dict[str, FloatArray]:
+        """Nothing else: the parts are the outputs."""
+        return {}
+
+    def neighbours(self) -> Neighbours:
+        """Return pairs of repeated measurements."""
+        return neighbours(np.zeros((len(self.names), 1)), self.cases)
+
+    def with_sigma(self, given: Mapping[str, float], relative: float, absolute: float) -> OutputData:
+        """Return the same with the standard deviations of errors where they are not known.
+
+        Parameters
+        ----------
+        given
+            By output.
+        relative, absolute
+            For other outputs, σ = max(relative |y|, absolute).
+
+        Raises
+        ------
+        DataError
+            If one is still not known.
+        """
+        general = np.maximum(relative * np.abs(self.values), absolute)
+        general = np.array([given.get(name, one) for name, one in zip(self.names, general, strict=True)])
+        sigma = np.where(np.isnan(self.sigma), general, self.sigma)
+        lost = [label for label, one in zip(self.labels, sigma, strict=True) if not one > 0]
+        if lost:
+            more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+            raise DataError(
+                f"{lost[0]}: the standard deviation of the error is not known{more}, expected a column sigma, "
+                "data.sigma of this output, or data.noise that does not vanish there"
+            )
+        return replace(self, sigma=sigma)
+
+    def with_truth(self, truth: Mapping[str, float]) -> OutputData:
+        """Return the same with numbers of the model that are known beside the data."""
+        return replace(self, truth={**self.truth, **truth})
+
+    def data_labels(self) -> list[str]:
+        """Say of each datum where it stands, and which output it is of."""
+        return [f"{label}, {name}" for label, name in zip(self.labels, self.names, strict=True)]
+
+
+def read_outputs(path: Path, outputs: Sequence[str]) -> OutputData:
+    """Read a table of measured outputs.
+
+    Parameters
+    ----------
+    path
+        The table.
+    outputs
+        Names of the outputs of the model.
+
+    Raises
+    ------
+    DataError
+        With every kind of mistake in the file.
+    """
+    table = read_table(path)
+    name = path.name
+    wrong = [
+        f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}"
+        for column in table.columns
+        if column not in COLUMNS
+    ]
+    wrong += [
+        f"{name}: no column '{column}', expected output, value" for column in COLUMNS[:2] if column not in table.columns
+    ]
+    if wrong:
+        raise DataError(*wrong)
+    names = tuple(row["output"] for row in table.rows)
+    labels = tuple(f"{name}: line {line}" for line in table.lines)
+    numbers = {
+        column: [_number(row[column]) for row in table.rows] for column in COLUMNS[1:] if column in table.columns
+    }
+    for label, one in zip(labels, names, strict=True):
+        if one not in outputs:
+            wrong.append(f"{label}: the model has no output '{one}'; {nearest(one, tuple(outputs))}")
+    for column, values in numbers.items():
+        empty = column == "sigma"
+        for label, value, row in zip(labels, values, table.rows, strict=True):
+            fits = math.isfinite(value) and (value > 0 or column == "value")
+            if not fits and not (empty and not row[column]):
+                expected = "a number" if column == "value" else "a number more than 0"
+                wrong.append(f"{label}: {column} is {row[column]!r}, expected {expected}")
+    truth = {}
+    for line in (line for line in table.remarks if line.startswith(TRUTH)):
+        path_of, _, text = line.removeprefix(TRUTH).partition("=")
+        value = _number(text.strip())
+        if not math.isfinite(value):
+            wrong.append(f"{name}: truth.{path_of.strip()} is {text.strip()!r}, expected a number")
+        truth[path_of.strip()] = value
+    if wrong:
+        raise DataError(*wrong)
+    source = tuple(line for line in table.remarks if not line.startswith(TRUTH))
+    sigma = np.array(numbers.get("sigma", [math.nan] * len(names)))
+    return OutputData(names, np.array(numbers["value"]), sigma, labels, source, truth)
+
+
+def stated(values: Mapping[str, float | Sequence[float]]) -> OutputData:
+    """Return measured outputs that a study states by name, one or several of each."""
+    pairs = [
+        (name, float(value))
+        for name, given in values.items()
+        for value in (given if isinstance(given, Sequence) else (given,))
+    ]
+    names = tuple(name for name, _ in pairs)
+    labels = tuple(f"data.outputs.{name}" for name in names)
+    return OutputData(names, np.array([value for _, value in pairs]), np.full(len(pairs), math.nan), labels)
+
+
+def _number(text: str) -> float:
+    """A number; NaN where a text is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

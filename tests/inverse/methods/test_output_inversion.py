@@ -1,0 +1,259 @@
+"""Inversion of measured outputs: linear models by closed forms, files and batches, bodies, servers, mistakes."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from mpi4py import MPI
+
+from inverse.data.observations import DataError
+from inverse.data.outputs import read_outputs, stated
+from tests.launch import run_script
+from workflows.__main__ import main
+from workflows.config.study import StudyError, document, load, parse
+from workflows.run.plan import plan
+
+A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
+MEAN, STD = np.array([1.0, -1.0]), np.array([0.5, 2.0])
+LINES = """
+import numpy as np
+
+A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
+
+
+def linear(p):
+    return A @ p
+
+
+def slopes(p):
+    return A
+"""
+STUDY = """
+[model]
+kind = "python"
+function = "lines_MODULE.linear"
+jacobian = "lines_MODULE.slopes"
+parameters = { a = 1.0, b = -1.0 }
+outputs = [{ name = "u", unit = "m" }, "v", "w"]
+
+[parameters]
+a = { kind = "normal", mean = 1.0, std = 0.5 }
+b = { kind = "normal", mean = -1.0, std = 2.0 }
+
+[data]
+outputs = { u = 0.4, w = [3.1, 2.9] }
+noise = { absolute = 0.2, relative = 0.1 }
+sigma = { u = 0.05 }
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+draws = 50
+"""
+TABLE = "# by hand\n# truth.a = 1.1\noutput,value,sigma\nu,0.4,0.05\nw,3.1,\nw,2.9,0.2\n"
+
+
+def exactly(rows, values, sigma):
+    """Mode, covariance and ln Z of the linear model with independent normal priors and errors."""
+    B = A[rows]
+    precision = np.diag(STD**-2.0) + (B / sigma[:, None] ** 2).T @ B
+    covariance = np.linalg.inv(precision)
+    mode = covariance @ (B.T @ (values / sigma**2) + MEAN / STD**2)
+    S = np.diag(sigma**2) + (B * STD**2) @ B.T
+    gap = values - B @ MEAN
+    log_evidence = -(gap @ np.linalg.solve(S, gap) + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
+    return mode, covariance, log_evidence
+
+
+VALUES, SIGMA = np.array([0.4, 3.1, 2.9]), np.array([0.05, 0.31, 0.29])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Studies of a linear model, whose module has a name of its own: it stays imported in this process."""
+    place = tmp_path_factory.mktemp("outputs")
+    (place / "lines_shared.py").write_text(LINES)
+    (place / "stated.toml").write_text(STUDY.replace("MODULE", "shared"))
+    (place / "data").mkdir()
+    for name, scale in (("one", 1.0), ("two", 1.1)):
+        (place / "data" / f"{name}.csv").write_text(TABLE.replace("0.4,", f"{0.4 * scale},"))
+    (place / "data" / "wrong.csv").write_text("output,value\nux,1\n")
+    return place
+
+
+def results(out):
+    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+
+
+def ran(study, out, *changes):
+    """Run a study in this process, without its words."""
+    sets = [word for change in changes for word in ("--set", change)]
+    return main(["run", str(study), "--out", str(out), "--quiet", *sets])
+
+
+def test_a_linear_model_has_its_exact_posterior(folder):
+    """Mode, standard deviations and evidence; the residuals, repeated measurements among them; nothing of meshes."""
+    assert ran(folder / "stated.toml", folder / "stated") == 0
+    one = results(folder / "stated").isel(data_set=0)
+    mode, covariance, log_evidence = exactly([0, 2, 2], VALUES, SIGMA)
+    np.testing.assert_allclose(one["mode"], mode, rtol=1e-8)
+    np.testing.assert_allclose(one["together_std"], np.sqrt(np.diag(covariance)), rtol=1e-8)
+    np.testing.assert_allclose(one["log_evidence"], log_evidence, rtol=1e-9)
+    np.testing.assert_allclose(one["sigma"], SIGMA)
+    np.testing.assert_allclose(one["residual"], (A[[0, 2, 2]] @ mode - VALUES) / SIGMA, rtol=1e-7)
+    assert [str(name) for name in one["case"].values] == ["u", "w"]
+    np.testing.assert_allclose(one["alone_std"][0], np.sqrt(np.diag(exactly([0], VALUES[:1], SIGMA[:1])[1])), rtol=1e-8)
+    assert not {"mesh_checked", "place", "stiffness_mode", "cell_nodes"} & set(one.data_vars)
+    assert np.isfinite(one["agreement_probability"])  # of the repeated ones
+    summary = json.loads((folder / "stated" / "summary.json").read_text())
+    assert set(summary["posterior"]) == {"a", "b"}
+    assert "can be trusted" in summary["verdict"]
+    page = (folder / "stated" / "report.html").read_text()
+    assert "values of outputs" in page
+    assert "predicted" in page
+    assert "oad case" not in page
+
+
+def test_tables_are_data_sets_side_by_side(folder):
+    """The same numbers as stated in the study; one that cannot be read does not stop the others."""
+    files = "data={files='data', noise={relative=0.1}}"
+    assert ran(folder / "stated.toml", folder / "batch", files) == 3
+    found = results(folder / "batch")
+    assert found["ok"].to_numpy().tolist() == [True, True, False]
+    assert "the model has no output 'ux'" in str(found["why"].values[2])
+    sigma = np.array([0.05, 0.31, 0.2])
+    mode, _, log_evidence = exactly([0, 2, 2], VALUES, sigma)
+    np.testing.assert_allclose(found["mode"][0], mode, rtol=1e-8)
+    np.testing.assert_allclose(found["log_evidence"][0], log_evidence, rtol=1e-9)
+    assert found["true"].sel(parameter="a").to_numpy()[:2].tolist() == [1.1, 1.1]
+    table = (folder / "batch" / "batch.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
+    assert "All data sets" in (folder / "batch" / "report.html").read_text()
+
+
+@pytest.mark.mpi
+def test_groups_of_ranks_give_the_same_bytes(folder):
+    for name, changes in (("stated", ()), ("batch", ("--set", "data={files='data', noise={relative=0.1}}"))):
+        out = folder / f"{name}-shared"
+        done = run_script(2, SCRIPT, "run", folder / "stated.toml", "--out", out, "--quiet", *changes)
+        assert done.returncode in (0, 3), done.stderr
+        one, other = (results(place) for place in (folder / name, out))
+        xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())
+
+
+SCRIPT = "import sys\nfrom workflows.__main__ import main\nsys.exit(main(sys.argv[1:]))"
+
+
+BAR = """
+[model]
+body = { size = [1.0, 1.0, 1.0], cells = [2, 1, 1], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e4, lmbda = 4e4 }
+clamp = ["x-min"]
+loads = [{ kind = "traction", on = "x-max", direction = [1, 0, 0], size = 900 }]
+outputs = [
+    { name = "uy", kind = "max-displacement", component = "y" },
+    { name = "ux", kind = "max-displacement", component = "x" },
+]
+
+[parameters]
+"material.mu" = { kind = "log-normal", mean = 1e4, std = 3e3 }
+
+[data]
+outputs = { ux = 0.03 }
+noise = { relative = 0.01 }
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+draws = 50
+"""
+
+
+def test_outputs_of_a_body(tmp_path):
+    """What is predicted at the mode is what was measured; the finer mesh is looked at."""
+    (tmp_path / "bar.toml").write_text(BAR)
+    study = load(tmp_path / "bar.toml")
+    assert any("mesh check  one solve" in line for line in plan(study))
+    assert ran(tmp_path / "bar.toml", tmp_path / "out") in (0, 3)
+    one = results(tmp_path / "out").isel(data_set=0)
+    assert one["predicted"].item() == pytest.approx(0.03, rel=2e-3)
+    assert one["predicted_std"].item() == pytest.approx(3e-4, rel=0.1)
+    assert bool(one["mesh_checked"])
+    model = study.spec.build(MPI.COMM_SELF, ("material.mu",))
+    finer = study.spec.refined(1).build(MPI.COMM_SELF, ("material.mu",))
+    mode = one["mode"].to_numpy()
+    error = (finer.solve(mode).outputs - model.solve(mode).outputs)[1] / one["sigma"].item()
+    assert one["mesh_error"].item() == pytest.approx(error, rel=1e-5)
+
+
+def test_studies_are_written_down(folder, capsys):
+    study = load(folder / "stated.toml")
+    assert parse(document(study)) == study
+    assert main(["check", str(folder / "stated.toml")]) == 0
+    assert "unknown     2: a, b" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("u = 0.4", "ux = 0.4", "data.outputs.ux: not an output of the model; did you mean 'u'?"),
+        ("sigma = { u", "sigma = { q", "data.sigma.q: not an output of the model"),
+        ("outputs = { u = 0.4, w = [3.1, 2.9] }", "", "data: expected either files or outputs"),
+        (
+            "noise = { absolute = 0.2, relative = 0.1 }",
+            "",
+            "data.outputs.w: the standard deviation of the error is not",
+        ),
+        ("w = [3.1", "w = ['x'", "data.outputs.w"),
+        ('a = { kind = "normal"', 'q = { kind = "normal"', "parameters: not a number of the model"),
+        ("[method]", "[parallel]\nranks_per_model = 2\n[method]", "is not shared by ranks, expected 1"),
+    ],
+)
+def test_mistakes_have_their_places(folder, old, new, told):
+    (folder / "bad.toml").write_text((folder / "stated.toml").read_text().replace(old, new))
+    with pytest.raises(StudyError) as error:
+        load(folder / "bad.toml")
+    assert told in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_model_without_derivatives_is_refused(folder, capsys):
+    """By `check` and by a run, in one line."""
+    text = (folder / "stated.toml").read_text()
+    (folder / "plain.toml").write_text("\n".join(line for line in text.splitlines() if "jacobian" not in line))
+    for arguments in (
+        ["check", str(folder / "plain.toml")],
+        ["run", str(folder / "plain.toml"), "--out", str(folder / "plain")],
+    ):
+        assert main(arguments) in (1, 2)
+        assert "has no derivatives, without which the most probable parameters are not found" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("output,value\n", "t.csv: no rows"),
+        ("output,val\nu,1\n", "unknown column 'val'; did you mean 'value'?"),
+        ("value\n1\n", "no column 'output'"),
+        ("output,value\nuu,1\n", "line 2: the model has no output 'uu'; did you mean 'u'?"),
+        ("output,value\nu,nan\n", "line 2: value is 'nan', expected a number"),
+        ("output,value,sigma\nu,1,0\n", "line 2: sigma is '0', expected a number more than 0"),
+        ("# truth.a = big\noutput,value\nu,1\n", "truth.a is 'big', expected a number"),
+    ],
+)
+def test_tables_with_mistakes(tmp_path, text, told):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(DataError) as error:
+        read_outputs(tmp_path / "t.csv", ("u", "v"))
+    assert told in " ".join(error.value.args)
+
+
+def test_errors_of_data():
+    """By table, by output, and in general; relative errors of zero need another."""
+    found = stated({"u": 2.0, "v": (0.0, 1.0)})
+    np.testing.assert_allclose(found.with_sigma({"u": 0.5}, 0.1, 0.2).sigma, [0.5, 0.2, 0.2])
+    with pytest.raises(DataError, match=r"data.outputs.v: the standard deviation .* not known, expected"):
+        found.with_sigma({"u": 0.5}, 0.1, 0.0)

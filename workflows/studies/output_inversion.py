@@ -1,0 +1,211 @@
+"""Studies that invert measured outputs: of a body, of a Python function, of a model behind a server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from forward.model import ForwardModel, ModelError
+from forward.registry import OfKind
+from forward.scalars import Mistake
+from forward.settings import Settings, nearest
+from forward.spec import MODELS, ModelSpec
+from inverse.data.errors import NORMAL, Errors
+from inverse.data.observations import DataError
+from inverse.data.outputs import OutputData, read_outputs, stated
+from workflows.config.priors import findings_of_materials
+from workflows.config.study import StudyError, ranges
+from workflows.studies.inversion import InversionStudy
+from workflows.studies.measured import DataSet
+
+if TYPE_CHECKING:
+    from forward.model import Finding
+
+STATED = "outputs"  # name of the data set that stands in the study itself
+Positive = Annotated[float, Field(gt=0)]
+
+
+class OutputNoise(Settings):
+    """Errors of measured outputs: normal, of standard deviation max(relative |value|, absolute).
+
+    Parameters
+    ----------
+    relative
+        In proportion to the value.
+    absolute
+        In the unit of the output.
+    """
+
+    relative: Annotated[float, Field(ge=0)] = 0.0
+    absolute: Annotated[float, Field(ge=0)] = 0.0
+
+
+class MeasuredOutputs(Settings):
+    """Measured outputs of the model, in tables or in the study itself.
+
+    Parameters
+    ----------
+    files
+        Tables with the columns output, value and, where it is known, sigma: names of files, folders, or patterns such
+        as ``data/*.csv``, beside the study or else in the working directory. Each file is a data set, which is inverted
+        by itself.
+    outputs
+        In place of files: what was measured, by output: a number, or a list of repeated measurements.
+    sigma
+        Standard deviations of the errors by output, where a table does not say.
+    noise
+        Errors of the other outputs: { relative = 0.05 }, { absolute = 1e-4 } or both.
+    errors
+        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } where a few data may be far off.
+    truth
+        By path: the numbers that the data were made of, where these are known.
+    sets
+        What the files were when the study ran; written by the run.
+    """
+
+    files: tuple[str, ...] = ()
+    outputs: dict[str, float | Annotated[tuple[float, ...], Field(min_length=1)]] = Field(default={})
+    sigma: dict[str, Positive] = Field(default={})
+    noise: OutputNoise = OutputNoise()
+    errors: Errors = NORMAL
+    truth: dict[str, float] = Field(default={})
+    sets: tuple[DataSet, ...] = ()
+
+    @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
+    @classmethod
+    def _one_alone(cls, given: Any) -> Any:
+        return (given,) if isinstance(given, str) else given
+
+    @model_validator(mode="after")
+    def _check(self) -> MeasuredOutputs:
+        if bool(self.files) == bool(self.outputs):
+            message = "expected either files or outputs"
+            raise ValueError(message)
+        return self
+
+
+class OutputInversion(InversionStudy):
+    """What to invert.
+
+    Parameters
+    ----------
+    model
+        A model with outputs, of which some were measured.
+    parameters
+        Priors by the paths of the numbers of the model that are unknown.
+    correlations
+        Correlations between them.
+    data
+        What was measured.
+    method
+        How it is inverted.
+    parallel
+        Use of ranks.
+    report
+        Sections of one's own in the report.
+    """
+
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
+    data: MeasuredOutputs
+
+    quantity: ClassVar[str] = "output"
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        return self.model.over(ranges(self.parameters))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the model before anything is solved."""
+        return (*self.model.findings_over(ranges(self.parameters)), *findings_of_materials(self.inputs))
+
+    @property
+    def meshes(self) -> tuple[ModelSpec, ...]:
+        """The model: there are no others."""
+        return (self.spec,)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs of the model."""
+        return tuple(output.name for output in self.model.outputs)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Outputs of which there are data, in the order of the model."""
+        return next((found.parts for found in self.measurements if found is not None), ())
+
+    def measured(self, number: int) -> OutputData:
+        """Return a data set that can be used."""
+        found: OutputData = self.measurements[number]
+        return found
+
+    def labels(self, number: int) -> list[str]:
+        """Say of each datum of a data set where it stands."""
+        return self.measured(number).data_labels()
+
+    def read(self, path: Path) -> OutputData:
+        """Read a table of outputs; errors as of every inversion."""
+        return self._with_errors(read_outputs(path, self.outputs))
+
+    def _with_errors(self, found: OutputData) -> OutputData:
+        noise = self.data.noise
+        return found.with_sigma(self.data.sigma, noise.relative, noise.absolute).with_truth(self.data.truth)
+
+    def with_data(self, folder: Path) -> Self:
+        """Return the same with its data read; errors as of every inversion."""
+        if self.data.sets:
+            return self
+        if self.data.files:
+            read = super().with_data(folder)
+        else:
+            try:
+                found = self._with_errors(stated(self.data.outputs))
+            except DataError as error:
+                raise StudyError(*(f"data: {line}" for line in error.args)) from None
+            data = self.data.model_copy(update={"sets": (DataSet(name=STATED, file=""),)})
+            read = self.model_copy(update={"data": data, "measurements": (found,)})
+        seen = {name for one in read.measurements if one is not None for name in one.names}
+        parts = tuple(name for name in self.outputs if name in seen)
+        of_model = tuple(None if one is None else one.of(self.outputs, parts) for one in read.measurements)
+        return read.model_copy(update={"measurements": of_model})
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        if self.model.kind == "specimen":
+            yield ("model", "kind"), "a specimen has no outputs, but displacements that are measured", self.model.kind
+            return
+        for i, field in enumerate(getattr(self.spec, "fields", ())):
+            if field.basis == "nodes":
+                message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
+            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        if not self.parameters and not self.model.coefficients:
+            yield ("parameters",), "nothing is unknown, expected at least one prior", {}
+        for block, names in (("outputs", self.data.outputs), ("sigma", self.data.sigma)):
+            for name in names:
+                if name not in self.outputs:
+                    message = f"not an output of the model; {nearest(name, self.outputs)}"
+                    yield ("data", block, name), message, name
+        yield from super()._mistakes()
+
+
+def derivable(model: ForwardModel, kind: str) -> None:
+    """Refuse a model without derivatives.
+
+    Raises
+    ------
+    ModelError
+        If it has none.
+    """
+    if not model.differentiable:
+        message = (
+            f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "
+            "found: expected a jacobian of the Python function, or a server that has ApplyJacobian or Gradient"
+        )
+        raise ModelError(message)
