@@ -19,9 +19,9 @@ from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
 from forward.fem.model import HyperelasticModel
+from forward.fem.reference import ReferenceFactor
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.reference import ReferenceFactor
 from forward.solvers.stability import NOT_SCREENED, Screened
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, Uniform
@@ -195,7 +195,6 @@ def dense_inertia(model: HyperelasticModel, state: FloatArray, point: FloatArray
     from scipy.sparse import csr_matrix
 
     body = model.body
-    model._visited = model._factorised = None
     body.set_parameters(point)
     body.at_load(1.0)
     body.set_state(state)

@@ -315,13 +315,12 @@ def inspect(
     check.set_parameters(point)
     check.at_load(1.0)
     residual = check.residual(solution.state)
-    other._visited = None  # the state that is set is not one of its own solutions
     body = model.linearise(solution)
     correction = body.norm(body.back_substitute(-residual.vector)) / body.norm(solution.state)
     seen = replace(
         row,
         smallest_jacobian=body.smallest_jacobian(solution.state),
-        negative=body.negative_pivots(),
+        negative=body.inertia(),
         condition=condition(body),
         residual=residual.relative,
         correction=correction,
@@ -332,7 +331,7 @@ def inspect(
 
 def negatives(model: HyperelasticModel, solution: FiniteElementSolution) -> int:
     """Number of negative eigenvalues of the stiffness."""
-    return model.linearise(solution).negative_pivots()
+    return model.linearise(solution).inertia()
 
 
 def condition(body: Any, iterations: int = 15) -> float:

@@ -25,11 +25,13 @@ from forward.fem import ranks
 from forward.fem.cost import factor
 from forward.fem.dolfinx import assembly, compile, linear, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
+from forward.fem.latest import Latest
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
 from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.materials.energies import MATERIALS
 from forward.model import FloatArray, SolveError, Work
+from forward.solvers.linear import LinearSolver
 from forward.solvers.newton import Residual
 from forward.terms.term import Place, Term
 
@@ -52,6 +54,7 @@ class Discretisation:
         self.comm = comm
         self.parameters = parameters
         self.work = Work()
+        self.latest = Latest()
         self.mesh, self.facets = meshes.mesh_body(comm, spec.body)
         self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
         self.size = self.unknowns.size
@@ -93,13 +96,11 @@ class Discretisation:
         self._residual = self.vector(imbalance)
         self._prescribe()
         trial = ufl.TrialFunction(self.unknowns.whole)
-        self._stiffness = self._matrix(self.derivative(imbalance, trial))
-        self._solver = self.new_solver()
-        self._factorised_at = np.zeros(self.size)
+        self._stiffness = self._bilinear(self.derivative(imbalance, trial))
+        self._matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
+        self._solver: LinearSolver = linear.DirectSolver(self._matrix)
         self._jacobians = self.at_points(self.J)
         self._external = 0.0
-        self._rounding: float | None = None
-        self._given: FloatArray | None = None  # parameters that are set
         self._stretch = self._small_stretch()
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
@@ -208,7 +209,7 @@ class Discretisation:
         points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
         return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
 
-    def _matrix(self, form: Any) -> Any:
+    def _bilinear(self, form: Any) -> Any:
         return compile.compile_form(self._invariants.inserted(form), self.comm)
 
     def _virtual_works(self) -> list[Any]:
@@ -330,13 +331,13 @@ class Discretisation:
         self._load.value = kept
         return forces
 
-    def new_solver(self) -> linear.DirectSolver:
-        """Return a matrix and a solver of their own for the stiffness."""
-        return self._new_solver(self._stiffness, symmetric=self.symmetric)
+    def new_solver(self) -> LinearSolver:
+        """Return a solver for the stiffness, with a matrix of its own."""
+        return linear.DirectSolver(self._new_matrix(self._stiffness, symmetric=self.symmetric))
 
-    def _new_solver(self, form: Any, *, symmetric: bool) -> linear.DirectSolver:
+    def _new_matrix(self, form: Any, *, symmetric: bool) -> linear.StiffnessMatrix:
         expected = factor(self.spec.body, mixed=self.spec.mixed)
-        return linear.DirectSolver(
+        return linear.StiffnessMatrix(
             form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
         )
 
@@ -370,10 +371,11 @@ class Discretisation:
 
     def set_parameters(self, parameters: FloatArray) -> None:
         """Give the parameters (d,) their values."""
-        self._rounding = None
-        if self._given is not None and np.array_equal(parameters, self._given):
+        self.latest.rounding = None
+        if self.latest.parameters is not None and np.array_equal(parameters, self.latest.parameters):
             return
-        self._given = np.array(parameters, dtype=float)
+        self.latest.parameters = np.array(parameters, dtype=float)
+        self.latest.moved()
         self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
         for path, constant in self._constants.items():
             constant.value = self._values[path]
@@ -388,10 +390,6 @@ class Discretisation:
         self._external = self.norm(external)
         for field in self.fields:  # the size of the loads is that without fluctuations
             field.set(parameters)
-
-    def forget_parameters(self) -> None:
-        """Set the parameters anew next time, whatever they are."""
-        self._given = None
 
     def _small_stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
@@ -434,6 +432,7 @@ class Discretisation:
 
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
+        self.latest.moved()
         self.unknowns.give(self._state, u)
 
     def state(self) -> FloatArray:
@@ -456,6 +455,7 @@ class Discretisation:
 
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
+        self.latest.moved()
         self._load.value = fraction
         self._targets = fraction * self._full_targets
 
@@ -539,13 +539,15 @@ class Discretisation:
         return min(left, 1e-4 * scale) if self._external > 0 else left
 
     def _rounding_without_loads(self) -> float:
-        if self._rounding is None:
+        if self.latest.rounding is None:
             load = self._load.value.copy()
             self._load.value = 0.0
             few = 4 if self.p is None else 16
-            self._rounding = few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
+            self.latest.rounding = (
+                few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
+            )
             self._load.value = load
-        return self._rounding
+        return self.latest.rounding
 
     def on_target(self, u: FloatArray) -> FloatArray:
         """Return u (U_local,) with the prescribed unknowns at their targets."""
@@ -558,8 +560,9 @@ class Discretisation:
         self.set_state(u)
         self.work.assemblies += 1
         self.work.factorisations += 1
+        self.latest.factorised = None  # a factorisation that fails leaves no factor
         self._solver.factorise()
-        self._factorised_at = u
+        self.latest.factorised_at = u
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right; rows of prescribed unknowns give their values."""
@@ -568,7 +571,8 @@ class Discretisation:
             if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
                 w = np.zeros_like(right)
                 w[self.fixed] = known
-                self.set_state(self._factorised_at)
+                assert self.latest.factorised_at is not None
+                self.set_state(self.latest.factorised_at)
                 right = right - self.stiffness_times(w)
                 right[self.fixed] = known
         return self.back_substitute(right)
@@ -620,11 +624,12 @@ class Discretisation:
 
     def assembled_stiffness(self) -> Any:
         """The stiffness at the state that is set, for `products`; the factor of `factorise` is lost."""
-        return self._solver.assembled()
+        self.latest.factorised = None
+        return self._matrix.assembled()
 
     def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
         """Products (k, U_local) of such a matrix with rows (k, U_local)."""
-        return self._solver.products(matrix, rows)
+        return self._matrix.products(matrix, rows)
 
     @cached_property
     def _symmetric_stiffness(self) -> Any:
@@ -637,29 +642,29 @@ class Discretisation:
         of_rest, of_followers = (
             self.derivative(work, trial) for work in (rest, sum(work for load, work in works if not load.symmetric))
         )
-        return self._matrix(of_rest + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
+        return self._bilinear(of_rest + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
 
-    def new_symmetric_solver(self) -> linear.DirectSolver:
-        """Return a matrix and a solver of their own for the symmetric part of the stiffness."""
-        return self._new_solver(self._symmetric_stiffness, symmetric=True)
+    def new_symmetric_solver(self) -> LinearSolver:
+        """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""
+        return linear.DirectSolver(self._new_matrix(self._symmetric_stiffness, symmetric=True))
 
     @cached_property
-    def _symmetric_part(self) -> linear.DirectSolver:
+    def _symmetric_part(self) -> LinearSolver:
         return self.new_symmetric_solver()
 
-    def negative_eigenvalues(self, u: FloatArray) -> int:
+    def negative_eigenvalues(self, u: FloatArray) -> int | None:
         """Factorise at u (U_local,); return the number of negative eigenvalues, of the symmetric part under pressures.
 
         Those of the condensed stiffness: in the mixed form each pressure adds one, which does not count.
         """
         if self.symmetric:
             self.factorise(u)
-            return self.negative_pivots()
+            return self.inertia()
         self.set_state(u)
         self.work.assemblies += 1
         self.work.factorisations += 1
         self._symmetric_part.factorise()
-        return self._symmetric_part.negative_pivots() - self.unknowns.pressures
+        return self._condensed(self._symmetric_part.negative_eigenvalues())
 
     @cached_property
     def free_displacements(self) -> FloatArray:
@@ -682,10 +687,12 @@ class Discretisation:
         products[:, self.fixed] = 0
         return products
 
-    def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; −1 if unknown."""
-        found = self._solver.negative_pivots()
-        return found - self.unknowns.pressures if found >= 0 else found
+    def inertia(self) -> int | None:
+        """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; None if unknown."""
+        return self._condensed(self._solver.negative_eigenvalues())
+
+    def _condensed(self, negative: int | None) -> int | None:
+        return None if negative is None else negative - self.unknowns.pressures
 
     # --- derivatives with respect to the parameters ------------------------------------------------------------------
 

@@ -13,12 +13,13 @@ import numpy as np
 
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
+from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, Reference, SolveError, Stability, Work
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.newton import Found, Residual, solve
-from forward.solvers.reference import ReferenceFactor, turn
+from forward.solvers.rotations import turn
 from forward.solvers.stability import NOT_SCREENED, Screened, draw
 
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
@@ -56,11 +57,9 @@ class HyperelasticModel(OneByOne):
         self._materials = spec.materials(parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
         self.body = Discretisation(spec, comm, parameters)
-        self.space = BodySpace(self.body, self._leave)
+        self.space = BodySpace(self.body)
         self.differentiable = True
         self._functionals = [functional(output, self.body) for output in spec.outputs]
-        self._visited: object = None  # the solution whose state is set
-        self._factorised: object = None  # the solution that owns the factor at hand
 
     @cached_property
     def reference(self) -> ReferenceFactor:
@@ -80,7 +79,7 @@ class HyperelasticModel(OneByOne):
             With the load fraction where the solver stopped, the reason, and the history of its iterations.
         """
         body = self.body
-        self._visited = self._factorised = None
+        body.latest.begin()
         for path, value in zip(self.parameters, parameters, strict=True):
             scalar = self._scalars.get(path)
             if scalar is not None:
@@ -107,34 +106,29 @@ class HyperelasticModel(OneByOne):
         # Where Newton had to take over, the reference is too far away for the derivatives too.
         solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
         if found.stability >= Stability.COUNTED and body.symmetric:
-            self._factorised = solution
+            body.latest.factorised = solution
         return solution
-
-    def _leave(self) -> None:
-        """Forget what is set: another changes it."""
-        self._visited = None
-        self.body.forget_parameters()
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
         """Set parameters and state to those of a solution, if they are not."""
-        if self._visited is not solution:
-            self.body.set_parameters(solution.parameters)
-            self.body.at_load(1.0)
-            self.body.set_state(solution.state)
-            self._visited = solution
-        self.body.work = solution.work
-        return self.body
+        body = self.body
+        if body.latest.solution is not solution:
+            body.set_parameters(solution.parameters)
+            body.at_load(1.0)
+            body.set_state(solution.state)
+            body.latest.solution = solution
+        body.work = solution.work
+        return body
 
     def linearise(self, solution: FiniteElementSolution) -> Discretisation:
         """Factorise the stiffness at a solution, if the factor at hand is another's."""
         body = self.visit(solution)
-        if self._factorised is not solution:
-            self._factorised = None  # a factorisation that fails leaves no factor
+        if body.latest.factorised is not solution:
             body.factorise(solution.state)
-            self._factorised = solution
+            body.latest.factorised = solution
             if solution.stability == Stability.SCREENED and body.symmetric:
-                negative = body.negative_pivots()
-                if negative > 0:
+                negative = body.inertia()
+                if negative is not None and negative > 0:
                     message = (
                         f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
                         "derivative has shown: the body buckles, or its mesh is too coarse"
@@ -145,11 +139,10 @@ class HyperelasticModel(OneByOne):
 
     def has_factor(self, solution: FiniteElementSolution) -> bool:
         """Whether the factor at hand is that of a solution."""
-        return self._factorised is solution
+        return self.body.latest.factorised is solution
 
     def take_reference(self, reference: Reference) -> ReferenceFactor:
         """Return the factor of a reference; this may change parameters and state."""
-        self._visited = None
         self.reference.prepare(reference)
         return self.reference
 

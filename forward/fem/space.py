@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import tolerance
 from forward.bodies.mesh_file import OwnMesh
 from forward.fem.dolfinx import meshes, spaces
+from forward.fem.equations import Discretisation
 from forward.model import FloatArray
-
-if TYPE_CHECKING:
-    from forward.fem.equations import Discretisation
 
 
 class BodySpace:
-    """The `NodalSpace` of a body.
+    """The `NodalSpace` of a body."""
 
-    Parameters
-    ----------
-    body
-        The body.
-    leave
-        Called before the parameters of the body are changed.
-    """
-
-    def __init__(self, body: Discretisation, leave: Callable[[], None]) -> None:
+    def __init__(self, body: Discretisation) -> None:
         self._body = body
         self._layout = body.layout
-        self._leave = leave
         self.coordinates = body.layout.coordinates
         self.displacements = body.layout.coordinates.size
         self.cells, self.gather, self.scatter = body.layout.cells, body.layout.gather, body.layout.scatter
@@ -76,7 +62,7 @@ class BodySpace:
         the vertices.
         """
         body = self._body
-        self._leave()
+        body.latest.forget_parameters()
         space = spaces.scalar_space(body.mesh, degree or body.spec.body.degree)
         found = {field.field.label: field.factors(points, space) for field in body.fields}
         return {label: factors for label, factors in found.items() if factors is not None}

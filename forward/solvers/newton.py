@@ -162,13 +162,13 @@ class System(Protocol):
     def smallest_jacobian(self, u: FloatArray) -> float:
         """Smallest J = det F over the quadrature points of all ranks."""
 
-    def negative_pivots(self) -> int:
-        """Number of negative eigenvalues of the factorised stiffness of displacements; −1 if unknown.
+    def inertia(self) -> int | None:
+        """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
 
         A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
         """
 
-    def negative_eigenvalues(self, u: FloatArray) -> int:
+    def negative_eigenvalues(self, u: FloatArray) -> int | None:
         """Factorise the stiffness at u; return the same of it, or of its symmetric part where it is not symmetric.
 
         Raises
@@ -568,6 +568,8 @@ def _accepted(
         negative = system.negative_eigenvalues(u)
     except SolveError as error:
         raise _Diverged(error.reason) from None
+    if negative is None:
+        return Stability.NOT_TESTED
     if negative > 0:
         raise _Unstable(negative, missed=seen.clear)
     return Stability.COUNTED
@@ -597,8 +599,8 @@ def _admissible_step(
 
 
 def _instability(system: System) -> str:
-    negative = system.negative_pivots()
-    if negative <= 0:
+    negative = system.inertia()
+    if negative is None or negative <= 0:
         return ""
     return f"; the last stiffness has {_counted(negative)} (unstable, or far from equilibrium)"
 

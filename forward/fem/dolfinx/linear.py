@@ -1,4 +1,4 @@
-"""Linear solvers of assembled stiffness matrices."""
+"""Stiffness matrices and what solves with them (`forward.solvers.linear`)."""
 
 from __future__ import annotations
 
@@ -21,18 +21,15 @@ TOO_LITTLE_ROOM = {-8, -9, -14, -15, -17, -20}  # more than was estimated is nee
 TOO_LITTLE_MEMORY = {-5, -7, -11, -13, -18, -19, -22}
 
 
-class DirectSolver:
-    """A stiffness matrix and its factorisation by MUMPS: LDLᵀ where the matrix is symmetric, else LU.
-
-    One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
-    communicator is created in a loop.
+class StiffnessMatrix:
+    """A bilinear form as a matrix, in which rows and columns of prescribed unknowns are those of the identity.
 
     Parameters
     ----------
     form
         Compiled bilinear form.
     constraints
-        Prescribed unknowns; their rows and columns become those of the identity.
+        Prescribed unknowns.
     unknowns
         Knows the order of vectors.
     comm
@@ -40,7 +37,12 @@ class DirectSolver:
     symmetric
         Whether the form is.
     expected
-        What the factor is expected to be.
+        What its factor is expected to be.
+
+    Attributes
+    ----------
+    matrix
+        PETSc's matrix.
 
     Raises
     ------
@@ -58,20 +60,53 @@ class DirectSolver:
         symmetric: bool,
         expected: Factor,
     ) -> None:
-        self._expected = expected
         require(2 * BYTES_PER_NONZERO * expected.nonzeros / comm.size + SPARE, "the stiffness matrix")
+        self.unknowns, self.comm, self.symmetric, self.expected = unknowns, comm, symmetric, expected
         self._form = form
-        self._unknowns = unknowns
         self._constraints = constraints
-        self._matrix = fem.petsc.create_matrix(form)
-        self._symmetric = symmetric
+        self.matrix = fem.petsc.create_matrix(form)
         if symmetric:
-            self._matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def assemble(self) -> None:
+        """Assemble at the state that is set."""
+        self.matrix.zeroEntries()
+        fem.petsc.assemble_matrix(self.matrix, self._form, bcs=self._constraints)
+        self.matrix.assemble()
+
+    def assembled(self) -> Any:
+        """Assemble; return a copy of PETSc's matrix, for `products`."""
+        self.assemble()
+        return self.matrix.copy()
+
+    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
+        """Return the products (k, n) of such a copy with rows (k, n)."""
+        x, y = matrix.createVecs()
+        found = np.empty_like(rows)
+        for row, product in zip(rows, found, strict=True):
+            x.array[:] = self.unknowns.reorder(row)
+            matrix.mult(x, y)
+            product[:] = self.unknowns.take(y.array_r)
+        x.destroy()
+        y.destroy()
+        return found
+
+
+class DirectSolver:
+    """A `LinearSolver` that factorises a stiffness matrix by MUMPS: LDLᵀ where it is symmetric, else LU.
+
+    One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
+    communicator is created in a loop. Another that assembles the matrix takes the factor away.
+    """
+
+    def __init__(self, stiffness: StiffnessMatrix) -> None:
+        self._stiffness = stiffness
+        self._unknowns, self._symmetric = stiffness.unknowns, stiffness.symmetric
         self._room = ROOM
-        self._analysed = False
-        self._ksp = self._new_ksp(comm)
-        self._right = self._matrix.createVecLeft()
-        self._solution = self._matrix.createVecRight()
+        self._analysed = self._factorised = False
+        self._ksp = self._new_ksp(stiffness.comm)
+        self._right = stiffness.matrix.createVecLeft()
+        self._solution = stiffness.matrix.createVecRight()
 
     def factorise(self) -> None:
         """Assemble and factorise.
@@ -83,16 +118,17 @@ class DirectSolver:
         StopError
             If there is no memory for the factor.
         """
-        unknowns, ranks = self._matrix.getSize()[0], self._ksp.comm.size
+        unknowns, ranks = self._stiffness.matrix.getSize()[0], self._ksp.comm.size
         if not self._analysed:  # the analysis crashes where it finds no memory
-            hopeless = HOPELESS * self._expected.bytes / ranks + SPARE
+            hopeless = HOPELESS * self._stiffness.expected.bytes / ranks + SPARE
             require(hopeless, f"the factor of the stiffness of {unknowns:,} unknowns")
-        self._assemble()
+        self._stiffness.assemble()
         while (status := self._try()) in TOO_LITTLE_ROOM and self._room < MOST_ROOM:
             self._room *= 4
             self._renew()
         self._analysed = True
-        if status >= 0:
+        self._factorised = status >= 0
+        if self._factorised:
             return
         if status == SINGULAR:
             message = "the stiffness is singular"
@@ -116,42 +152,22 @@ class DirectSolver:
 
     def _new_ksp(self, comm: Any) -> Any:
         ksp = PETSc.KSP().create(comm)
-        ksp.setOperators(self._matrix)
+        ksp.setOperators(self._stiffness.matrix)
         ksp.setType("preonly")
         ksp.pc.setType("cholesky" if self._symmetric else "lu")
         ksp.pc.setFactorSolverType("mumps")
         ksp.pc.setFactorSetUpSolverType()
         ksp.pc.getFactorMatrix().setMumpsIcntl(14, self._room)
-        if (
-            self._symmetric
-        ):  # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots
+        if self._symmetric:
+            # ScaLAPACK, to which MUMPS leaves the last front on several ranks, counts no negative pivots.
             ksp.pc.getFactorMatrix().setMumpsIcntl(13, 1)
         return ksp
 
     def _renew(self) -> None:
         """Begin with a new factor, which is analysed again."""
         self._ksp.destroy()
-        self._ksp = self._new_ksp(self._matrix.comm)
+        self._ksp = self._new_ksp(self._stiffness.comm)
         self._analysed = False
-
-    def _assemble(self) -> None:
-        self._matrix.zeroEntries()
-        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
-        self._matrix.assemble()
-
-    def assembled(self) -> Any:
-        """Assemble; return a copy of the matrix, for `products`. The factor at hand is that of another matrix then."""
-        self._assemble()
-        return self._matrix.copy()
-
-    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
-        """Return the products (k, n) of such a matrix with rows (k, n)."""
-        found = np.empty_like(rows)
-        for row, product in zip(rows, found, strict=True):
-            self._right.array[:] = self._unknowns.reorder(row)
-            matrix.mult(self._right, self._solution)
-            product[:] = self._unknowns.take(self._solution.array_r)
-        return found
 
     def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
@@ -175,8 +191,14 @@ class DirectSolver:
         solutions.destroy()
         return result
 
-    def negative_pivots(self) -> int:
-        """Number of negative pivots of LDLᵀ, that is of negative eigenvalues; −1 where it is not known."""
+    def negative_eigenvalues(self) -> int | None:
+        """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues; None for LU."""
         if not self._symmetric:
-            return -1
+            return None
         return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))
+
+    def memory(self) -> int:
+        """Return the bytes of the last factor with its working memory on all ranks, to whole megabytes; 0 before."""
+        if not self._factorised:
+            return 0
+        return 10**6 * int(self._ksp.pc.getFactorMatrix().getMumpsInfog(22))

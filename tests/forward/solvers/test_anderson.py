@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forward.solvers.anderson import AndersonMixing, block_galerkin
-from forward.solvers.reference import rotations, turned
+from forward.solvers.rotations import rotations, turned
 
 pytestmark = pytest.mark.unit
 

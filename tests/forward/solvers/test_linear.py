@@ -1,0 +1,112 @@
+"""Linear solvers against dense algebra, and in each other's place."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from forward.fem.dolfinx import linear
+from forward.hyperelastic import Hyperelastic
+from forward.model import Stability
+from tests.bodies import loaded_body
+
+pytestmark = pytest.mark.fem
+
+
+def cantilever(**changes):
+    """A block that bends a little: its stiffness is symmetric."""
+    blocks = {
+        "formulation": "displacement",
+        "body": {"size": (0.1, 0.02, 0.02), "cells": (3, 1, 1), "cell": "hexahedron"},
+        "material": {"kind": "neo-hookean", "C1": 5e3, "D1": 5e4},
+        "clamp": ("x-min",),
+        "loads": ({"kind": "traction", "on": "x-max", "direction": (0.0, -1.0, 0.0), "size": 60.0},),
+        "outputs": ({"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "y"},),
+    }
+    return Hyperelastic.model_validate(blocks | changes)
+
+
+SPECS = {
+    "definite": cantilever(),
+    "indefinite": cantilever(formulation="mixed"),
+    "not symmetric": loaded_body("mooney-rivlin"),
+}
+
+
+@pytest.mark.parametrize("kind", SPECS)
+def test_a_direct_solver_agrees_with_dense_algebra(kind):
+    model = SPECS[kind].build(MPI.COMM_SELF, ())
+    state = np.array(model.solve(np.empty(0)).state)
+    body = model.body
+    body.set_state(state)
+    solver = body.new_solver()
+    assert solver.memory() == 0
+    solver.factorise()
+    K = body.free_stiffness_times(np.eye(body.size)).T
+    K[body.fixed] = 0  # columns are zero already; rows of prescribed unknowns are identities
+    K[body.fixed, body.fixed] = 1
+    rows = np.random.default_rng(0).standard_normal((3, body.size))
+    rows[:, body.fixed] = 0
+    for transpose in (False, True):
+        expected = np.linalg.solve(K.T if transpose else K, rows.T).T
+        found = solver.solve(rows, transpose=transpose)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+        one = solver.solve(rows[1], transpose=transpose)
+        np.testing.assert_allclose(one, found[1], rtol=0, atol=1e-12 * np.abs(found).max())
+    negative = solver.negative_eigenvalues()
+    if kind == "not symmetric":
+        assert negative is None
+    else:
+        assert negative == (np.linalg.eigvalsh((K + K.T) / 2) < 0).sum() == body.unknowns.pressures
+    assert (10**6 if body.size > 100 else 0) <= solver.memory() < 10**9
+
+
+class ConjugateGradients:
+    """A linear solver that iterates, knows no inertia, and factorises nothing."""
+
+    def __init__(self, stiffness):
+        self._stiffness = stiffness
+        self._matrix = None
+
+    def factorise(self):
+        if self._matrix is not None:
+            self._matrix.destroy()
+        self._matrix = self._stiffness.assembled()
+        diagonal = self._matrix.getDiagonal()
+        self._scale = 1 / self._stiffness.unknowns.take(diagonal.array_r)
+
+    def solve(self, right, *, transpose=False):
+        if right.ndim == 2:
+            return np.array([self.solve(row) for row in right]).reshape(right.shape)
+        x, r = np.zeros_like(right), np.array(right)
+        p = z = self._scale * r
+        for _ in range(10 * len(right)):
+            if np.linalg.norm(r) <= 1e-13 * np.linalg.norm(right):
+                break
+            q = self._stiffness.products(self._matrix, p[None])[0]
+            step = (r @ z) / (p @ q)
+            before = r @ z
+            x, r = x + step * p, r - step * q
+            z = self._scale * r
+            p = z + (r @ z) / before * p
+        return x
+
+    def negative_eigenvalues(self):
+        return None
+
+    def memory(self):
+        return 0
+
+
+def test_another_linear_solver_gives_the_same_solutions(monkeypatch):
+    names = ("material.C1", "loads.traction.size")
+    point = np.array([5e3, 60.0])
+    expected = SPECS["definite"].build(MPI.COMM_SELF, names).solve(point)
+    monkeypatch.setattr(linear, "DirectSolver", ConjugateGradients)
+    found = SPECS["definite"].build(MPI.COMM_SELF, names).solve(point)
+    assert found.converged
+    assert expected.stability == Stability.COUNTED
+    assert found.stability == Stability.NOT_TESTED  # it has nothing to count with
+    np.testing.assert_allclose(found.state, expected.state, rtol=0, atol=1e-7 * np.abs(expected.state).max())
+    tangents, gradient = found.tangent(np.eye(2))[:, 0], found.adjoint(np.ones(1))
+    np.testing.assert_allclose(tangents, expected.tangent(np.eye(2))[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(gradient, tangents, rtol=1e-9)
