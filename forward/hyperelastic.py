@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from pydantic import Field, ValidationError, create_model, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
@@ -18,7 +18,8 @@ from forward.bodies.random_fields import RandomField
 from forward.fem.cost import Times, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials
-from forward.materials.energies import MATERIALS, constants, measures, splits
+from forward.materials.block import Material
+from forward.materials.material import MATERIALS, constants, splits
 from forward.model import Finding
 from forward.observables.outputs import Output, PointDisplacement, Reaction
 from forward.scalars import Mistake, Scalar
@@ -28,46 +29,8 @@ from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
-
-class _Fibrous(Settings):
-    """A material with one or two families of fibres, along vectors in the undeformed body."""
-
-    fibres: tuple[Vector, ...] = Field(min_length=1, max_length=2)
-
-    @field_validator("fibres")
-    @classmethod
-    def _have_lengths(cls, fibres: tuple[Vector, ...]) -> tuple[Vector, ...]:
-        if not all(any(fibre) for fibre in fibres):
-            message = "a direction has length zero, expected vectors such as [1, 0, 0]"
-            raise ValueError(message)
-        return fibres
-
-
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
-
-    Material = Settings
-else:
-    # One block per energy, made from its signature, so that the names of the constants stand in one place.
-    Material = Annotated[
-        Union[  # noqa: UP007 - the members are computed
-            tuple(
-                create_model(
-                    energy.__name__.title().replace("_", ""),
-                    __base__=_Fibrous if "i4" in measures(energy) else Settings,
-                    __doc__=energy.__doc__,
-                    kind=(Literal[name], name),
-                    **{
-                        constant: (Annotated[(float, *get_args(admissible)[1:])], ...)
-                        for constant, admissible in constants(energy).items()
-                    },
-                )
-                for name, energy in MATERIALS.items()
-            )
-        ],
-        Field(discriminator="kind"),
-    ]
-
 
 CONTRAST = "contrast"
 
@@ -117,7 +80,7 @@ def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], pa
         paths = {name: f"{place}.{name}" for name in values}
         return {name: paths[name] if paths[name] in parameters else value for name, value in values.items()}
 
-    names = constants(MATERIALS[energy])
+    names = constants(energy)
     shared = own("material", {name: getattr(material, name) for name in names})
     found = {"material": shared}
     for region, numbers in regions.items():
@@ -155,7 +118,8 @@ class Hyperelastic(ModelSpec):
         Path, tolerance and limits of the solver; its kind alone may be given as a word, `solver = "newton"`.
     formulation
         Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
-        and a material with a constant D1). "auto" is mixed where that is possible and κ/μ may be above 3: over all
+        and a material with a constant D1 or a stated volumetric part). "auto" is mixed where that is possible and κ/μ
+        may be above 3: over all
         values of the inputs in a study, with the constants as given elsewhere.
     """
 
@@ -184,7 +148,7 @@ class Hyperelastic(ModelSpec):
     def scalars(self) -> dict[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
         found = {}
-        for name in constants(MATERIALS[self.energy]):
+        for name in constants(self.energy):
             found[f"material.{name}"] = Scalar(getattr(self.material, name), type(self.material), name)
         for region, numbers in self.regions.items():
             for name, value in numbers.items():
@@ -251,7 +215,7 @@ class Hyperelastic(ModelSpec):
 
     @property
     def _splits(self) -> bool:
-        """Whether the energy is the sum of a part without J and of D1 (J−1)²."""
+        """Whether the energy is the sum of a part of the shape and a part of the volume alone."""
         return splits(self.energy)
 
     @property
@@ -461,7 +425,7 @@ class Hyperelastic(ModelSpec):
 
     def _mistakes_of_formulation(self) -> Iterator[Mistake]:
         if self.formulation == "mixed" and not self._splits:
-            split = ", ".join(name for name, energy in MATERIALS.items() if splits(energy))
+            split = ", ".join(name for name in MATERIALS if splits(name))
             message = f"the energy '{self.energy}' has no part of the volume alone; a mixed form has: {split}"
             yield ("formulation",), message, self.formulation
         if self.formulation == "mixed" and self.body.degree < 2:

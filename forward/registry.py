@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,11 +37,14 @@ class Kinds:
         Those of the program: ``MODULE:NAME`` by kind.
     expected
         The class that every one must be a subclass of.
+    objection
+        Instead, where they are no classes: why something is none of them, or None if it is one.
     """
 
     family: str
     own: Mapping[str, str]
     expected: type = Settings
+    objection: Callable[[Any], str | None] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,6 +69,10 @@ class Kinds:
             raise KindError(f"unknown kind; {nearest(kind, self.names)}")
         return self._imported(kind, found.module, found.attr)
 
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the program's own."""
+        return iter(self.own)
+
     def _installed(self) -> dict[str, importlib.metadata.EntryPoint]:
         """Kinds that installed packages declare, by name."""
         prefix = f"{self.family}."
@@ -88,6 +95,11 @@ class Kinds:
             known = tuple(word for word in dir(loaded) if not word.startswith("_"))
             message = f"the module '{module}' has no {self.family} '{name}'; {nearest(name, known)}"
             raise KindError(message) from None
+        if self.objection is not None:
+            objection = None if kind in self.own else self.objection(found)
+            if objection is not None:
+                raise KindError(f"'{module}.{name}' is no {self.family}: {objection}")
+            return found
         if not (isinstance(found, type) and issubclass(found, self.expected)):
             raise KindError(f"'{module}.{name}' is no {self.family}: expected a subclass of {self.expected.__name__}")
         if issubclass(found, Settings) and "kind" not in found.model_fields:
@@ -120,10 +132,17 @@ class OfKind:
         The kinds.
     default
         The kind where none is written; None where it must be.
+    make
+        Returns the block of a kind, where the kinds are no blocks themselves.
     """
 
     kinds: Kinds
     default: str | None = None
+    make: Callable[[str], type[Settings]] | None = None
+
+    def block(self, kind: str) -> Any:
+        """Return the class of the blocks of a kind."""
+        return self.kinds[kind] if self.make is None else self.make(kind)
 
     def validate(self, value: Any) -> Any:
         """Return the block that a table describes; blocks that were made before pass."""
@@ -137,7 +156,7 @@ class OfKind:
         if not isinstance(kind, str):
             raise _mistake("no_word", "expected a word", kind)
         try:
-            block = self.kinds[kind]
+            block = self.block(kind)
         except KindError as error:
             raise _mistake(UNKNOWN_KIND, str(error), kind, known=list(self.kinds.names)) from None
         return block.model_validate({**value, "kind": kind})
@@ -147,9 +166,9 @@ class OfKind:
         return core_schema.no_info_before_validator_function(self.validate, core_schema.any_schema())
 
     def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        """Any of the program's own kinds, or a block of another kind, of which nothing is known."""
-        known = [handler(self.kinds[kind].__pydantic_core_schema__) for kind in self.kinds.own]
-        other = {"type": "object", "properties": {"kind": {"type": "string", "not": {"enum": [*self.kinds.own]}}}}
+        """Any of the kinds that have a name, or a block of a dotted one, of which nothing is known."""
+        known = [handler(self.block(kind).__pydantic_core_schema__) for kind in self.kinds.names]
+        other = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}}
         return {"anyOf": [*known, {**other, "required": ["kind"]}]}
 
 

@@ -22,9 +22,10 @@ from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.cost import Times, sum_of
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.hyperelastic import Hyperelastic, Material, materials
+from forward.hyperelastic import Hyperelastic, materials
 from forward.materials.admissible import Materials
-from forward.materials.energies import splits
+from forward.materials.block import Material
+from forward.materials.material import splits
 from forward.model import Finding, FloatArray, Guess, ModelError, OneByOne, Reference, SolveError, Stability, Work
 from forward.observables.outputs import Output, PointDisplacement
 from forward.scalars import Mistake, Scalar

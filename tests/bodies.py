@@ -7,8 +7,8 @@ from sympy.codegen.cfunctions import expm1, log1p
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials import kinematics
-from forward.materials.energies import MATERIALS as LAWS
-from forward.materials.energies import measures
+from forward.materials.material import MATERIALS as LAWS
+from forward.materials.material import measures
 
 MATERIALS = {
     "mooney-rivlin": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 2e4, "D1": 2e5},

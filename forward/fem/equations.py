@@ -3,8 +3,9 @@
 F = ∂Π/∂u (plus follower pressures) on the free unknowns and u = target on the prescribed ones.
 
 Displacement form: Π = ∫ W dX − loads. Mixed form: u holds displacements and then pressures p (tension is positive), and
-Π = ∫ W_iso + p (J−1) − p²/(2κ) dX − loads, the perturbed Lagrangian of W = W_iso + κ/2 (J−1)². K is then symmetric and
-indefinite. Forces (N) and volumes (m³), metres and pascals share vectors, so norms are of one kind only.
+Π = ∫ W_iso + p g(J) − p²/(2κ) dX − loads, the perturbed Lagrangian of W = W_iso + κ/2 g(J)². There g is J−1, or what a
+stated volumetric part makes it, and then p g'(J) is the pressure. K is symmetric and indefinite. Forces (N) and volumes
+(m³), metres and pascals share vectors, so norms are of one kind only.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from forward.fem.latest import Latest
 from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
 from forward.hyperelastic import CONTRAST, Hyperelastic
-from forward.materials.energies import MATERIALS
+from forward.materials.admissible import moduli
+from forward.materials.material import constants, energy_of, isochoric
 from forward.model import FloatArray, SolveError, Work
 from forward.solvers.linear import LinearSolver
 from forward.solvers.newton import Residual
@@ -109,10 +111,8 @@ class Discretisation:
     @cached_property
     def energy(self) -> Any:
         """Energy density; in the mixed form, without that of the change of volume."""
-        values = self._material
-        if self.p is not None:
-            values["D1"] = 0
-        return self.stiffness_factor * MATERIALS[self.spec.energy](OPS, *self._invariants.measures.values(), **values)
+        energy = energy_of(self.spec.energy) if self.p is None else isochoric(self.spec.energy)
+        return self.stiffness_factor * energy(OPS, *self._invariants.measures.values(), **self._material)
 
     @cached_property
     def _regions(self) -> dict[str, Any]:
@@ -164,16 +164,16 @@ class Discretisation:
     def _energies(self) -> tuple[Any, Any, Any]:
         """Densities of the stored energy, of the potential whose derivative is the imbalance, and of the volume change.
 
-        In the mixed form ∫ J−1 dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the latter
-        keeps its digits however small it is.
+        In the mixed form ∫ g(J) dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the
+        latter keeps its digits however small it is.
         """
         dilation, p = self._invariants.deformation.dilation, self._pressure
         energy, j = self.energy, self._invariants.measures.get("j", dilation)
         if p is None:
             return energy, energy, dilation
-        bulk = 2 * self.stiffness_factor * self._material["D1"]
+        bulk, g = self._invariants.volume(self.stiffness_factor, self._material)
         of_pressure = p**2 / (2 * bulk)
-        return energy + of_pressure, energy + p * j - of_pressure, p / bulk
+        return energy + of_pressure, energy + p * g - of_pressure, p / bulk if g is j else p / bulk + (j - g)
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
@@ -421,7 +421,8 @@ class Discretisation:
 
         It acts on an area h². A body whose boundary is held altogether is so far from its pressure; others are nearer.
         """
-        return float(2 * self._values["material.D1"] / self._distance)
+        values = {name: self._values[f"material.{name}"] for name in constants(self.spec.energy)}
+        return float(moduli(self.spec.energy, values)[1] / self._distance)
 
     def weights(self) -> FloatArray:
         """What turns an imbalance (U_local,) into forces (N): one on displacements."""

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from forward.materials.admissible import Materials, admissible, moduli
-from forward.materials.energies import splits
+from forward.materials.material import splits
 from forward.model import Finding
 
 Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths

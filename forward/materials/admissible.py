@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from forward.materials.energies import MATERIALS, constants
+from forward.materials.material import Energy, constants, energy_of, incompressible, small_strain_moduli, unfit_at_rest
 from forward.model import FloatArray
 
 Values = Mapping[str, Any]  # of constants by name: numbers, or arrays (n,)
@@ -52,25 +52,34 @@ _BULK: dict[str, _AtRest] = {
     "saint-venant-kirchhoff": _LAME,
     "blatz-ko": _AtRest("5/3 mu", lambda v: 5 / 3 * v["mu"]),
 }
-_VOLUME = _AtRest("2 D1", lambda v: 2 * v["D1"])  # of energies that split
+_VOLUME = _AtRest("2 D1", lambda v: 2 * v["D1"])  # of the program's own that split
 
 
 def moduli(energy: str, values: Values) -> tuple[Any, Any]:
-    """Return the shear and the bulk modulus (Pa) at rest of a kind of material; κ is infinite where D1 is left out."""
+    """Return the shear and the bulk modulus (Pa) at rest of a kind of material.
+
+    κ is infinite where the constants of the volume are left out. Of energies that are none of the program's own they
+    are found by numerical derivatives.
+    """
+    if energy not in _SHEAR:
+        return small_strain_moduli(energy, values)
     bulk = _BULK.get(energy, _VOLUME)
-    incompressible = bulk is _VOLUME and "D1" not in values
-    return _SHEAR[energy].of(values), np.inf if incompressible else bulk.of(values)
+    return _SHEAR[energy].of(values), np.inf if incompressible(energy, values) else bulk.of(values)
 
 
 def objection(energy: str, values: Mapping[str, float]) -> str | None:
     """Say why these constants are of no material, or None if they are."""
-    for limit in _limits(energy):
+    for limit in _limits(energy_of(energy)):
         if limit.name in values and not limit.holds(values[limit.name]):
             return f"{limit.name} = {values[limit.name]:.6g}, expected {limit.words}"
-    bulk = _BULK.get(energy, _VOLUME)
-    for symbol, modulus, formula in zip("μκ", moduli(energy, values), (_SHEAR[energy], bulk), strict=True):
+    own = energy in _SHEAR
+    unfit = None if own else unfit_at_rest(energy, values)
+    if unfit is not None:
+        return unfit
+    formulas = (f" = {_SHEAR[energy].words}", f" = {_BULK.get(energy, _VOLUME).words}") if own else ("", "")
+    for symbol, modulus, formula in zip("μκ", moduli(energy, values), formulas, strict=True):
         if not modulus > 0:
-            return f"not stable at rest: {symbol} = {formula.words} = {modulus:.6g} Pa, expected more than 0"
+            return f"not stable at rest: {symbol}{formula} = {modulus:.6g} Pa, expected more than 0"
     return None
 
 
@@ -78,7 +87,7 @@ def admissible(energy: str, values: Values) -> NDArray[np.bool_]:
     """Return which constants, numbers or arrays (n,), are of a material (n,)."""
     shear, bulk = moduli(energy, values)
     good = (np.asarray(shear) > 0) & (np.asarray(bulk) > 0)
-    for limit in _limits(energy):
+    for limit in _limits(energy_of(energy)):
         if limit.name in values:
             good = good & limit.holds(values[limit.name])
     return np.asarray(good)
@@ -100,8 +109,8 @@ class _Limit(NamedTuple):
 
 
 @cache
-def _limits(energy: str) -> tuple[_Limit, ...]:
-    hints = constants(MATERIALS[energy])
+def _limits(energy: Energy) -> tuple[_Limit, ...]:
+    hints = constants(energy)
     return tuple(
         _Limit(name, float(str(limit.gt if isinstance(limit, Gt) else limit.ge)), isinstance(limit, Ge))
         for name, hint in hints.items()

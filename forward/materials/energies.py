@@ -17,22 +17,18 @@ numbers near one. An energy is written so that it is none either: it keeps its d
     trace       tr E, with E = (C − I)/2
     square      E:E
 
-An energy that splits into an isochoric and a volumetric part has a constant called D1, and its volumetric part is
-exactly D1(J−1)²: with D1 = 0 it is the isochoric part, of i1, i2, l1, l2 and l3, and of fibres. No other energy may
-call a constant D1.
+An energy that has a constant called D1 splits into an isochoric part, of i1, i2, l1, l2 and l3, and of fibres, which it
+is with D1 = 0, and the volumetric part D1(J−1)². Other volumetric parts are stated
+(`forward.materials.material.with_volume`).
 """
 
 from __future__ import annotations
 
-import cmath
-import inspect
-from collections.abc import Callable, Mapping
-from types import SimpleNamespace
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
 from annotated_types import Ge, Gt, Unit
 
-from forward.materials.kinematics import atanh_rest, dilation_of, expm1_of, log1p_of, of_stretches
+from forward.materials.kinematics import atanh_rest
 
 Number = Annotated[Any, Unit("Pa")]
 NonNegative = Annotated[Any, Ge(0), Unit("Pa")]
@@ -169,105 +165,3 @@ def holzapfel_gasser_ogden(
     """
     fibres = sum(ops.expm1(k2 * ops.positive(longer) ** 2) for longer in i4)
     return c / 2 * i1 + k1 / (2 * k2) * fibres + D1 * j**2
-
-
-Energy = Callable[..., Any]
-
-MATERIALS: dict[str, Energy] = {
-    "mooney-rivlin": mooney_rivlin,
-    "neo-hookean": neo_hookean,
-    "neo-hookean-coupled": neo_hookean_coupled,
-    "yeoh": yeoh,
-    "gent": gent,
-    "demiray": demiray,
-    "saint-venant-kirchhoff": saint_venant_kirchhoff,
-    "blatz-ko": blatz_ko,
-    "ogden": ogden,
-    "holzapfel-gasser-ogden": holzapfel_gasser_ogden,
-}
-
-
-_COMPLEX = SimpleNamespace(
-    ln=cmath.log,
-    exp=cmath.exp,
-    sinh=cmath.sinh,
-    sqrt=cmath.sqrt,
-    positive=lambda x: x if complex(x).real > 0 else 0.0,
-    near=lambda z, limit, inside, outside: inside if abs(z) < limit else outside,
-)
-_COMPLEX.log1p, _COMPLEX.expm1 = log1p_of(_COMPLEX), expm1_of(_COMPLEX)
-
-
-def measures(energy: str | Energy) -> tuple[str, ...]:
-    """Return what an energy, or that of a kind of material, is a function of, by name and in its order."""
-    _, *names = (
-        name
-        for name, p in inspect.signature(_energy_of(energy)).parameters.items()
-        if p.kind is not inspect.Parameter.KEYWORD_ONLY
-    )
-    return tuple(names)
-
-
-def measured(
-    energy: str | Energy, ops: Any, less_one: tuple[Any, Any, Any], dilation: Any, fibres: tuple[Any, ...] = ()
-) -> dict[str, Any]:
-    """Return the measures of an energy from principal stretches less one, J − 1, and the I4 − 1 of fibres."""
-    known = of_stretches(ops, less_one, dilation, fibres)
-    return {name: known[name] for name in measures(energy)}
-
-
-def constants(energy: Energy) -> dict[str, Any]:
-    """Return the names of the constants of an energy, each with its annotation (admissible values and unit)."""
-    hints = get_type_hints(energy, include_extras=True)
-    keyword_only = inspect.Parameter.KEYWORD_ONLY
-    return {name: hints[name] for name, p in inspect.signature(energy).parameters.items() if p.kind is keyword_only}
-
-
-def units(energy: Energy) -> dict[str, str]:
-    """Return the names of the constants of an energy, each with its SI unit ("1" for ratios)."""
-    return {
-        name: item.unit for name, hint in constants(energy).items() for item in get_args(hint) if isinstance(item, Unit)
-    }
-
-
-def splits(energy: str | Energy) -> bool:
-    """Whether an energy, or that of a kind of material, is an isochoric part and D1(J−1)²."""
-    return "D1" in constants(_energy_of(energy))
-
-
-def small_strain_moduli(energy: str | Energy, values: Mapping[str, float]) -> tuple[float, float]:
-    """Shear and bulk modulus of the undeformed body; fibres, which bear tension only, left out.
-
-    Pure shear with stretches exp(h), exp(−h), 1 has W = 2μh² + …, so that μ = W''(h)/4 at h = 0. A dilation with all
-    stretches λ has W = κ(3(λ−1))²/2 + …, so that κ = W''(λ)/9 at λ = 1. First derivatives are complex steps, which are
-    exact to rounding; the second one adds a central difference of order 4.
-
-    Parameters
-    ----------
-    energy
-        An energy, or a kind of material.
-    values
-        Its constants.
-
-    Returns
-    -------
-    tuple of float
-        μ and κ in Pa, to ten digits.
-    """
-    W = _energy_of(energy)
-    tiny = 1e-30
-
-    def curvature(path: Callable[[complex], tuple[Any, Any, Any]], h: float) -> float:
-        def slope(at: float) -> float:
-            less_one = path(complex(at, tiny))
-            known = measured(W, _COMPLEX, less_one, dilation_of(less_one))
-            return float(complex(W(_COMPLEX, *known.values(), **values)).imag / tiny)
-
-        return (8 * (slope(h) - slope(-h)) - slope(2 * h) + slope(-2 * h)) / (12 * h)
-
-    shear = curvature(lambda h: (_COMPLEX.expm1(h), _COMPLEX.expm1(-h), 0.0), 1e-3)
-    return shear / 4, curvature(lambda h: (h, h, h), 1e-3) / 9
-
-
-def _energy_of(energy: str | Energy) -> Energy:
-    return MATERIALS[energy] if isinstance(energy, str) else energy

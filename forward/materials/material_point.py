@@ -24,8 +24,8 @@ from annotated_types import Gt
 from pydantic import Field, model_validator
 
 from forward.materials.admissible import objection
-from forward.materials.energies import MATERIALS, constants, measures
 from forward.materials.kinematics import dilation_of, of_stretches
+from forward.materials.material import Energy, constants, energy_of, incompressible, isochoric, measures, of_volume
 from forward.model import FloatArray, FunctionModel, FunctionSolution, Guess, InadmissibleError, OneByOne, SolveError
 from forward.settings import Settings
 
@@ -100,7 +100,7 @@ class HomogeneousModel(OneByOne):
     energy
         Kind of the material, see `forward.materials.energies`.
     values
-        Its constants; without the constant D1, an energy that has one is that of an incompressible material.
+        Its constants; without those of the volume (D1), an energy that has them is that of an incompressible material.
     tests
         What is measured.
     parameters
@@ -130,16 +130,17 @@ class HomogeneousModel(OneByOne):
         objection = next(filter(None, (unfit(energy, test.mode, fibres) for test in tests)), None)
         if objection is not None:
             raise ValueError(objection)
-        known = constants(MATERIALS[energy])
+        known = constants(energy)
         given = dict.fromkeys([*values, *parameters])
-        unknown, missing = set(given) - set(known), set(known) - set(given) - {"D1"}
+        left_out = of_volume(energy) if incompressible(energy, given) else ()
+        unknown, missing = set(given) - set(known), set(known) - set(given) - set(left_out)
         if unknown or missing:
             message = f"constants of '{energy}': {', '.join(sorted(given))}, expected: {', '.join(known)}"
             raise ValueError(message)
         self.parameters = tuple(parameters)
         self._names = tuple(name for name in known if name in given)
         self._energy = energy
-        self._free = "D1" not in known or "D1" in given  # faces move as they like, and where to has to be found
+        self._free = not incompressible(energy, given)  # faces move as they like, and where to has to be found
         self._values = np.array([values.get(name, np.nan) for name in self._names])
         self._varied = [self._names.index(name) for name in parameters]
         self._tests = tuple(tests)
@@ -279,7 +280,7 @@ def reading(
     energy
         Kind of the material.
     names
-        The c constants θ; without D1 an energy that has it is read at J = 1.
+        The c constants θ; without those of the volume an energy that has them is read at J = 1.
     fibres
         Unit vectors along the families of fibres.
     component, cauchy
@@ -287,10 +288,10 @@ def reading(
     """
     kinematics = _MODES[mode]
     confined = kinematics.incompressible is None
-    incompressible = "D1" in constants(MATERIALS[energy]) and "D1" not in names
-    free = not incompressible and not confined
-    energies = _of_measures(energy, names, len(fibres))
-    ways = [_of_stretches(mode, name, incompressible=incompressible, fibres=fibres) for name in measures(energy)]
+    kept = incompressible(energy, names)  # the volume
+    free = not kept and not confined
+    energies = _of_measures(energy_of(energy), names, len(fibres))
+    ways = [_of_stretches(mode, name, incompressible=kept, fibres=fibres) for name in measures(energy)]
     share = {"P1": (1, 0), "P2": (0, 1), "P1-P2": (1, -1)}[component]
 
     def shares(x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[Any, Any, Any]:
@@ -298,9 +299,9 @@ def reading(
         along, across = share[0] / kinematics.share, share[1]
         if not cauchy or confined:
             return along, across, 0.0
-        J = 1.0 if incompressible else 1 + dilation_of(kinematics.stretches(np, x, z, y))
+        J = 1.0 if kept else 1 + dilation_of(kinematics.stretches(np, x, z, y))
         both = 2 if mode == "uniaxial" else 1  # faces that are free
-        return along * (1 + x) / J, across * (1 + z) / J, 0.0 if incompressible else -both / (1 + y)
+        return along * (1 + x) / J, across * (1 + z) / J, 0.0 if kept else -both / (1 + y)
 
     def balance(x: FloatArray, z: FloatArray, y: FloatArray, theta: FloatArray) -> tuple[Any, Any]:
         """∂W/∂y and ∂²W/∂y²."""
@@ -358,7 +359,7 @@ class _Energies(NamedTuple):
 
 
 @cache
-def _of_measures(energy: str, names: tuple[str, ...], families: int) -> _Energies:
+def _of_measures(energy: Energy, names: tuple[str, ...], families: int) -> _Energies:
     import sympy
 
     m: list[Any] = []
@@ -369,9 +370,7 @@ def _of_measures(energy: str, names: tuple[str, ...], families: int) -> _Energie
         given.append(tuple(own) if name == "i4" else own[0])
     theta = sympy.symbols(names)
     values = dict(zip(names, theta, strict=True))
-    if "D1" in constants(MATERIALS[energy]):
-        values.setdefault("D1", sympy.Integer(0))
-    W = MATERIALS[energy](_operators(), *given, **values)
+    W = (isochoric(energy) if incompressible(energy, names) else energy)(_operators(), *given, **values)
     slopes = [sympy.diff(W, one) for one in m]
     first = _compiled([*m, *theta], [W, *slopes])
     second = _compiled([*m, *theta], [slope.diff(one) for slope in slopes for one in m])

@@ -511,12 +511,11 @@ def _kinds() -> set[str]:
     from typing import get_args
 
     from forward.bodies import geometry, inclusions
-    from forward.materials.energies import MATERIALS
     from forward.observables import outputs
 
     unions = (geometry.Body, inclusions.Inclusion, outputs.Output, Distribution)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return set(MATERIALS) | {member.model_fields["kind"].default for member in members}
+    return {member.model_fields["kind"].default for member in members}
 
 
 _TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

@@ -8,7 +8,7 @@ from typing import Any
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.hyperelastic import Hyperelastic
-from forward.materials.energies import MATERIALS, constants, units
+from forward.materials.material import MATERIALS, constants, energy_of, units
 from forward.observables.outputs import Output
 from forward.terms.term import Term
 from forward.words import listed, number, settings, with_unit
@@ -42,7 +42,7 @@ def unit_of(path: str) -> str:
     block, _, name = path.partition(".")
     if block == "material":
         # A name has the same unit in every material.
-        return next((of[name] for of in map(units, MATERIALS.values()) if name in of), "1")
+        return next((of[name] for of in map(units, MATERIALS) if name in of), "1")
     if block == "inclusions":
         return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
             path.rpartition(".")[2], "m"
@@ -78,9 +78,9 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     pressures = " and pressures (mixed form)" if model.mixed else ""
     yield "unknowns", [f"{model.unknowns:,} displacements{pressures}{coarsest}"]
     kind = model.energy
-    numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(MATERIALS[kind])]
+    numbers = [f"{name} = {_scalar(study, f'material.{name}')}" for name in constants(kind)]
     fibres = [f"fibres along {' and '.join(map(listed, model.fibres))}"] if model.fibres else []
-    law = str(MATERIALS[kind].__doc__).partition("\n")[0]
+    law = str(energy_of(kind).__doc__).partition("\n")[0]
     yield "material", [law, ", ".join(numbers), *fibres]
     if model.regions:
         named = {

@@ -13,9 +13,10 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import Vector
 from forward.materials.admissible import Materials
-from forward.materials.energies import MATERIALS, constants
+from forward.materials.material import MATERIALS, constants, incompressible, of_volume
 from forward.materials.material_point import HELD, Component, HomogeneousModel, MaterialTest, Mode, named, unfit
 from forward.model import Finding, FloatArray, ForwardModel
+from forward.registry import KindError
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
 from inverse.criticism.comparison import Candidate, Data
@@ -244,8 +245,9 @@ class CandidateModel(Settings):
     Parameters
     ----------
     material
-        Its kind, and the constants that do not vary; without D1 an energy that has it is incompressible. Fibres, where
-        it has them, by their components along the first stretch, along the second one and across both.
+        Its kind, and the constants that do not vary; without those of the volume (D1) an energy is
+        incompressible. Fibres, where it has them, by their components along the first stretch, along the second one and
+        across both.
     parameters
         Priors of the constants that do.
     correlations
@@ -291,15 +293,17 @@ class CandidateModel(Settings):
         if kind is None:
             message = "material.kind: missing"
             raise ValueError(message)
-        if kind not in MATERIALS:
-            message = f"material.kind: {shown(kind)}; {nearest(str(kind), tuple(MATERIALS))}"
-            raise ValueError(message)
+        try:
+            MATERIALS[str(kind)]
+        except KindError as error:
+            message = f"material.kind: {shown(kind)}; {str(error).removeprefix('unknown kind; ')}"
+            raise ValueError(message) from None
         numbers = {name for name, value in self.material.items() if isinstance(value, float)}
         words = [name for name in self.material if name not in {"kind", "fibres", *numbers}]
         if words:
             message = f"material.{words[0]}: {shown(self.material[words[0]])}, expected a number"
             raise ValueError(message)
-        known = constants(MATERIALS[self.kind])
+        known = constants(self.kind)
         given = dict.fromkeys([*self.fixed, *self.parameters])
         for name in given:
             if name not in known:
@@ -308,7 +312,8 @@ class CandidateModel(Settings):
             if name in self.fixed and name in self.parameters:
                 message = f"'{name}' stands in material and in parameters, expected one of them"
                 raise ValueError(message)
-        missing = [name for name in known if name not in given and name != "D1"]
+        left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
+        missing = [name for name in known if name not in given and name not in left_out]
         if missing:
             message = f"missing: {', '.join(missing)}, expected in material or parameters"
             raise ValueError(message)

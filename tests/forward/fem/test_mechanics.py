@@ -12,7 +12,7 @@ from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
 from forward.fem.layout import Layout
 from forward.hyperelastic import Hyperelastic
-from forward.materials import energies as materials
+from forward.materials.material import MATERIALS as REGISTERED
 from forward.solvers.newton import solve
 from tests import textbook
 from tests.bodies import (
@@ -273,4 +273,4 @@ def test_compiling_a_form_changes_no_other(tmp_path, monkeypatch):
 
 
 def test_every_material_has_a_cell():
-    assert set(CELLS) == set(ALL_MATERIALS) == set(materials.MATERIALS)
+    assert set(CELLS) == set(ALL_MATERIALS) == set(REGISTERED)

@@ -5,7 +5,7 @@ import pytest
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Materials, admissible, moduli, objection
-from forward.materials.energies import MATERIALS, constants, small_strain_moduli
+from forward.materials.material import MATERIALS, constants, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import InadmissibleError
 from tests.bodies import CONSTANTS

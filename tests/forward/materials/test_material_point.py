@@ -6,7 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.hyperelastic import Hyperelastic
-from forward.materials.energies import MATERIALS, constants, measures, small_strain_moduli
+from forward.materials.material import MATERIALS, constants, measures, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import SolveError
 from tests.bodies import CONSTANTS

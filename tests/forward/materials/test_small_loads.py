@@ -11,7 +11,7 @@ from mpi4py import MPI
 from forward.hyperelastic import Hyperelastic
 from forward.materials import kinematics
 from forward.materials.admissible import moduli
-from forward.materials.energies import MATERIALS, measures
+from forward.materials.material import MATERIALS, measures
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from tests import textbook
 from tests.bodies import MATERIALS as BLOCKS
