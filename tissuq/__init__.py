@@ -1,12 +1,27 @@
-"""Uncertainty quantification and Bayesian model selection for hyperelastic soft tissue."""
+"""Uncertainty quantification and Bayesian model selection for hyperelastic soft tissue.
+
+    import tissuq
+
+    study = tissuq.load("configs/beam.toml")
+    data = tissuq.run(study)                                    # an xarray dataset, which all pictures take
+    print(float(data["mean"].sel(output="uy_max")), tissuq.findings(data))
+
+    model = tissuq.Model(study.model)
+    solution = model.solve({"material.C1": 9e3})                # numbers by their names
+    print(solution["uy_max"], solution.displacement_at([0.28, 0.01, 0.04]), solution.gradient("uy_max"))
+
+Names are imported when they are first used: `import tissuq` itself imports neither FEniCSx nor MPI.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 _PACKAGES = ("forward", "uq", "inverse", "workflows")
 
@@ -36,3 +51,51 @@ def _installed() -> None:
 
 
 _installed()
+
+_PUBLIC = {  # MODULE:NAME of what is found here, or a module
+    "load": "tissuq.studies:load",
+    "run": "tissuq.studies:run",
+    "read": "tissuq.studies:read",
+    "findings": "uq.findings:findings",
+    "Study": "workflows.config.study:Study",
+    "StudyError": "workflows.config.study:StudyError",
+    "Model": "tissuq.model:Model",
+    "Hyperelastic": "forward.hyperelastic:Hyperelastic",
+    "Specimen": "forward.specimen:Specimen",
+    "SolveError": "forward.model:SolveError",
+    "DerivativeError": "forward.model:DerivativeError",
+    "plots": "workflows.report.plots",
+    "bodies": "workflows.report.bodies",
+}
+__all__ = [*_PUBLIC]  # noqa: PLE0604 - names
+
+if TYPE_CHECKING:
+    from forward.hyperelastic import Hyperelastic as Hyperelastic
+    from forward.model import DerivativeError as DerivativeError
+    from forward.model import SolveError as SolveError
+    from forward.specimen import Specimen as Specimen
+    from tissuq.model import Model as Model
+    from tissuq.studies import load as load
+    from tissuq.studies import read as read
+    from tissuq.studies import run as run
+    from uq.findings import findings as findings
+    from workflows.config.study import Study as Study
+    from workflows.config.study import StudyError as StudyError
+    from workflows.report import bodies as bodies
+    from workflows.report import plots as plots
+
+
+def __getattr__(name: str) -> Any:
+    place = _PUBLIC.get(name)
+    if place is None:
+        from forward.settings import nearest
+
+        message = f"module 'tissuq' has no attribute '{name}'; {nearest(name, tuple(_PUBLIC))}"
+        raise AttributeError(message)
+    module, _, inside = place.partition(":")
+    found = import_module(module)
+    return getattr(found, inside) if inside else found
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PUBLIC])

@@ -1,0 +1,90 @@
+"""The public namespace: studies and models from Python, in a few lines."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import tissuq
+from tests.launch import ROOT, run_script
+
+TINY = ROOT / "configs" / "tiny.toml"
+
+
+def test_importing_it_imports_nothing_heavy():
+    heavy = "{'dolfinx', 'mpi4py', 'petsc4py', 'ufl', 'scipy', 'numpy', 'xarray', 'pydantic', 'matplotlib'}"
+    done = run_script(None, f"import sys, tissuq; print(sorted({heavy} & set(sys.modules)))")
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_every_name_is_there():
+    for name in tissuq.__all__:
+        assert getattr(tissuq, name) is not None
+    with pytest.raises(AttributeError, match="did you mean 'Study'"):
+        _ = tissuq.Studdy
+
+
+@pytest.mark.fem
+def test_a_study_in_memory_is_that_of_the_command(tmp_path):
+    study = tissuq.load(TINY, ["method.samples=8"])
+    found = tissuq.run(study)
+    kept = tissuq.run(study, tmp_path / "study")
+    for name in found.variables:
+        assert found[name].to_numpy().tobytes() == kept[name].to_numpy().tobytes()
+    again = tissuq.run(study, tmp_path / "study")  # finished: it is read
+    np.testing.assert_array_equal(again["mean"], kept["mean"])
+    assert sorted(path.name for path in (tmp_path / "study").iterdir()) == [
+        "evaluations.h5", "fields", "results.nc", "study.toml", "summary.json",
+    ]  # fmt: skip
+    assert tissuq.plots.histogram(found, "uy_max").get_xlabel()
+    assert tissuq.findings(found) == tissuq.findings(kept)
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_under_mpirun_the_first_rank_has_the_results():
+    script = (
+        "import sys, tissuq; from mpi4py import MPI; "
+        "found = tissuq.run(tissuq.load(sys.argv[1], ['method.samples=8'])); "
+        "print(MPI.COMM_WORLD.rank, sorted(map(str, found.data_vars))[:1])"
+    )
+    done = run_script(2, script, TINY)
+    assert done.returncode == 0, done.stderr
+    first, second = sorted(line for line in done.stdout.splitlines() if line[:2] in {"0 ", "1 "})
+    assert first != "0 []"
+    assert second == "1 []"
+
+
+@pytest.mark.fem
+def test_a_model_by_the_names_of_its_numbers():
+    model = tissuq.Model(tissuq.load(TINY).model)
+    first = model.solve({"material.C1": 9e3})
+    assert set(first) == {"uy_max", "ux_max"}
+    step = 1.0
+    ends = [model.solve({"material.C1": 9e3 + h}, near=first) for h in (-step, step)]
+    slope = (ends[1]["uy_max"] - ends[0]["uy_max"]) / (2 * step)
+    assert first.gradient("uy_max")["material.C1"] == pytest.approx(slope, rel=1e-5)
+    assert (model.nodes[1:] >= model.nodes[:-1])[:, 0].all()
+    np.testing.assert_allclose(
+        first.displacement_at(model.nodes[[0, 7, -1]]), first.displacement[[0, 7, -1]], atol=1e-14
+    )
+    assert -first.displacement[:, 1].min() == pytest.approx(first["uy_max"])
+    middle = model.nodes[[0, -1]].mean(axis=0)
+    assert first.displacement_at(middle).shape == (1, 3)
+    with pytest.raises(ValueError, match="outside the mesh"):
+        first.displacement_at([1.0, 0.0, 0.0])
+    with pytest.raises(KeyError, match=r"did you mean 'material\.C1'"):
+        model.solve({"material.C3": 1.0})
+    with pytest.raises(KeyError, match=r"did you mean 'uy_max'"):
+        first.gradient("uy_mx")
+    assert "uy_max = " in repr(first)
+
+
+def test_a_python_function_is_a_model_too(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "configs"), *sys.path])
+    model = tissuq.Model(tissuq.load(ROOT / "configs" / "own-model.toml").model)
+    found = model.solve({"load": 2.0})
+    assert found["tip"] == pytest.approx(2 * model.solve()["tip"])
+    assert model.nodes is None
+    with pytest.raises(ValueError, match="no body"):
+        _ = found.displacement
