@@ -22,7 +22,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.chaos import Chaos
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
-from uq.surrogates.expansion import load
+from uq.surrogates.expansion import Expansion
 from uq.surrogates.field_regression import Projections
 from workflows.config.study import load as load_study
 
@@ -203,7 +203,7 @@ def _compare(case: Case, ot: Any) -> None:
                 method = Chaos(samples=n, max_order=case.order, seed=seed, gradients=gradients, fields=False)
                 data = method.run(inputs, evaluate)
                 kept["data"] = data
-                predicted = load(data).outputs(test)[:, 0]
+                predicted = Expansion.of(data).outputs(test)[:, 0]
                 moments = data["mean"][0].item(), data["std"][0].item()
                 return data.sizes["term"], predicted, *moments, data["sobol_first"][0].to_numpy()
 

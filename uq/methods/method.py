@@ -6,8 +6,8 @@ A kind of one's own is a subclass in a module beside the study or in an installe
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Self
 
 from forward.registry import Kinds
 from forward.scalars import Mistake
@@ -88,6 +88,10 @@ class Method(Settings):
         if objection is not None:
             given = [{"between": (a, b), "value": value} for a, b, value in inputs.correlations]
             yield ("correlations",), objection, given
+
+    def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
+        """Return the method with the results of other studies that it names, as they are read."""
+        return self
 
     def with_tangents(self, samples: int) -> int:
         """Of so many samples, the number whose derivatives are asked for too."""

@@ -15,11 +15,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
 from forward.model import FloatArray, ForwardModel, SolveError, scattered
 from forward.settings import nearest
@@ -91,7 +92,7 @@ class Sobol(Amount):
     groups
         Names of groups with the parameters that they have: their indices are estimated too.
     source
-        Directory of the results to take ("given-data").
+        Directory of the results to take ("given-data"), beside the study or else in the working directory.
     scrambles
         Number of parts of one scrambled sequence ("saltelli"): their scatter is the error that is claimed, with R − 1
         degrees of freedom.
@@ -116,6 +117,7 @@ class Sobol(Amount):
     seed: Annotated[int, Field(ge=0)] = 0
     quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
     fields: bool = True
+    results: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)  # those of `source`
 
     def check_amount(self) -> None:
         """Raise a ValueError where design, amount and source do not go together."""
@@ -133,6 +135,10 @@ class Sobol(Amount):
             raise ValueError(message)
         if self.design == "saltelli":
             check_scrambles(self.samples, self.scrambles)
+
+    def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
+        """Return the same with the results that it takes."""
+        return self if self.source is None else self.model_copy(update={"results": read(self.source)})
 
     def planned(self, dimension: int) -> int:
         """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
@@ -258,7 +264,10 @@ class Sobol(Amount):
     # --- from given data -----------------------------------------------------------------------------------------
 
     def _take(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        source = _read(str(self.source), inputs, evaluate)
+        if self.results is None:
+            message = f"the results of {self.source} were not read, expected them in `results`: see `with_sources`"
+            raise ValueError(message)
+        source = _fitting(self.results, str(self.source), inputs, evaluate)
         centre = linearise(inputs, evaluate)
         theirs = source["nominal"].to_numpy()
         if not np.allclose(theirs, centre.outputs, rtol=SAME, atol=SAME * np.abs(theirs).max()):
@@ -268,7 +277,9 @@ class Sobol(Amount):
             )
             raise FileNotFoundError(message)
         dataset = source.drop_vars([name for name in ("node_position", "cell_nodes", "unit") if name in source])
-        dataset.attrs = {"stopped": f"from the results of {self.source}: {source.attrs.get('stopped', 'samples')}"}
+        dataset.attrs = {
+            "stopped": f"from the results of {Path(str(self.source)).name}: {source.attrs.get('stopped', 'samples')}"
+        }
         dataset.attrs |= {name: source.attrs[name] for name in ("note", "findings") if name in source.attrs}
         if not self.fields:
             dataset = dataset.drop_dims([dim for dim in ("node",) if dim in dataset.dims])
@@ -364,21 +375,14 @@ def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     return dataset
 
 
-def _read(directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-    """Read the results of another study, of the same parameters and outputs.
+def _fitting(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+    """Return the results of another study, which must be of the same parameters and outputs.
 
     Raises
     ------
     FileNotFoundError
-        If there are none.
+        If they are of others.
     """
-    import xarray as xr
-
-    path = Path(directory) / "results.nc"
-    if not path.exists():
-        message = f"{directory}: holds no results.nc, expected the directory of a finished study"
-        raise FileNotFoundError(message)
-    source: xr.Dataset = xr.load_dataset(path, engine="h5netcdf")
     for what, expected in (("parameter", inputs.names), ("output", evaluate.outputs)):
         theirs = tuple(source[what].values)
         if theirs != expected:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +47,37 @@ class Expansion:
     fields: FloatArray | None = None
     _told: list[str] = field(default_factory=list, repr=False, compare=False)
 
+    @classmethod
+    def of(cls, results: xr.Dataset) -> Expansion:
+        """Make the expansion of a finished study callable.
+
+        Raises
+        ------
+        ValueError
+            If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
+        """
+        if "multi_index" not in results:
+            message = "these results hold no expansion, expected those of method.kind = 'chaos'"
+            raise ValueError(message)
+        arrays = {str(name): variable.to_numpy() for name, variable in results.data_vars.items()}
+        basis = Basis(
+            Coordinates(
+                arrays["coordinate_logarithmic"].astype(bool), arrays["coordinate_mean"], arrays["coordinate_std"]
+            ),
+            arrays["recurrence_alpha"],
+            arrays["recurrence_beta"],
+            arrays["multi_index"],
+        )
+        return cls(
+            tuple(map(str, results["parameter"].values)),
+            tuple(map(str, results["output"].values)),
+            basis,
+            arrays["coefficients"],
+            arrays["range_lower"],
+            arrays["range_upper"],
+            arrays.get("field_coefficients"),
+        )
+
     def outputs(self, points: FloatArray) -> FloatArray:
         """Return the outputs (n, m) at points (n, d)."""
         return self.basis.values(self._checked(points)) @ self.coefficients
@@ -84,42 +114,3 @@ class Expansion:
             message = f"points outside the range where the expansion was fitted, in: {', '.join(names)}"
             warnings.warn(message, OutsideRangeWarning, stacklevel=3)
         return points
-
-
-def load(source: str | Path | xr.Dataset) -> Expansion:
-    """Make the expansion of a finished study callable.
-
-    Parameters
-    ----------
-    source
-        The results directory, its results.nc, or the dataset.
-
-    Raises
-    ------
-    ValueError
-        If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
-    """
-    import xarray as xr
-
-    if isinstance(source, str | Path):
-        path = Path(source)
-        source = xr.load_dataset(path / "results.nc" if path.is_dir() else path, engine="h5netcdf")
-    if "multi_index" not in source:
-        message = "these results hold no expansion, expected those of method.kind = 'chaos'"
-        raise ValueError(message)
-    arrays = {str(name): variable.to_numpy() for name, variable in source.data_vars.items()}
-    basis = Basis(
-        Coordinates(arrays["coordinate_logarithmic"].astype(bool), arrays["coordinate_mean"], arrays["coordinate_std"]),
-        arrays["recurrence_alpha"],
-        arrays["recurrence_beta"],
-        arrays["multi_index"],
-    )
-    return Expansion(
-        tuple(map(str, source["parameter"].values)),
-        tuple(map(str, source["output"].values)),
-        basis,
-        arrays["coefficients"],
-        arrays["range_lower"],
-        arrays["range_upper"],
-        arrays.get("field_coefficients"),
-    )

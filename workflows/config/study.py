@@ -291,8 +291,15 @@ def _deeper_than(tree: Any, most: int) -> bool:
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Say in full where the file of a mesh is, which the study names from where it stands itself."""
-    model = blocks.get("model")
+    """Say in full where a mesh and the results of another study are, which a study names from where it stands itself.
+
+    Results may be in the working directory too.
+    """
+    method, model = blocks.get("method"), blocks.get("model")
+    source = method.get("source") if isinstance(method, Mapping) else None
+    if isinstance(source, str) and isinstance(method, Mapping):
+        place = next((path for path in (folder / source, Path(source)) if path.exists()), folder / source)
+        blocks = blocks | {"method": {**method, "source": str(place.resolve())}}
     body = model.get("body") if isinstance(model, Mapping) else None
     file = body.get("file") if isinstance(body, Mapping) else None
     if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):

@@ -263,7 +263,8 @@ def _sampling(study: Study, ensemble: Ensemble) -> Job:
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        return study.method.run(inputs, recorders["/"])
+        method = study.method.with_sources(lambda place: read_dataset(Path(place)))
+        return method.run(inputs, recorders["/"])
 
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()

@@ -58,17 +58,15 @@ def test_what_no_expansion_explains_has_the_moments_of_its_samples_and_no_indice
     assert "explains nothing" in findings(data)[0].text
 
 
-def test_given_data_of_such_an_expansion_have_no_indices_either(tmp_path):
+def test_given_data_of_such_an_expansion_have_no_indices_either():
     case = BY_NAME["oscillation"]
     source = run(Chaos(samples=40), "oscillation")
-    source.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
-    data = Sobol(design="given-data", source=str(tmp_path)).run(case.inputs, Vectorised(case))
+    given = Sobol(design="given-data", source="results")
+    data = given.with_sources(lambda place: source).run(case.inputs, Vectorised(case))
     assert np.isnan(data["sobol_total"].to_numpy()).all()
     assert "error" in severities(data)
     samples = run(MonteCarlo(samples=40), "oscillation")
-    (tmp_path / "plain").mkdir()
-    samples.to_netcdf(tmp_path / "plain" / "results.nc", engine="h5netcdf")
-    data = Sobol(design="given-data", source=str(tmp_path / "plain")).run(case.inputs, Vectorised(case))
+    data = given.with_sources(lambda place: samples).run(case.inputs, Vectorised(case))
     assert np.isnan(data["sobol_total"].to_numpy()).all()
     assert "error" in severities(data)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 
 from forward.model import FunctionModel, SolveError
@@ -19,7 +20,7 @@ from uq.methods import chaos
 from uq.methods.chaos import Chaos
 from uq.surrogates import regression
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
-from uq.surrogates.expansion import OutsideRangeWarning, load
+from uq.surrogates.expansion import Expansion, OutsideRangeWarning
 from uq.surrogates.linearisation import linearise
 
 MARGINALS = {
@@ -109,8 +110,8 @@ def test_a_polynomial_is_recovered(kind, gradients):
     points = inputs.points(np.random.default_rng(0).random((50, 2)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OutsideRangeWarning)
-        found = load(data).outputs(points)[:, 0]
-        slopes = load(data).tangents(points)[:, 0] * inputs.std
+        found = Expansion.of(data).outputs(points)[:, 0]
+        slopes = Expansion.of(data).tangents(points)[:, 0] * inputs.std
     np.testing.assert_allclose(found, [function(p) for p in points], rtol=1e-9, atol=1e-9)
     exact = np.array([by_complex_step(function)(p)[0] for p in points]) * inputs.std
     np.testing.assert_allclose(slopes, exact, rtol=1e-8, atol=1e-8)
@@ -167,7 +168,7 @@ def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     monkeypatch.setattr(regression, "TRUNCATIONS", (1.0,))
     monkeypatch.setattr(chaos, "DICTIONARY", 0)  # nothing to select from
     data = run(Chaos(samples=20, max_order=3, gradients=gradients), inputs, function, by_complex_step(function))
-    basis = load(data).basis
+    basis = Expansion.of(data).basis
     points, values = data["points"].to_numpy(), data["values"].to_numpy()[:, 0]
     errors, means, stds = [], [], []
     for out in range(20):
@@ -298,8 +299,8 @@ def test_saved_and_loaded(tmp_path):
     data = run(Chaos(samples=15), SMOOTH, smooth, by_complex_step(smooth))
     data.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     points = np.random.default_rng(2).random((30, 4))
-    expansion = load(tmp_path)
-    np.testing.assert_array_equal(expansion.outputs(points), load(data).outputs(points))
+    expansion = Expansion.of(xr.load_dataset(tmp_path / "results.nc", engine="h5netcdf"))
+    np.testing.assert_array_equal(expansion.outputs(points), Expansion.of(data).outputs(points))
     slopes = [(expansion.outputs(points + h) - expansion.outputs(points - h)) / 2e-6 for h in 1e-6 * np.eye(4)]
     np.testing.assert_allclose(expansion.tangents(points)[:, 0], np.array(slopes)[:, :, 0].T, atol=1e-7)
     with pytest.warns(OutsideRangeWarning, match=r"in: b$"):
@@ -308,7 +309,7 @@ def test_saved_and_loaded(tmp_path):
         warnings.simplefilter("error")
         expansion.outputs(np.array([[0.5, 1.1, 0.5, 0.5]]))  # said once
     with pytest.raises(ValueError, match="hold no expansion"):
-        load(data.drop_vars("multi_index"))
+        Expansion.of(data.drop_vars("multi_index"))
     with pytest.raises(ValueError, match="not expanded"):
         expansion.displacements(points)
 
@@ -349,7 +350,7 @@ class States:
 def test_fields_are_the_regression_of_all_states(beam, method):
     inputs, evaluate = beam
     data = method.run(inputs, evaluate)
-    expansion = load(data)
+    expansion = Expansion.of(data)
     basis, points, states = expansion.basis, data["points"].to_numpy(), States()
     evaluate(Request(points, fields=states, start=linearise(inputs, evaluate).prediction))
     kept = np.array(states.rows)

@@ -15,7 +15,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.methods import chaos
 from uq.methods.multilevel_chaos import MultilevelChaos
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
-from uq.surrogates.expansion import load
+from uq.surrogates.expansion import Expansion
 from uq.surrogates.field_regression import StateExpansion
 from uq.surrogates.linearisation import linearise
 
@@ -110,7 +110,7 @@ def test_levels_converge_to_the_model():
     assert (data["level_work"].sel(operation="residuals")[:-1] == 2 * 32).all()
     # Each level has points of its own.
     assert data["points"].shape == (32, 2)
-    np.testing.assert_allclose(load(data).outputs(data["points"].to_numpy()), data["values"], rtol=1e-2)
+    np.testing.assert_allclose(Expansion.of(data).outputs(data["points"].to_numpy()), data["values"], rtol=1e-2)
 
 
 def test_the_error_of_a_level_is_what_polynomials_and_iterations_leave():
@@ -242,7 +242,7 @@ def test_the_beam_by_corrections_is_the_beam_by_newton(beam):
     first = data["level_work"].isel(level=0).to_series()
     assert first["back_substitutions"] == 2 * 32
     assert first["residuals"] == 3 * 32
-    expansion = load(data)
+    expansion = Expansion.of(data)
     point = study.inputs.points(np.array([[0.3, 0.8]]))
     solved = model.solve(point[0])
     np.testing.assert_allclose(expansion.outputs(point)[0], solved.outputs, rtol=3e-4)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from forward.model import FunctionModel, OneByOne, Solution, SolveError
 from tests.launch import run_script
@@ -18,6 +19,8 @@ from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo
 from uq.methods.sobol import Sobol
 from uq.surrogates.linearisation import linearise
+from workflows.config.study import document, load, parse
+from workflows.run.run import run as run_study
 
 STUDENT = 2.13  # of a 95 % interval with 15 degrees of freedom
 ISHIGAMI = Inputs({name: Uniform(lower=-np.pi, upper=np.pi) for name in "abc"})
@@ -243,8 +246,7 @@ def test_settings_that_cannot_work_are_refused():
 
 
 def given(tmp_path, data, **settings):
-    data.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
-    return Sobol(design="given-data", source=str(tmp_path), **settings)
+    return Sobol(design="given-data", source=str(tmp_path), **settings).with_sources(lambda place: data)
 
 
 def test_given_an_expansion(tmp_path):
@@ -254,7 +256,7 @@ def test_given_an_expansion(tmp_path):
         np.testing.assert_allclose(data[name], source[name], rtol=1e-12)
     np.testing.assert_allclose(data["sobol_second"][0, 0, 1], 5 / 91, atol=1e-6)
     assert np.isnan(data["sobol_second_error"]).all()
-    assert str(tmp_path) in data.attrs["stopped"]
+    assert tmp_path.name in data.attrs["stopped"]
 
 
 def test_given_samples(tmp_path):
@@ -284,7 +286,7 @@ def test_given_data_must_fit(tmp_path):
     ):
         with pytest.raises(FileNotFoundError, match=told):
             run(method, inputs, function, outputs=outputs)
-    with pytest.raises(FileNotFoundError, match=r"holds no results\.nc"):
+    with pytest.raises(ValueError, match="were not read"):
         run(Sobol(design="given-data", source=str(tmp_path / "none")), CUBE, product)
     written = run(MonteCarlo(samples=20), CUBE, product)
     written.attrs["config"] = '[parameters]\na = { kind = "uniform", lower = 0.0, upper = 1.0 }\n'
@@ -544,3 +546,43 @@ def test_parts_of_one_sequence_err_less_than_independent_scrambles_and_claim_no_
     rms, claimed = (np.sqrt((np.array(found) ** 2).mean(axis=(0, 2))) for found in (errors, claims))
     assert (rms < (0.012, 0.008)).all()
     assert (rms < claimed).all()
+
+
+PRODUCT = """
+[model]
+kind = "python"
+function = "tests.functions.product"
+parameters = { a = 0.5, b = 0.5, c = 0.5 }
+outputs = ["f"]
+
+[parameters]
+a = { kind = "uniform", lower = 0, upper = 1 }
+b = { kind = "uniform", lower = 0, upper = 1 }
+c = { kind = "uniform", lower = 0, upper = 1 }
+
+[method]
+"""
+
+
+def test_the_source_is_beside_the_study(tmp_path, monkeypatch):
+    """Or else in the working directory; what is nowhere is said when the study runs, before anything is kept."""
+    (tmp_path / "studies").mkdir()
+    first, again = (tmp_path / "studies" / name for name in ("first.toml", "again.toml"))
+    first.write_text(f'{PRODUCT}kind = "monte-carlo"\nsamples = 200\nfields = false\n')
+    again.write_text(f'{PRODUCT}kind = "sobol"\ndesign = "given-data"\nsource = "results/first"\nfields = false\n')
+    run_study(load(first), "first", tmp_path / "studies" / "results" / "first", quiet=True)
+    beside = load(again)
+    assert beside.method.source == str(tmp_path / "studies" / "results" / "first")
+    assert parse(document(beside)) == beside
+    run_study(beside, "again", tmp_path / "again", quiet=True)
+    with xr.open_dataset(tmp_path / "again" / "results.nc", engine="h5netcdf") as found:
+        np.testing.assert_allclose(found["sobol_total"][0], 16 / 37, atol=0.05)
+        assert found.attrs["stopped"].startswith("from the results of first: ")
+    moved = tmp_path / "again.toml"
+    moved.write_text(again.read_text())
+    monkeypatch.chdir(tmp_path / "studies")
+    assert load(moved).method.source == beside.method.source
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"results/first: holds no results\.nc"):
+        run_study(load(moved), "none", tmp_path / "none", quiet=True)
+    assert not (tmp_path / "none").exists()
