@@ -74,6 +74,11 @@ class Results:
         """SI unit of an output."""
         return str(self.dataset["unit"].sel(output=output).item())
 
+    def parameter_unit(self, path: str) -> str:
+        """SI unit of a number of the model, by its path; "1" for coefficients of random fields."""
+        scalars = self.study.model.scalars
+        return str(scalars[path].unit) if path in scalars else "1"
+
     @property
     def solves(self) -> int:
         """Number of solves."""

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from forward.words import number, per, with_unit
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import unit_of
 
 
 class LocalField(Section):
@@ -36,6 +35,6 @@ def field_norms(results: Results) -> Table:
         size, std, wide = (
             float(of_parameter[key]) for key in ("field_derivative_rms", "parameter_std", "parameter_range")
         )
-        slope = with_unit(number(size, 5), per("m", unit_of(name)))
+        slope = with_unit(number(size, 5), per("m", results.parameter_unit(name)))
         rows.append((name, slope, with_unit(number(size * std), "m"), with_unit(number(size * wide), "m")))
     return Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)

@@ -9,7 +9,6 @@ from forward.words import number, per, with_unit
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,7 +39,7 @@ def sensitivities(results: Results, output: str) -> Table:
     rows = []
     for name in results.leading(slopes["derivative_per_std"]):
         of_parameter = slopes.sel(parameter=name)
-        slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, unit_of(name)))
+        slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, results.parameter_unit(name)))
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
         rows.append((name, slope, *(with_unit(number(value), unit) for value in scaled)))
     return Table(("parameter", "derivative", "× standard deviation", "× range"), rows)

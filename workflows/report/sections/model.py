@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from forward.words import number, settings
 from workflows.report.blocks import Block, Heading, Pairs, Table
 from workflows.report.section import Results, Section
-from workflows.report.words import model_in_words, unit_of
+from workflows.report.words import model_in_words
 
 
 class Model(Section):
@@ -32,7 +32,7 @@ def parameters(results: Results) -> Table:
         block = distribution.model_dump()
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
-        rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, unit_of(name)))
+        rows.append((name, f"{block['kind']}: {settings(block, 'kind')}", mean, std, results.parameter_unit(name)))
     for field, count in Counter(path.split(".")[1] for path in results.study.model.coefficients).items():
         kept = float(results.dataset["variance_kept"].sel(random_field=field))
         law = f"independent standard normal; {100 * kept:.3g} % of the variance of the field"
