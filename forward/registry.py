@@ -167,9 +167,18 @@ class OfKind:
 
     def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
         """Any of the kinds that have a name, or a block of a dotted one, of which nothing is known."""
-        known = [handler(self.block(kind).__pydantic_core_schema__) for kind in self.kinds.names]
+        known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.names]
         other = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}}
         return {"anyOf": [*known, {**other, "required": ["kind"]}]}
+
+
+def _with_reference(block: type[Settings]) -> core_schema.CoreSchema:
+    """Return the schema of a block by which it has a place of its own in a JSON Schema, that others refer to."""
+    found: core_schema.CoreSchema = block.__pydantic_core_schema__
+    name = found.get("ref")
+    if not isinstance(name, str):
+        return found
+    return core_schema.definitions_schema(core_schema.definition_reference_schema(name), [found])
 
 
 def _mistake(kind: str, message: str, given: Any, **context: Any) -> ValidationError:

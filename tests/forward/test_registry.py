@@ -77,4 +77,6 @@ def test_mistakes_have_their_places(outside, first, place, said):
 
 def test_the_schema_knows_the_kinds():
     schema = TypeAdapter(Body).json_schema()
-    assert {one["title"] for one in schema["properties"]["first"]["anyOf"] if "title" in one} == {"Gravity", "Traction"}
+    named = {one["$ref"].rpartition("/")[2] for one in schema["properties"]["first"]["anyOf"] if "$ref" in one}
+    assert named == {"Gravity", "Traction"}
+    assert named <= schema["$defs"].keys()
