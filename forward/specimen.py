@@ -30,7 +30,7 @@ from forward.model import Finding, FloatArray, Guess, ModelError, OneByOne, Refe
 from forward.observables.outputs import Output, PointDisplacement
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
-from forward.solvers.newton import SolverSettings
+from forward.solvers.settings import SolverSettings
 from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load

@@ -34,7 +34,7 @@ from forward.materials.admissible import moduli
 from forward.materials.material import constants, energy_of, isochoric
 from forward.model import FloatArray, SolveError, Work
 from forward.solvers.linear import LinearSolver
-from forward.solvers.newton import Residual
+from forward.solvers.system import Residual
 from forward.terms.term import Place, Term
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences

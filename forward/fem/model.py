@@ -18,9 +18,10 @@ from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, Reference, SolveError, Stability, Work
 from forward.solvers.anderson import Inverse, block_galerkin
-from forward.solvers.newton import Found, Residual, solve
+from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
 from forward.solvers.stability import NOT_SCREENED, Screened, draw
+from forward.solvers.system import Found, Residual
 
 FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
 ITERATIONS = 20  # of these derivatives, before a factor is made after all

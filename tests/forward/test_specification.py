@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS, constants, measures
-from forward.solvers.newton import SolverSettings
+from forward.solvers.settings import SolverSettings
 
 pytestmark = pytest.mark.unit
 

@@ -10,7 +10,7 @@ from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.fem.functionals import functional
 from forward.hyperelastic import Hyperelastic
-from forward.solvers.newton import solve
+from forward.solvers.equilibrium import solve
 from tests.bodies import MATERIALS, OUTPUTS, loaded_body
 from tests.launch import ROOT, run_script
 from workflows.config.study import load

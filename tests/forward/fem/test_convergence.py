@@ -12,7 +12,7 @@ from mpi4py import MPI
 from forward.fem.dolfinx import spaces
 from forward.fem.equations import Discretisation
 from forward.hyperelastic import Hyperelastic
-from forward.solvers.newton import solve
+from forward.solvers.equilibrium import solve
 
 pytestmark = pytest.mark.fem
 MATERIAL = {"kind": "neo-hookean-coupled", "mu": 1.0, "lmbda": 2.0}

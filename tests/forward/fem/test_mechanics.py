@@ -13,7 +13,7 @@ from forward.fem.functionals import functional
 from forward.fem.layout import Layout
 from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS as REGISTERED
-from forward.solvers.newton import solve
+from forward.solvers.equilibrium import solve
 from tests import textbook
 from tests.bodies import (
     CELLS,

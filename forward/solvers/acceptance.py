@@ -1,0 +1,97 @@
+"""Whether a state is an equilibrium, and one that a body takes."""
+
+from __future__ import annotations
+
+from forward.model import FloatArray, SolveError, Stability
+from forward.solvers.settings import SolverSettings
+from forward.solvers.stability import NOT_SCREENED
+from forward.solvers.system import Residual, System, Way
+
+STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
+
+
+class Diverged(Exception):  # noqa: N818 - control flow of the solvers
+    """An attempt at one load failed, for the reason given."""
+
+
+class Unstable(Diverged):
+    """An equilibrium was found that is not stable."""
+
+    def __init__(self, negative: int, *, missed: bool) -> None:
+        what = f"the equilibrium is unstable (its stiffness has {_counted(negative)})"
+        super().__init__(f"{what}: the body buckles, or its mesh is too coarse")
+        self.stability = Stability.MISSED if missed else Stability.REFUSED
+
+
+def converged(system: System, tolerance: float, u: FloatArray, residual: Residual, sizes: list[float]) -> bool:
+    """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding.
+
+    `sizes` are those of the residuals before, to which this one is added.
+    """
+    if residual.gap != 0:
+        return False
+    size = max(residual.size, residual.volume)
+    if size <= tolerance * residual.scale:
+        return True
+    stalled = bool(sizes) and size > STALLED * sizes[-1]
+    sizes.append(size)
+    return (residual.scale == 0 or stalled) and size <= system.rounding(u, residual.scale)
+
+
+def convex(system: System, before: tuple[FloatArray, Residual], now: tuple[FloatArray, Residual]) -> bool:
+    """Whether the energy is convex along a move; where it is not, only a factor can tell what the state is."""
+    return system.curvature(now[0] - before[0], now[1].vector - before[1].vector) >= 0
+
+
+def accepted(
+    system: System,
+    settings: SolverSettings,
+    u: FloatArray,
+    residual: Residual,
+    way: Way | None = None,
+    history: list[str] | None = None,
+) -> Stability:
+    """Look at an equilibrium: no cell is turned inside out and it is not unstable, or raise `Diverged`.
+
+    What counts is the stiffness at the state itself, however it was found. Only where a reference is at hand may a
+    screen take the place of counting its negative eigenvalues.
+    """
+    check_jacobian(system, u)
+    if settings.accept_unstable:
+        return Stability.NOT_TESTED
+    seen = NOT_SCREENED
+    if way is not None:
+        seen = way.screen(u, residual)
+        if history is not None:
+            history.append(f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}")
+        if way.draw >= seen.chance:
+            return Stability.SCREENED
+    try:
+        negative = system.negative_eigenvalues(u)
+    except SolveError as error:
+        raise Diverged(error.reason) from None
+    if negative is None:
+        return Stability.NOT_TESTED
+    if negative > 0:
+        raise Unstable(negative, missed=seen.clear)
+    return Stability.COUNTED
+
+
+def check_jacobian(system: System, u: FloatArray) -> None:
+    """Raise `Diverged` where a cell is turned inside out."""
+    jacobian = system.smallest_jacobian(u)
+    if not jacobian > 0:
+        message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
+        raise Diverged(message)
+
+
+def instability(system: System) -> str:
+    """Say what the last factor tells of a failure; nothing where it shows no negative eigenvalue."""
+    negative = system.inertia()
+    if negative is None or negative <= 0:
+        return ""
+    return f"; the last stiffness has {_counted(negative)} (unstable, or far from equilibrium)"
+
+
+def _counted(negative: int) -> str:
+    return f"{negative} negative eigenvalue{'' if negative == 1 else 's'}"

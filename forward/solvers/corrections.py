@@ -1,0 +1,98 @@
+"""Correcting a prediction with the factor of another state, by Anderson mixing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forward.model import FloatArray
+from forward.solvers.acceptance import Diverged, accepted, converged, convex
+from forward.solvers.anderson import AndersonMixing, Inverse
+from forward.solvers.settings import SolverSettings
+from forward.solvers.system import Found, Residual, System, Way
+
+WINDOW = 8  # differences that Anderson mixing keeps
+PATIENCE = 6  # corrections without a smaller residual before they are given up
+ROUGH = 1e-2  # relative residual of a state that only serves to predict the next
+SHORTEST = 1 / 8  # part of the way from the reference that is not divided any more
+ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
+
+
+def predict_correct(system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]) -> Found:
+    """Correct a prediction with a reference factor, in steps along the way where one is too long; or raise `Diverged`.
+
+    With s the slope of the prediction, the state after a part t of the way is ū + t s + t² q(t). The first step takes
+    q = 0; each state that is found gives a value of q, through the last two of which the next is predicted.
+    """
+    slope = start - way.state
+    known: list[tuple[float, FloatArray]] = []
+    reached, target = 0.0, 1.0
+    while True:
+        way.at(target)
+        guess = way.state + target * slope + target**2 * _line(known, target)
+        tolerance = settings.tolerance if target == 1 else ROUGH
+        history.append(f"prediction at {target:.6g} of the way from the reference")
+        u = system.on_target(guess)
+        residual = system.residual(u)
+        close = np.isfinite(residual.size)
+        if close:
+            u, residual, close = mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
+        if close and target == 1:
+            stability = accepted(system, settings, u, residual, way, history)
+            return Found(u, residual.relative, corrected=True, stability=stability)
+        if close:
+            known.append((target, ((u - way.state) / target - slope) / target))
+            reached, target = target, 1.0
+        elif target - reached > SHORTEST:
+            target = (reached + target) / 2
+        else:
+            way.at(1.0)
+            message = "the reference is too far away"
+            history.append(message)
+            raise Diverged(message)
+
+
+def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:
+    """Value at t of the line through the last two of the points known, of the constant through one, or zero."""
+    if not known:
+        return 0.0
+    (b, q) = known[-1]
+    if len(known) == 1:
+        return q
+    (a, p) = known[-2]
+    return np.asarray(p + (t - a) / (b - a) * (q - p))
+
+
+def mix(
+    system: System,
+    tolerance: float,
+    u: FloatArray,
+    residual: Residual,
+    inverse: Inverse,
+    limit: int,
+    history: list[str],
+) -> tuple[FloatArray, Residual, bool]:
+    """Correct u with one factor; return the best state, its residual, and whether it is an equilibrium."""
+    mixing = AndersonMixing(inverse, WINDOW, len(u), system.total, system.weights())
+    best, smallest, since = u, residual, 0
+    sizes: list[float] = []
+    last: tuple[FloatArray, Residual] | None = None
+    for iteration in range(limit + 1):
+        history.append(f"correction {iteration}: relative residual {residual.relative:.3e}")
+        if residual.size > ROUNDED * residual.scale > 0:
+            sizes.clear()  # corrections falter before they are close
+        if converged(system, tolerance, u, residual, sizes):
+            stable = last is None or convex(system, last, (u, residual))
+            return u, residual, stable and system.smallest_jacobian(u) > 0
+        if iteration > 0 and residual.size < smallest.size:
+            best, smallest, since = u, residual, 0
+        else:
+            since += 1
+        if iteration == limit or since > PATIENCE:
+            break
+        last = (u, residual)
+        u = mixing.next(u, residual.vector)
+        residual = system.residual(u)
+        if not np.isfinite(residual.size):
+            history.append("correction: the state has no finite residual")
+            break
+    return best, smallest, False

@@ -1,0 +1,149 @@
+"""Finding the equilibrium of a discretised body: predict and correct with a reference factor, Newton, load steps.
+
+From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
+stiffness; where that is slow it goes on with Newton's method, then with adaptive load steps. All of them stop at the
+same test of the residual. `solve` can also be told to stop after a few iterations, wherever it is then.
+
+Whole Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
+what stops the iteration are steps that grow. A line search on the residual or on the energy, or the natural
+monotonicity test of Deuflhard's NLEQ-ERR, would shorten the first step of a slender body in bending, after which the
+residual is 5000 times and the simplified correction 380 times larger although Newton converges in six more
+iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0002-newton-globalisation.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forward.model import FloatArray, SolveError, Stability
+from forward.solvers.acceptance import Diverged, Unstable, accepted, check_jacobian, converged, convex
+from forward.solvers.anderson import AndersonMixing
+from forward.solvers.corrections import ROUNDED, WINDOW, predict_correct
+from forward.solvers.newton import admissible_step, factorise, load_steps, newton
+from forward.solvers.settings import SolverSettings
+from forward.solvers.system import Found, Residual, System, Way
+
+ASTRAY = 100  # relative residual after the corrections that were allowed: the reference is too far away
+
+
+def solve(
+    system: System,
+    settings: SolverSettings,
+    zero: FloatArray,
+    start: FloatArray | None = None,
+    way: Way | None = None,
+    iterations: int | None = None,
+) -> Found:
+    """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
+
+    Parameters
+    ----------
+    system
+        The body; its `work` counts what is spent.
+    settings
+        Path, tolerance and limits.
+    zero
+        The undeformed state (U_local,).
+    start
+        A prediction of the state at full load (U_local,).
+    way
+        Where the prediction comes from.
+    iterations
+        Stop after so many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
+        or, without one, Newton steps. The equilibrium is looked for after all where they lead to no admissible state,
+        and where they are as many as the settings allow at all.
+
+    Returns
+    -------
+    Found
+        The state, with J > 0 at every quadrature point.
+
+    Raises
+    ------
+    SolveError
+        With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
+    """
+    history: list[str] = []
+    refused = Stability.NOT_TESTED  # of equilibria at full load
+
+    def failed(stop: Diverged) -> None:
+        nonlocal refused
+        if isinstance(stop, Unstable):
+            refused = max(refused, stop.stability)
+
+    def known(found: Found) -> Found:
+        # What the screen has missed is to be known, even where another equilibrium is found in its place.
+        return found._replace(stability=refused) if refused == Stability.MISSED else found
+
+    if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
+        system.at_load(1.0)
+        try:
+            return _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
+        except Diverged as stop:
+            history.append(f"{stop}: the equilibrium is looked for after all")
+            failed(stop)
+    from_zero = start is None or (settings.kind == "newton" and iterations is None)
+    guesses = [zero] if start is None or from_zero else [start, zero]
+    if way is not None and len(guesses) == 2:
+        system.at_load(1.0)
+        try:
+            return known(predict_correct(system, settings, guesses[0], way, history))
+        except Diverged as stop:
+            failed(stop)
+    for guess in guesses:
+        try:
+            return known(newton(system, settings, guess, history, 1.0)[0])
+        except Diverged as stop:
+            failed(stop)
+    try:
+        return known(load_steps(system, settings, zero, history))
+    except SolveError as error:
+        if refused != Stability.NOT_TESTED:
+            message = f"{error.reason}; the equilibrium that was found at full load is unstable"
+            raise SolveError(message, error.history, error.work, refused) from None
+        raise
+
+
+def _iterate_few(
+    system: System, settings: SolverSettings, start: FloatArray, way: Way | None, iterations: int, history: list[str]
+) -> Found:
+    """Make so many iterations, fewer if they meet the tolerance; or raise `Diverged`.
+
+    What counts is the last state and not that with the smallest residual: the first step of a slender body in bending
+    raises the residual although it brings the body closer.
+    """
+    u = system.on_target(start)
+    residual = system.residual(u)
+    mixing = None
+    if way is not None and np.isfinite(residual.size):
+        window = min(iterations, WINDOW)
+        mixing = AndersonMixing(way.inverse(u), window, len(u), system.total, system.weights())
+    sizes: list[float] = []
+    last: tuple[FloatArray, Residual] | None = None
+    for iteration in range(iterations + 1):
+        history.append(f"iteration {iteration} of {iterations}: relative residual {residual.relative:.3e}")
+        if not np.isfinite(residual.size):
+            message = "the state has no finite residual"
+            raise Diverged(message)
+        if residual.size > ROUNDED * residual.scale > 0:
+            sizes.clear()  # as in `mix`
+        if converged(system, settings.tolerance, u, residual, sizes):
+            if mixing is not None and last is not None and not convex(system, last, (u, residual)):
+                message = "the stiffness is indefinite along the last move"
+                raise Diverged(message)
+            stability = accepted(system, settings, u, residual, way if mixing is not None else None, history)
+            return Found(u, residual.relative, corrected=mixing is not None, stability=stability)
+        if iteration == iterations:
+            break
+        last = (u, residual)
+        if mixing is not None:
+            u = mixing.next(u, residual.vector)
+            residual = system.residual(u)
+        else:
+            factorise(system, u)
+            u, residual = admissible_step(system, settings, u, system.solve(-residual.vector))
+    if mixing is not None and residual.relative > ASTRAY:
+        message = "the reference is too far away"
+        raise Diverged(message)
+    check_jacobian(system, u)  # no equilibrium, so neither stable nor unstable
+    return Found(u, residual.relative, converged=False, corrected=mixing is not None)

@@ -1,0 +1,151 @@
+"""What the search for equilibria wants of a discrete system, and what it gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from forward.model import FloatArray, Stability, Work
+from forward.solvers.anderson import Inverse
+from forward.solvers.stability import Screened
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Imbalance of a state.
+
+    Attributes
+    ----------
+    vector
+        This rank's part: forces on the free displacements, distance from the target on the prescribed ones, volumes
+        on the pressures.
+    size
+        Euclidean norm over the free displacements, of all ranks (N).
+    scale
+        What `size` is compared with (N).
+    gap
+        Largest distance of a prescribed unknown from its target (m).
+    volume
+        Norm of the volumes out of balance, of all ranks, as a force (N); 0 where they are rounding, and where
+        pressures are no unknowns.
+    """
+
+    vector: FloatArray
+    size: float
+    scale: float
+    gap: float
+    volume: float = 0.0
+
+    @property
+    def relative(self) -> float:
+        """The residual relative to the loads."""
+        largest = max(self.size, self.volume)
+        return largest / self.scale if self.scale > 0 else largest
+
+
+class System(Protocol):
+    """A nonlinear system at a load fraction, and the linear system of its factorised stiffness.
+
+    Vectors hold this rank's part; every method is collective over the ranks of the system.
+    """
+
+    work: Work
+
+    def at_load(self, fraction: float) -> None:
+        """Scale all loads and prescribed displacements."""
+
+    def on_target(self, u: FloatArray) -> FloatArray:
+        """Return u with the prescribed unknowns at their targets."""
+
+    def residual(self, u: FloatArray) -> Residual:
+        """Return the imbalance at u."""
+
+    def rounding(self, u: FloatArray, scale: float) -> float:
+        """What the size of a residual with this scale cannot be expected to fall below at u, whatever the loads (N)."""
+
+    def factorise(self, u: FloatArray) -> None:
+        """Assemble and factorise the stiffness at u.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve K x = right with the factor at hand; prescribed rows are identities."""
+
+    def total(self, values: FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+
+    def curvature(self, move: FloatArray, change: FloatArray) -> float:
+        """Second difference of the energy along a move, from the change of the residual's vector."""
+
+    def weights(self) -> FloatArray:
+        """What turns a residual's vector into forces (N)."""
+
+    def norm(self, x: FloatArray) -> float:
+        """Euclidean norm over the displacements of all ranks (pressures, in another unit, follow them)."""
+
+    def smallest_jacobian(self, u: FloatArray) -> float:
+        """Smallest J = det F over the quadrature points of all ranks."""
+
+    def inertia(self) -> int | None:
+        """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
+
+        A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
+        """
+
+    def negative_eigenvalues(self, u: FloatArray) -> int | None:
+        """Factorise the stiffness at u; return the same of it, or of its symmetric part where it is not symmetric.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+
+
+class Way(Protocol):
+    """The way in parameters from a reference state, whose factor is at hand, to the values that are asked for."""
+
+    @property
+    def state(self) -> FloatArray:
+        """The state (U_local,) of the reference."""
+
+    @property
+    def draw(self) -> float:
+        """A number in [0, 1) that depends on the parameters only: states are counted where it is small."""
+
+    def screen(self, u: FloatArray, residual: Residual) -> Screened:
+        """Return what the screen of `forward.solvers.stability` says of an equilibrium."""
+
+    def at(self, fraction: float) -> None:
+        """Give the system the parameters after a part of the way."""
+
+    def inverse(self, u: FloatArray) -> Inverse:
+        """Return an approximate inverse of the stiffness at u."""
+
+
+class Found(NamedTuple):
+    """A state (U_local,) and what is known of it.
+
+    Attributes
+    ----------
+    state
+        The state.
+    residual
+        Its relative residual.
+    converged
+        Whether it is an equilibrium to the solver's tolerance.
+    corrected
+        Whether it was found with the factor of the reference.
+    stability
+        How its stability was looked at; where that is by counting, the last factor is that of the stiffness there.
+    """
+
+    state: FloatArray
+    residual: float
+    converged: bool = True
+    corrected: bool = False
+    stability: Stability = Stability.NOT_TESTED
