@@ -25,6 +25,7 @@ MATTERS = 0.01  # error of a standard deviation from which its tails matter
 LATER = 3.0
 BEYOND_SAMPLES = 0.3  # share of the variance that may come from beyond the samples without a word
 ROUNDING = 1e-9
+LAST_DIGITS = 1e-13  # of an output
 CENTRE = 6.0  # leave-one-out errors that an expansion may err by at the mean parameters
 SEEN = 1e-3  # of the standard deviation: errors there that are not worth a word
 
@@ -155,10 +156,14 @@ def of_reach(names: Sequence[str], outside: FloatArray, relative: FloatArray, sa
             )
 
 
-def of_centre(names: Sequence[str], errors: FloatArray, loo: FloatArray, std: FloatArray) -> Iterator[Finding]:
+def of_centre(
+    names: Sequence[str], values: FloatArray, errors: FloatArray, loo: FloatArray, std: FloatArray
+) -> Iterator[Finding]:
     """Find the outputs that an expansion misses (m,) at the mean parameters, where there was a solve of its own."""
-    for name, error, left, size in zip(names, np.abs(errors).tolist(), loo.tolist(), std.tolist(), strict=True):
-        if error > max(CENTRE * left, SEEN * size):
+    rounding = LAST_DIGITS * np.abs(values)
+    limits = np.maximum(np.maximum(CENTRE * loo, SEEN * std), rounding)
+    for name, error, left, limit in zip(names, np.abs(errors).tolist(), loo.tolist(), limits.tolist(), strict=True):
+        if error > limit:
             yield Finding(
                 "warning",
                 f"At the mean parameters, a solve that the fit has not seen, the expansion of {name} errs by "

@@ -206,11 +206,7 @@ def jackknife_error(left_out: FloatArray) -> FloatArray:
 
 
 def field_indices(
-    variance: FloatArray,
-    first: FloatArray,
-    total: FloatArray,
-    volumes: FloatArray | None = None,
-    known: NDArray[np.bool_] | None = None,
+    variance: FloatArray, first: FloatArray, total: FloatArray, volumes: FloatArray | None = None
 ) -> dict[str, tuple[tuple[str, ...], FloatArray | NDArray[np.int64]]]:
     """Return the generalised indices of a field, its indices by node, and which parameter dominates there.
 
@@ -220,19 +216,15 @@ def field_indices(
         V (nodes,), and V_i and T_i (d, nodes) of d parameters, sums over the components.
     volumes
         Share (nodes,) of the body that each node stands for in the integrals; by default all count alike.
-    known
-        At which nodes something is known of the variance; by default at all.
 
     Returns
     -------
     dict
         `field_sobol_first` and `field_sobol_total` (parameter); `node_sobol_first` and `node_sobol_total` (parameter,
-        node), zero where nothing moves or is known; and `dominating` (node), the number of the parameter with the
-        largest total index, or −1 there.
+        node), zero where nothing moves; and `dominating` (node), the number of the parameter with the largest total
+        index, or −1 where nothing moves.
     """
     moving = variance > MOVES * variance.max(initial=0.0)
-    if known is not None:
-        moving &= known
     at_node = np.where(moving, variance, 0.0)
     v = np.ones(len(variance)) if volumes is None else volumes
     return {

@@ -38,6 +38,7 @@ from uq.surrogates.regression import (
     DICTIONARY,
     FULL,
     NOTHING,
+    ROUNDING,
     ROWS_PER_TERM,
     TRUSTED,
     Data,
@@ -273,7 +274,7 @@ def expansion_dataset(
         dataset = dataset.assign(_distribution(method, regression))
     add(dataset, *regression.doubts(evaluate.outputs))
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
-    add(dataset, *of_centre(evaluate.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
+    add(dataset, *of_centre(evaluate.outputs, centre.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
     if field is not None:
         dataset = dataset.assign(
             _field_estimates(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
@@ -313,12 +314,19 @@ def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tup
             len(data.values), len(drawn), p=data.weights / data.weights.sum()
         )
         drawn = np.where(rough, drawn + fit.unseen[which], drawn)
-    counts = [np.histogram(column, BINS, density=True) for column in drawn.T]
+    counts = [_density(column) for column in drawn.T]
     return {
         **found.variables,
         "density": (("output", "bin"), np.array([density for density, _ in counts])),
         "density_edge": (("output", "edge"), np.array([edges for _, edges in counts])),
     }
+
+
+def _density(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Density in bins of values (n,), and their edges; NaN for what does not vary, which has none."""
+    if np.ptp(drawn) <= ROUNDING * np.abs(drawn).max():
+        return np.full(BINS, np.nan), np.linspace(drawn.min(), drawn.max(), BINS + 1)
+    return np.histogram(drawn, BINS, density=True)
 
 
 def _among(terms: NDArray[np.int64], which: NDArray[np.int64], coefficients: FloatArray) -> FloatArray:

@@ -363,10 +363,11 @@ def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     indices = dataset["multi_index"].to_numpy()
     variance, first, total = partial_variances(squares, indices, np.eye(indices.shape[1], dtype=bool))
     nothing = "field_loo_error" in dataset and float(dataset["field_loo_error"]) > NOTHING
-    known = None
+    dataset = dataset.assign(field_indices(variance, first.T, total.T, volumes))
     if "node_loo_error" in dataset:
-        known = (dataset["node_loo_error"].to_numpy() <= NOTHING) & (not nothing)
-    dataset = dataset.assign(field_indices(variance, first.T, total.T, volumes, known))
+        known = (dataset["node_loo_error"] <= NOTHING) & (not nothing)
+        maps = {f"node_{name}": dataset[f"node_{name}"].where(known) for name in RUNNING}
+        dataset = dataset.assign({**maps, "dominating": dataset["dominating"].where(known, -1)})
     for name in RUNNING:
         if nothing:
             dataset[f"field_{name}"] = dataset[f"field_{name}"] * np.nan

@@ -363,7 +363,8 @@ def _select(
     """
     n, rows, m = right.shape
     columns, parts, folds = products.columns, products.parts, len(products.parts)
-    scale = np.maximum(np.linalg.norm(right - right.mean(axis=0), axis=(0, 1)), 1e-300)
+    size, scale = (np.linalg.norm(one, axis=(0, 1)) for one in (right, right - right.mean(axis=0)))
+    scale = np.where(scale > ROUNDING * size, scale, np.maximum(size, 1e-300))  # a constant asks for no function
     rest = (right / scale).reshape(n * rows, m)
     explained = np.tile(columns.T @ rest, (folds + 1, 1, 1))
     for k, part in enumerate(parts):

@@ -158,6 +158,32 @@ def test_indices_of_a_product():
     np.testing.assert_allclose(data["sobol_total"][0], (25 + 2 * 5 + 1) / 91, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("constant", [3.0, 0.0, -1e9])
+@pytest.mark.parametrize("gradients", [True, False])
+def test_an_output_that_does_not_vary(constant, gradients):
+    """It asks for no function, has no density, and no warning of numpy's is printed."""
+    inputs = Inputs({name: Uniform(lower=0.0, upper=1.0) for name in "ab"})
+    outputs = ("f", "c")
+
+    def both(p):
+        return [np.exp(p[0]) * p[1], constant]
+
+    def slopes(p):
+        return [[np.exp(p[0]) * p[1], np.exp(p[0])], [0.0, 0.0]]
+
+    def alone(p):
+        return both(p)[0]
+
+    data = run(Chaos(samples=12, gradients=gradients), inputs, both, slopes, outputs=outputs)
+    one = run(Chaos(samples=12, gradients=gradients), inputs, alone, lambda p: slopes(p)[:1])
+    assert data["mean"].sel(output="c").item() == pytest.approx(constant, rel=1e-13, abs=1e-15)
+    assert data["std"].sel(output="c").item() <= 1e-13 * abs(constant)
+    assert np.isnan(data["density"].sel(output="c")).all()
+    assert " of c " not in data.attrs.get("findings", "")
+    assert data["loo_error"].sel(output="f").item() == pytest.approx(one["loo_error"].item(), rel=1e-6)
+
+
 @pytest.mark.parametrize("gradients", [True, False])
 def test_leave_one_out_is_what_it_says(monkeypatch, gradients):
     inputs = Inputs({name: SMOOTH.marginals[name] for name in "ab"})

@@ -15,6 +15,7 @@ from forward import words as numbers
 from forward.model import WORK, FunctionModel, SolveError
 from uq.estimators.indices import field_indices
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal, Normal, Uniform
 from workflows.config.study import dump, parse
 from workflows.report import bodies, plots, words
 from workflows.report.page import compare, write_report
@@ -610,3 +611,32 @@ def test_units_of_parameters(path, unit, of_a_length, number):
     assert words.unit_of(path) == unit
     assert numbers.per("m", unit) == of_a_length
     assert numbers.with_unit(numbers.number(2.0), unit) == number
+
+
+@pytest.mark.parametrize(
+    ("prior", "at", "std"),
+    [
+        (Normal(mean=5e3, std=5e2), 9.95e3, 39.0),  # ten deviations away
+        (Uniform(lower=5e3, upper=9.5e3), 9.497e3, 2.7),  # at an end
+        (LogNormal(mean=1e3, std=5e2), 2e3, 1e2),
+    ],
+)
+def test_axes_of_posteriors_hold_the_posterior(prior, at, std):
+    z = np.linspace(-5.6, 5.6, 1001)
+    values, slopes = prior.from_normal(z)
+    density = np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300)
+    draws = at + std * np.random.default_rng(0).standard_normal(500)
+    if prior.support is not None:
+        draws = draws[draws < prior.support[1]]
+    columns = {"mode": at, "mean": at, "std": std, "laplace_std": std, "prior_std": 5e2, "true": np.nan}
+    one = xr.Dataset(
+        {name: (("parameter",), [value]) for name, value in columns.items()}
+        | {"draw": (("draw_n", "parameter"), draws[:, None])},
+        coords={"parameter": ["material.C1"]},
+    ).assign(chains=0, effective=100.0)
+    ax = plots.inversion.marginals(one, {"material.C1": (values, density)})
+    low, high = ax.get_xlim()
+    assert low < np.quantile(draws, 0.003) < np.quantile(draws, 0.997) <= high
+    assert high - low < 20 * std
+    if prior.support is not None:
+        assert high <= prior.support[1]

@@ -176,10 +176,10 @@ def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
         mean, std = float(of["mode"]), float(of["laplace_std"])
         low, high = _span(draws, mean, min(std, 3 * float(of["std"])), float(of["true"]))
         values, density = before[name]
-        x = np.linspace(max(low, values[0]), min(high, values[-1]), 300)
+        x = np.linspace(*_cut(low, high, np.append(draws, mean), values[[0, -1]]), 300)
         ax.fill_between(x, _smooth(draws, float(of["std"]), _worth(one), x), **_FILLED)
         ax.plot(x, _bell(x, mean, std), color=DARK, linewidth=1, label="Laplace")
-        ax.plot(x, np.interp(x, values, density), color=PLAIN, linestyle="--", label="prior")
+        ax.plot(x, np.interp(x, values, density, left=0.0, right=0.0), color=PLAIN, linestyle="--", label="prior")
         if np.isfinite(of["true"]):
             ax.axvline(float(of["true"]), color=HIGH, label="truth")
         _finish(ax, named(name, unit_of(name)), x)
@@ -197,6 +197,13 @@ def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[floa
     if low - 2 * wide < true < high + 2 * wide:
         low, high = min(low, true - 0.1 * wide), max(high, true + 0.1 * wide)
     return low, high
+
+
+def _cut(low: float, high: float, posterior: FloatArray, prior: FloatArray) -> tuple[float, float]:
+    """Cut the ends of an axis off where the prior (2,) ends, unless points (n,) of the posterior are beyond."""
+    slack = 1e-6 * (prior[1] - prior[0])
+    low = max(low, float(prior[0])) if posterior.min() > prior[0] - slack else low
+    return low, min(high, float(prior[1])) if posterior.max() < prior[1] + slack else high
 
 
 def _worth(one: xr.Dataset) -> float:
@@ -225,7 +232,10 @@ def _finish(ax: Axes, label: str, x: FloatArray) -> None:
 
 def _legend(found: list[Axes]) -> None:
     handles, labels = found[0].get_legend_handles_labels()
-    found[0].figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
+    figure = found[0].get_figure(root=True)
+    assert figure is not None
+    columns = 4 if figure.get_figwidth() > 5 else 2
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize="small", frameon=False)
 
 
 def node_marginals(one: xr.Dataset) -> Axes:
@@ -264,7 +274,7 @@ def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax.axvline(0, color=HIGH, linewidth=1)
     ax.set_yticks(places, names)
     ax.set_ylim(-0.6, len(names) - 0.4)
-    farthest = max(3.0, float(np.abs(z).max()) + 1.3)
+    farthest = max(3.0, 1.05 * float(np.abs(z).max()) + 1.3)
     ax.set_xlim(-farthest, farthest)
     ax.set_xlabel("(mean − truth)/standard deviation")
     return ax
