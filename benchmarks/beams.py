@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from workflows.config.study import Study, load
+from workflows.config.study import load
+from workflows.studies.sampling import Study
 
 CONFIG = Path(__file__).parent.parent / "configs" / "beam.toml"
 

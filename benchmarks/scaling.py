@@ -101,7 +101,8 @@ def measured() -> tuple[Constants, FloatArray, FloatArray]:
     from uq.evaluation.evaluate import Merger, Request, SerialEvaluate
     from uq.inputs.sampling import random_points
     from uq.surrogates.linearisation import linearise
-    from workflows.config.study import Study, load
+    from workflows.config.study import load
+    from workflows.studies.sampling import Study
 
     times = []
     for study in (beam((12, 2, 4)), load(CONFIG.with_name("beam-wide.toml"))):

@@ -79,10 +79,10 @@ if TYPE_CHECKING:
     from tissuq.studies import read as read
     from tissuq.studies import run as run
     from uq.findings import findings as findings
-    from workflows.config.study import Study as Study
-    from workflows.config.study import StudyError as StudyError
+    from workflows.config.mistakes import StudyError as StudyError
     from workflows.report import bodies as bodies
     from workflows.report import plots as plots
+    from workflows.studies.sampling import Study as Study
 
 
 def __getattr__(name: str) -> Any:

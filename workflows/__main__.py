@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from workflows.config.study import AnyStudy
+    from workflows.studies.study import StudyKind
 
 # One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StopError as error:
         return _end(f"failed: {error}", FAILED)
     from forward.model import ModelError, SolveError
-    from workflows.config.study import StudyError
+    from workflows.config.mistakes import StudyError
 
     try:
         code = int(options.command(options))
@@ -130,19 +130,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _load(options: argparse.Namespace) -> AnyStudy:
+def _load(options: argparse.Namespace) -> StudyKind:
     """Read the study; modules of a Python model are found beside it and in the working directory, after all others."""
-    from forward.external.models import PythonModel
     from forward.machine import reserve_for_linear_algebra
     from workflows.config.study import load
 
     reserve_for_linear_algebra()
     study = load(options.study, options.set)
-    model = getattr(study, "model", None)
-    if isinstance(model, PythonModel):
+    if study.modules:
         from forward.external.own_modules import make_visible
 
-        make_visible(model.modules, [options.study.resolve().parent, Path.cwd()])
+        make_visible(study.modules, [options.study.resolve().parent, Path.cwd()])
     if study.report is not None:  # a section that is missing is said before the study runs
         from workflows.report.section import of_study
 
@@ -178,7 +176,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from workflows.config.study import StudyError
+    from workflows.config.mistakes import StudyError
     from workflows.report.page import compare, write_report
 
     if options.out is not None and len(options.directories) == 1:
@@ -199,8 +197,9 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from workflows.config.study import Study, StudyError
+    from workflows.config.mistakes import StudyError
     from workflows.serve import serve
+    from workflows.studies.sampling import Study
 
     study = _load(options)
     if not isinstance(study, Study):

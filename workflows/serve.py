@@ -26,8 +26,9 @@ from forward.model import FloatArray, Guess, ModelError, Solution, SolveError, d
 from forward.settings import nearest, shown
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
-from workflows.config.study import Study, StudyError
+from workflows.config.mistakes import StudyError
 from workflows.http import RefusalError, Server
+from workflows.studies.sampling import Study
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from forward.settings import nearest
-from workflows.config.study import StudyError
+from workflows.config.mistakes import StudyError
 
 _MODEL = """\
 # A study of tissuq. SI units throughout. Check it with `tissuq check FILE`, run it with `mpirun -n 2 tissuq run FILE`.

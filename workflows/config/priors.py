@@ -1,17 +1,59 @@
-"""Priors that reach where there is no material: what is refused, and what is said of the rest."""
+"""Priors that reach where there is no model: what is refused, and what is said of the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
 from forward.materials.admissible import Materials
 from forward.model import Finding
-from forward.scalars import Mistake
+from forward.scalars import Mistake, Scalar
+from forward.settings import nearest
+from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
+NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 LEAST = 0.5  # probability that constants must have to be of a material at all
+
+
+def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of parameters, by their paths."""
+    return {path: distribution.range for path, distribution in parameters.items()}
+
+
+def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
+    """Find a prior of the factor on standard deviations of errors that reaches what is no standard deviation."""
+    if prior is None:
+        return
+    lowest = prior.support[0] if prior.support is not None else prior.at(NEGLIGIBLE)
+    if lowest < 0:
+        message = f"reaches {lowest:.4g}, expected a factor on standard deviations, which is positive"
+        yield place, message, prior.model_dump()
+
+
+def mistakes_of_parameters(
+    scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution], constants: Collection[str] = ()
+) -> Iterator[Mistake]:
+    """Find parameters that are no numbers of a model, or that reach where it is impossible.
+
+    Constants of materials are left out: they are judged together, by `workflows.config.priors`.
+    """
+    for path, distribution in parameters.items():
+        if path not in scalars:
+            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            continue
+        if path in constants:
+            continue
+        ends = distribution.support
+        if ends is None:
+            ends = (distribution.at(NEGLIGIBLE), distribution.at(1 - NEGLIGIBLE))
+        for end in ends:
+            objection = scalars[path].objection(end)
+            if objection is not None:
+                message = f"reaches {end:.4g}, where the model is impossible ({objection})"
+                yield ("parameters", path), message, distribution.model_dump()
+                break
 
 
 def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mistake]:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import Report, located
-from workflows.config.study import StudyError, lines, parse
+from workflows.config.study import parse
 from workflows.report import comparison
 from workflows.report.blocks import Block, Folded, Heading, Html, Text
 from workflows.report.section import SECTIONS, Results, Section, sections

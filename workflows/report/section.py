@@ -17,7 +17,7 @@ from forward.external.own_modules import make_visible
 from forward.registry import KindError, Kinds
 from forward.settings import nearest
 from forward.words import with_error, with_unit
-from workflows.config.study import StudyError
+from workflows.config.mistakes import StudyError
 from workflows.report.words import solves
 
 if TYPE_CHECKING:

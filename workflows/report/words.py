@@ -12,7 +12,7 @@ from forward.materials.material import MATERIALS, constants, energy_of, units
 from forward.observables.outputs import Output
 from forward.terms.term import Term
 from forward.words import listed, number, settings, with_unit
-from workflows.config.study import Study
+from workflows.studies.sampling import Study
 
 
 def stability(counts: dict[str, int]) -> str:

@@ -5,34 +5,38 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import Loaded, Sources, other_code, sources
 from forward.registry import dotted
-from forward.spec import ModelSpec
-from workflows.config.study import StudyError, document
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document
 from workflows.results.directory import write_text
 
 if TYPE_CHECKING:
-    from workflows.config.study import AnyStudy
+    from workflows.studies.study import StudyKind
 
 FILE = "sources.json"
 
 
-def modules(study: AnyStudy) -> tuple[str, ...]:
+def modules(study: StudyKind) -> tuple[str, ...]:
     """Return the modules of a user that a study names: those of its model, and of kinds that are dotted paths."""
-    model = getattr(study, "model", None)
-    of_model = model.modules if isinstance(model, ModelSpec) else ()
-    return tuple(dict.fromkeys([*of_model, *dotted(document(study))]))
+    return tuple(dict.fromkeys([*study.modules, *dotted(document(study))]))
 
 
-def digest(study: AnyStudy) -> str | None:
+def digest(study: StudyKind) -> str | None:
     """Return a hash of these modules and of what they import, if there are any."""
     found = modules(study)
     return sources(found).digest if found else None
 
 
-def refuse_other(directory: Path, study: AnyStudy) -> None:
+def identity(study: StudyKind) -> dict[str, Any]:
+    """Return all that decides on evaluations: the study, and the text of these modules."""
+    source = digest(study)
+    return study.identity() | ({} if source is None else {"source": source})
+
+
+def refuse_other(directory: Path, study: StudyKind) -> None:
     """Compare the modules of a user with those that the results in a directory follow from.
 
     Raises
@@ -52,7 +56,7 @@ def refuse_other(directory: Path, study: AnyStudy) -> None:
         raise StudyError(message)
 
 
-def keep(directory: Path, study: AnyStudy, loaded: Loaded | None) -> None:
+def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
     """Write down the modules of a user, with those that were loaded in the course of a run."""
     found = modules(study)
     if found and loaded is not None:
@@ -67,7 +71,7 @@ def make_visible(directory: Path) -> None:
         sys.path += [str(folder) for folder in known.folders if folder.is_dir() and str(folder) not in sys.path]
 
 
-def listed(study: AnyStudy) -> list[str]:
+def listed(study: StudyKind) -> list[str]:
     """Say which kinds of a study are a user's own, and where they are from."""
     names = list(dict.fromkeys(dotted(document(study))))
     if not names:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from forward.model import Finding, SolveError
 from forward.words import number, with_unit
-from workflows.config.study import ranges
+from workflows.config.priors import ranges
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from uq.evaluation.evaluate import Evaluations
-    from workflows.config.study import Study
+    from workflows.studies.sampling import Study
 
 AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
 

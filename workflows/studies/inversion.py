@@ -14,36 +14,39 @@ from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
 from forward.scalars import Mistake
-from forward.settings import Settings, nearest
+from forward.settings import nearest
 from forward.specimen import Specimen
 from inverse.data.observations import DataError, files
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.priors import findings_of_materials, mistakes_of_materials
-from workflows.config.report import Report
-from workflows.config.study import (
-    Correlation,
-    Parallel,
-    StudyError,
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import StudyError, refused
+from workflows.config.priors import (
+    findings_of_materials,
     mistakes_of_factor,
+    mistakes_of_materials,
     mistakes_of_parameters,
     ranges,
-    refused,
 )
+from workflows.config.report import Report
 from workflows.studies.measured import DataFiles, DataSet, read_measurement
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     from forward.model import Finding, FloatArray
+    from forward.spec import ModelSpec
     from inverse.data.observations import Components
     from inverse.methods.record import Data
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.job import Job
     from workflows.studies.measured import Measurement
-    from workflows.studies.synthesis import Synthesis
 
 SOLVES_OF_FIELD = 12  # for a mode
 
 
-class InversionStudy(Settings):
+class InversionStudy(StudyKind):
     """What inversions of all kinds of models have in common.
 
     Parameters
@@ -73,6 +76,7 @@ class InversionStudy(Settings):
     report: Report | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
+    stopped: ClassVar[str] = "all data sets inverted"
     quantity: ClassVar[str]  # what was measured
 
     def __eq__(self, other: object) -> bool:
@@ -125,6 +129,42 @@ class InversionStudy(Settings):
         each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
         return each * sum(measurement is not None for measurement in self.measurements)
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> InversionStudy:
+        """Check the blocks of an inversion of displacements of a specimen, or of outputs of any model."""
+        model = blocks.get("model")
+        body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
+        if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
+            from workflows.studies.output_inversion import OutputInversion
+
+            return OutputInversion.model_validate(blocks).with_data(folder)
+        return Inversion.model_validate(blocks).with_data(folder)
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model."""
+        return (self.model,)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the model."""
+        found: tuple[str, ...] = self.model.modules
+        return found
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the model, and what is done for each data set; collective."""
+        from workflows.studies.inversion_job import job
+
+        return job(self, ensemble, directory, checkpoint)
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the unknown parameters."""
+        return self.inputs.names
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that decides on evaluations; of a file, its contents and not its place."""
+        return super().identity() | {"model": self.model.identity()}
 
     def measured(self, number: int) -> Data:
         """Return a data set that can be used."""
@@ -277,6 +317,12 @@ class Inversion(InversionStudy):
         """Read a file of displacements; errors as of every inversion."""
         return read_measurement(path, self.model, self.data)
 
+    def plan(self, groups: int) -> list[str]:
+        """Say what is inverted, and how long that will take."""
+        from workflows.studies.inversion_plan import plan
+
+        return plan(self)
+
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
@@ -296,26 +342,3 @@ class Inversion(InversionStudy):
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
         yield from super()._mistakes()
-
-
-def made(blocks: Mapping[str, Any], folder: Path) -> InversionStudy | Synthesis:
-    """Check the blocks of a study of one of these kinds; data files are beside the study, in a folder.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        For mistakes in the blocks.
-    StudyError
-        For mistakes in the data.
-    """
-    if blocks["method"].get("kind") == "synthesize":
-        from workflows.studies.synthesis import Synthesis
-
-        return Synthesis.model_validate(blocks)
-    model = blocks.get("model")
-    body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
-    if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
-        from workflows.studies.output_inversion import OutputInversion
-
-        return OutputInversion.model_validate(blocks).with_data(folder)
-    return Inversion.model_validate(blocks).with_data(folder)

@@ -17,8 +17,8 @@ from forward.spec import MODELS, ModelSpec
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.observations import DataError
 from inverse.data.outputs import OutputData, read_outputs, stated
-from workflows.config.priors import findings_of_materials
-from workflows.config.study import StudyError, ranges
+from workflows.config.mistakes import StudyError
+from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
 from workflows.studies.measured import DataSet
 
@@ -147,6 +147,12 @@ class OutputInversion(InversionStudy):
     def labels(self, number: int) -> list[str]:
         """Say of each datum of a data set where it stands."""
         return self.measured(number).data_labels()
+
+    def plan(self, groups: int) -> list[str]:
+        """Say what is inverted, and how long that will take."""
+        from workflows.studies.inversion_plan import plan_of_outputs
+
+        return plan_of_outputs(self)
 
     def read(self, path: Path) -> OutputData:
         """Read a table of outputs; errors as of every inversion."""

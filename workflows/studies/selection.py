@@ -26,12 +26,18 @@ from inverse.low_dimensional.posterior import NOISE
 from inverse.methods.selection import Select
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.priors import findings_of_materials, mistakes_of_materials
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import StudyError, lines, refused
+from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
-from workflows.config.study import Correlation, Parallel, StudyError, mistakes_of_factor, refused
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.job import Job
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
@@ -327,9 +333,10 @@ class CandidateModel(Settings):
         return self
 
 
-class Comparison(Settings):
+class Comparison(StudyKind):
     """What studies that compare models have in common: candidates by name, groups of data, the method."""
 
+    stopped: ClassVar[str] = "all evidences found"
     quantity: ClassVar[str]  # what was measured
     costly: ClassVar[bool]  # whether solves are worth a file
     candidates: Mapping[str, Any]
@@ -402,6 +409,31 @@ class Comparison(Settings):
         counts = [len(self.tests(group)) for group in self.group_names]
         held_out = sum(count for count in counts if count > 1) if self.method.held_out else 0
         return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
+        """Check the blocks of a comparison on a specimen, where there is one, or on material points."""
+        if "model" in blocks:
+            from workflows.studies import specimen_selection
+
+            return specimen_selection.SpecimenSelection.model_validate(specimen_selection.expanded(blocks, folder))
+        return Selection.model_validate(expanded(blocks, folder))
+
+    def plan(self, groups: int) -> list[str]:
+        """Say what is compared, and how long that will take."""
+        from workflows.studies.selection_plan import plan
+
+        return plan(self)
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the candidates, each for each group of data; collective."""
+        from workflows.studies.selection_job import job
+
+        return job(self, ensemble)
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the parameters of a candidate."""
+        return tuple(self.candidates[label.partition("/")[0]].parameters)
 
     def mistakes_of_method(self) -> Iterator[Mistake]:
         """Find what does not fit the candidates and the data."""
@@ -537,23 +569,6 @@ class Selection(Comparison):
         yield from self.mistakes_of_method()
 
 
-def made(blocks: Mapping[str, Any], folder: Path) -> Comparison:
-    """Check the blocks of a study that compares models of a specimen, where there is one, or of material points.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        For mistakes in the blocks.
-    StudyError
-        For mistakes in the data.
-    """
-    if "model" in blocks:
-        from workflows.studies import specimen_selection
-
-        return specimen_selection.SpecimenSelection.model_validate(specimen_selection.expanded(blocks, folder))
-    return Selection.model_validate(expanded(blocks, folder))
-
-
 def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return a document whose table of data, if it names one, has been read.
 
@@ -568,8 +583,6 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     try:
         table = DataFile.model_validate(dict(data))
     except ValidationError as error:
-        from workflows.config.study import lines
-
         raise StudyError(*lines(error, "data")) from None
     return {**document, "data": table.read(folder)}
 

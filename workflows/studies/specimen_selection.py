@@ -22,9 +22,10 @@ from inverse.data.observations import DataError, read
 from inverse.methods.selection import SelectSpecimens
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.priors import mistakes_of_materials
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import StudyError, lines, refused
+from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
-from workflows.config.study import Correlation, Parallel, StudyError, mistakes_of_parameters, ranges, refused
 from workflows.studies.selection import WHOLE, Comparison
 
 if TYPE_CHECKING:
@@ -204,6 +205,11 @@ class SpecimenSelection(Comparison):
         }
 
     @property
+    def specs(self) -> tuple[Specimen, ...]:
+        """The specimens of all candidates."""
+        return tuple(self.specimens.values())
+
+    @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the specimens before anything is solved, each once."""
         of_specimens = (
@@ -335,8 +341,6 @@ def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     data, candidates = blocks.get("data"), blocks.get("candidates")
     if not isinstance(data, Mapping) or "file" not in data or not isinstance(candidates, Mapping) or not candidates:
         return dict(blocks)
-    from workflows.config.study import lines
-
     try:
         file = DisplacementFile.model_validate(dict(data))
     except ValidationError as error:

@@ -6,7 +6,8 @@ import io
 import json
 from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +15,30 @@ from pydantic import Field, model_validator
 
 from forward.bodies.inclusions import log_factor
 from forward.scalars import Mistake
-from forward.settings import Settings
 from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.priors import mistakes_of_materials
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import refused
+from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
-from workflows.config.study import Correlation, Parallel, mistakes_of_parameters, ranges, refused
 from workflows.studies.job import MethodJob
+from workflows.studies.predictions import duration, formulation, times_of
+from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import Finding, FloatArray
     from forward.specimen import SpecimenModel
+    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.evaluate import Evaluate
 
 
-class Synthesis(Settings):
+class Synthesis(StudyKind):
     """What synthetic data to make.
 
     Parameters
@@ -52,6 +56,9 @@ class Synthesis(Settings):
     report
         Sections of one's own in the report.
     """
+
+    stopped: ClassVar[str] = "all data made"
+    explains: ClassVar[bool] = False
 
     model: Specimen
     parameters: dict[str, Distribution] = Field(default={})
@@ -85,6 +92,23 @@ class Synthesis(Settings):
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
+
+    @property
+    def specs(self) -> tuple[Specimen, ...]:
+        """The specimen."""
+        return (self.model,)
+
+    def plan(self, groups: int) -> list[str]:
+        """Say what is made, and how long that will take."""
+        return plan(self)
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
+        """Make the specimen; collective."""
+        return job(self, ensemble, name)
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of what is drawn."""
+        return self.inputs.names
 
     @model_validator(mode="after")
     def _check(self) -> Synthesis:
@@ -199,3 +223,17 @@ def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
 
     labelled = partial(with_factor, study, places=places, fields=factor)
     return MethodJob(model, {}, task, recorders, labelled, texts=texts)
+
+
+def plan(study: Synthesis) -> list[str]:
+    """Say what is made, and how long that will take."""
+    spec, sets = study.specimen, len(study.method.fraction)
+    seconds = sets * sum(times_of(spec.loaded(case)).textbook for case in spec.cases)
+    return [
+        f"method      {study.method.kind}",
+        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        formulation(study.model.decision(ranges(study.parameters))),
+        f"data sets   {sets}",
+        f"time        about {duration(seconds)} on 1 core (rough)",
+    ]

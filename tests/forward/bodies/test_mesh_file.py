@@ -23,7 +23,8 @@ from forward.specimen import Specimen
 from tests.bodies import loaded_body
 from tests.launch import ROOT, run_script
 from tests.meshes import CELLS, NAMES, SIZE, box, numbered
-from workflows.config.study import StudyError, differences, document, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import differences, document, load, parse
 from workflows.results.directory import label, with_regions, write_fields
 from workflows.run.plan import plan
 

@@ -20,7 +20,8 @@ from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo, _JointMome
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 from uq.surrogates import linearisation
 from uq.surrogates.linearisation import linearise
-from workflows.config.study import StudyError, document, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse
 from workflows.results.directory import read_dataset
 from workflows.run.run import run
 

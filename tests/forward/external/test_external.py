@@ -15,7 +15,8 @@ from forward.model import ModelError, SolveError
 from tests import functions
 from tests.launch import ROOT
 from uq.evaluation.evaluate import Request, SerialEvaluate
-from workflows.config.study import StudyError, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load, parse
 from workflows.results.directory import read_summary
 from workflows.run.plan import plan
 from workflows.run.run import run

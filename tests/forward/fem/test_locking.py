@@ -10,7 +10,8 @@ from benchmarks import locking as benchmark
 from forward.fem.locking import SWITCH, ratios
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import moduli
-from workflows.config.study import StudyError, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import parse
 from workflows.run.plan import plan
 
 BEAM = {

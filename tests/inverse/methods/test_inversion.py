@@ -27,7 +27,8 @@ from tests.problems import curved
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.study import StudyError, document, load, parse, schema
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse, schema
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.run.run import run as run_study

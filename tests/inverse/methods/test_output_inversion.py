@@ -11,7 +11,8 @@ from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs, stated
 from tests.launch import run_script
 from workflows.__main__ import main
-from workflows.config.study import StudyError, document, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
 
 A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])

@@ -21,7 +21,8 @@ from tests.rubber import CONFIGS, FACTOR, treloar
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
-from workflows.config.study import StudyError, dump, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import dump, load, parse
 from workflows.run.plan import plan
 from workflows.starter import starter
 from workflows.studies.findings_selection import doubts_of_selection, findings, grade

@@ -21,7 +21,8 @@ from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import Request, SerialEvaluate
 from uq.inputs.distributions import LogNormal
 from workflows.__main__ import main
-from workflows.config.study import StudyError, dump, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import dump, load, parse
 from workflows.report.sections.finer_meshes import meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan

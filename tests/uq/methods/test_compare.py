@@ -18,7 +18,8 @@ from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.compare import TIMES, Compare, gains, plain_samples
 from uq.methods.monte_carlo import MonteCarlo
-from workflows.config.study import StudyError, document, dump, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, dump, parse
 from workflows.report import plots
 from workflows.report.page import write_report
 from workflows.results.directory import label, write_dataset

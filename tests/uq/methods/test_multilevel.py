@@ -17,7 +17,8 @@ from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.multilevel import MultilevelMonteCarlo, bias, optimal, rate
-from workflows.config.study import StudyError, load, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load, parse
 from workflows.report import plots
 from workflows.report.plots.multilevel import _sampling
 from workflows.run.plan import plan

@@ -14,9 +14,11 @@ from forward.terms.gravity import Gravity
 from uq.inputs.distributions import Normal, Uniform
 from uq.methods.monte_carlo import MonteCarlo
 from workflows.__main__ import main
-from workflows.config.study import Study, StudyError, differences, document, dump, load, parse, schema
+from workflows.config.mistakes import StudyError
+from workflows.config.study import differences, document, dump, load, parse, schema
 from workflows.run.plan import plan
 from workflows.starter import _METHODS, starter
+from workflows.studies.sampling import Study
 
 pytestmark = pytest.mark.unit
 

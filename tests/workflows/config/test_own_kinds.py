@@ -9,7 +9,8 @@ import xarray as xr
 
 from forward.model import ModelError
 from tests.launch import environment
-from workflows.config.study import StudyError, load, schema
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load, schema
 from workflows.run.plan import plan
 from workflows.run.run import run
 

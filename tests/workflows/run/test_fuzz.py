@@ -15,7 +15,8 @@ from inverse.data.observations import DataError, read
 from tests.forward.bodies.test_mesh_file import box, numbered
 from tests.fuzz import damaged_bytes, damaged_table, mutations
 from workflows.__main__ import main
-from workflows.config.study import StudyError, parse
+from workflows.config.mistakes import StudyError
+from workflows.config.study import parse
 from workflows.run import run as study_runs
 
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from workflows.config.study import load
-from workflows.run.plan import parts, plan
+from workflows.run.plan import plan
+from workflows.studies.sampling_plan import parts
 
 pytestmark = pytest.mark.unit
 

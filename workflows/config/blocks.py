@@ -1,0 +1,33 @@
+"""Blocks that studies of all kinds have."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from forward.settings import Settings
+from uq.evaluation.evaluate import BLOCKS
+
+
+class Correlation(Settings):
+    """Correlation of two parameters in the Gaussian copula."""
+
+    between: tuple[str, str]
+    value: Annotated[float, Field(gt=-1, lt=1)]
+
+
+class Parallel(Settings):
+    """How ranks are used; it does not change results (except by rounding, where ranks share a model or blocks change).
+
+    Parameters
+    ----------
+    ranks_per_model
+        Ranks that share one model; the others work on other samples.
+    blocks
+        Most blocks that an evaluation is cut into: more groups of ranks than these have nothing to do, and a block
+        that is interrupted is begun again.
+    """
+
+    ranks_per_model: Annotated[int, Field(ge=1)] = 1
+    blocks: Annotated[int, Field(ge=1, le=1_000_000)] = BLOCKS

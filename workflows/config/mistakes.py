@@ -1,0 +1,129 @@
+"""Mistakes in studies, in words: where, what was given, what was expected."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from forward.scalars import Mistake
+from forward.settings import UNKNOWN_KIND, cut, nearest, one_line, shown
+from uq.inputs.distributions import Distribution
+from workflows.studies.study import SAMPLING, STUDIES
+
+LISTED = 50  # mistakes that are shown
+
+
+class StudyError(Exception):
+    """A study that cannot be run; each argument is one line: the place, what was given and what was expected."""
+
+    def __init__(self, *mistakes: str) -> None:
+        more = [f"and {len(mistakes) - LISTED} more mistakes"] if len(mistakes) > LISTED else []
+        super().__init__(*map(one_line, mistakes[:LISTED]), *more)
+
+    def __str__(self) -> str:
+        """All mistakes, a line each."""
+        return "\n".join(self.args)
+
+
+def refused(title: str, mistakes: Sequence[Mistake]) -> None:
+    """Raise what pydantic raises, if there are mistakes."""
+    if mistakes:
+        raise ValidationError.from_exception_data(
+            title,
+            [
+                InitErrorDetails(type=PydanticCustomError("study", "{message}", {"message": m}), loc=place, input=given)
+                for place, m, given in mistakes
+            ],
+        )
+
+
+_APART = [kind for kind in STUDIES.own if kind != SAMPLING]  # kinds of studies whose files have other blocks
+# What pydantic puts into the places of mistakes beside keys: the members of a union, in words of TOML.
+_MEMBERS = {
+    "str": "a text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "tuple": "a list",
+    "list": "a list",
+    "dict": "a table",
+}
+_MEMBER = re.compile(rf"({'|'.join(_MEMBERS)})(\[.*\])?$")
+_INNER = re.compile(
+    r"\[key\]$|(function-|tagged-union|literal|constrained|lax-or|nullable|is-instance|model|chain|json)\S*\["
+)
+
+
+def lines(error: ValidationError, place: str = "") -> list[str]:
+    """Say the mistakes of a block at a place: where, what was given, what was expected."""
+    items = error.errors(include_url=False)
+    members: dict[str, list[str]] = {}  # what would have been right, by where
+    deeper = set[str]()
+    for item in items:
+        where, member, rest = _around_member(item["loc"], place)
+        if member is not None:
+            members.setdefault(where, []).append(member)
+            deeper |= {where} if rest else set()
+    found = []
+    for item in items:
+        where, member, rest = _around_member(item["loc"], place)
+        if member is None or rest:
+            found.append(_line(item, _place(item["loc"], place)))
+        elif where not in deeper:
+            words = list(dict.fromkeys(members[where]))
+            found.append(f"{where}: expected {' or '.join(words)}; given {shown(item['input'])}")
+    return list(dict.fromkeys(map(one_line, found)))
+
+
+def _around_member(steps: Sequence[str | int], place: str) -> tuple[str, str | None, bool]:
+    """Return where a union on the way to a mistake stands, the member that it is in, and whether it is inside that."""
+    for i, step in enumerate(steps):
+        match = _MEMBER.match(step) if isinstance(step, str) else None
+        if match is not None:
+            return _place(steps[:i], place), _MEMBERS[match[1]], i + 1 < len(steps)
+    return _place(steps, place), None, False
+
+
+def _place(steps: Sequence[str | int], place: str) -> str:
+    for step in steps:
+        if isinstance(step, int):
+            place += f"[{step}]"
+        elif (step not in _TAGS or place == "candidates") and not _INNER.match(step) and not _MEMBER.match(step):
+            place += f".{cut(step, _WORD)}" if place else cut(step, _WORD)
+    return place
+
+
+def _line(item: Any, place: str) -> str:
+    message, given = item["msg"], item["input"]
+    if item["type"] in {"missing", "unknown_key"}:
+        return f"{place}: {message}"
+    if item["type"] == UNKNOWN_KIND and place == "method.kind" and "." not in given:
+        message = f"unknown kind; {nearest(given, [*item['ctx']['known'], *_APART])}"
+    message = f"{place}: {message[:1].lower()}{message[1:]}"
+    if isinstance(given, Mapping) and not message.endswith(
+        ("a table, { key = value }", "a word")
+    ):  # a whole block, of which the message names the part
+        return message
+    return f"{message}; given {shown(given)}"
+
+
+_WORD = 60  # letters of a key in a message
+
+
+def _kinds() -> set[str]:
+    """Return the kinds of blocks, which pydantic puts into the places of errors."""
+    from typing import get_args
+
+    from forward.bodies import geometry, inclusions
+    from forward.observables import outputs
+
+    unions = (geometry.Body, inclusions.Inclusion, outputs.Output, Distribution)
+    members = [member for union in unions for member in get_args(get_args(union)[0])]
+    return {member.model_fields["kind"].default for member in members}
+
+
+_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block

@@ -1,0 +1,151 @@
+"""What a run leaves in summary.json, and says at its end."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uq.estimators import branch
+from uq.findings import findings
+from workflows.report import words
+from workflows.results.summary import inverted, summarise
+from workflows.run import own_code
+from workflows.run.version import commit, versions
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.evaluation.evaluate import Evaluations
+    from uq.evaluation.tasks import Outcome
+    from workflows.studies.job import Job
+    from workflows.studies.study import StudyKind
+
+LISTED = 50  # failures that are listed; evaluations.h5 has all
+
+
+def summarised(
+    study: StudyKind,
+    name: str,
+    dataset: xr.Dataset,
+    job: Job,
+    ranks: int,
+    groups: int,
+    wall: float,
+) -> dict[str, Any]:
+    """Return what summary.json says: the study, what came of it, what that took, and by what it was made."""
+    from forward.model import WORK
+
+    evaluations, outcomes = job.evaluations, job.outcomes
+    every = evaluations.values()
+    done = _of_tasks(outcomes, every) if outcomes else _of_solves(study, evaluations)
+    seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
+    source = own_code.digest(study)
+    stability = branch.counts(every)
+    return {
+        "study": name,
+        "method": study.method.kind,
+        "status": "partial" if done["failed"] else "complete",
+        "stopped": dataset.attrs.get("stopped", study.stopped),
+        **({"note": dataset.attrs["note"]} if "note" in dataset.attrs else {}),
+        "findings": [one._asdict() for one in findings(dataset)],
+        **done,
+        **({"stability": stability} if stability else {}),
+        "wall_seconds": wall,
+        "cpu_seconds": seconds * study.parallel.ranks_per_model,
+        "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
+        **summarise(dataset),
+        "provenance": {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seed": getattr(study.method, "seed", None),
+            "ranks": ranks,
+            "groups": groups,
+            "processor": platform.machine(),
+            "commit": commit(),
+            **({} if source is None else {"source": source}),
+            "versions": {"python": platform.python_version(), **versions()},
+        },
+    }
+
+
+def _of_solves(study: StudyKind, evaluations: Mapping[str, Evaluations]) -> dict[str, Any]:
+    """Number of solves, and which failed."""
+    explains = study.explains
+    failed = [
+        (label, failure)
+        for label, found in evaluations.items()
+        for failure in found.failures
+        if not (explains and failure.inadmissible)
+    ]
+    return {
+        "evaluations": sum(len(found.points) for found in evaluations.values()),
+        "failed": len(failed),
+        **({"zero_likelihood": _unlikely(evaluations.values())} if explains else {}),
+        "failures": [
+            {
+                **({} if label == "/" else {"model": label}),
+                "parameters": dict(zip(study.parameters_of(label), failure.parameters, strict=True)),
+                "reason": failure.reason,
+            }
+            for label, failure in failed[:LISTED]
+        ],
+    }
+
+
+def _of_tasks(outcomes: Sequence[Outcome], evaluations: Iterable[Evaluations]) -> dict[str, Any]:
+    """Number of data sets that were inverted side by side, and which failed."""
+    failed = [(number, one.reason) for number, one in enumerate(outcomes) if one.dataset is None]
+    return {
+        "evaluations": len(outcomes),
+        "failed": len(failed),
+        "zero_likelihood": _unlikely(evaluations),
+        "failures": [{"parameters": {"data_set": float(k)}, "reason": reason} for k, reason in failed[:LISTED]],
+    }
+
+
+def _unlikely(evaluations: Iterable[Evaluations]) -> int:
+    """Number of solves at parameters for which there is no model."""
+    return sum(failure.inadmissible for found in evaluations for failure in found.failures)
+
+
+def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    """Say at the end of a run what was found."""
+    lines = [
+        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
+        f"probability {found['probability']:.3g}"
+        for model, found in summary.get("models", {}).items()
+    ]
+    lines += inverted(summary)
+    for output, values in summary.get("outputs", {}).items():
+        unit = dataset.unit.sel(output=output).item()
+        lines.append(
+            f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
+            f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+        )
+        if "bias_error" in values:
+            lines[-1] += (
+                f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
+            )
+    first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
+        )
+    if not lines:
+        for output, slopes in summary.get("local_per_range", {}).items():
+            shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
+            lines.append(f"{output}: derivative × range of the parameter: {shown}")
+    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
+    lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
+    if "stability" in summary:
+        lines.append(words.stability(summary["stability"]))
+    if "note" in summary:
+        lines.append(summary["note"])
+    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
+    if (directory / "report.html").exists():
+        lines.append(f"report: {directory / 'report.html'}")
+    return "\n".join(lines) + "\n"

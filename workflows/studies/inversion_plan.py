@@ -1,0 +1,84 @@
+"""What an inversion will cost."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from workflows.config.priors import ranges
+from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
+
+if TYPE_CHECKING:
+    from workflows.studies.inversion import Inversion
+    from workflows.studies.output_inversion import OutputInversion
+
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
+
+
+def plan(study: Inversion) -> list[str]:
+    """Say what is inverted, and how long that will take."""
+    from workflows.studies.inversion import SOLVES_OF_FIELD
+
+    spec, sets = study.specimen, study.data.sets
+    usable = [m for m in study.measurements if m is not None]
+    counts = [int(m.observations.measured.sum()) for m in usable]
+    moved = [int((m.moved > 0).sum()) for m in usable]
+    cases = [times_of(spec.loaded(case)) for case in spec.cases]
+    each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)
+    if study.field:
+        unknown = f"{spec.body.vertex_count:,} values of ln stiffness"
+        seconds = (
+            textbook * (SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD) + 2 * study.method.solves(field=True) * each
+        )
+    else:
+        unknown = f"{len(study.names)}: {', '.join(study.names)}"
+        seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
+    seconds += each * study.method.chain_solves(len(study.names), field=study.field)
+    once, checked = mesh_check(spec) if study.method.mesh_check else (0.0, NOT_ASKED)
+    seconds += once
+    return [
+        f"method      {study.method.kind}",
+        f"unknown     {unknown}",
+        *(f"{what:10}  {found}" for what, found in spec.body.listed.items()),
+        f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
+        formulation(study.model.decision(ranges(study.parameters))),
+        f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
+        *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
+        f"mesh check  {checked}",
+        f"time        about {duration(seconds)} for each on 1 core (rough)",
+        *(f"warning     {item.refused}" for item in sets if item.refused),
+    ]
+
+
+def _moved(count: int, farthest: float) -> str:
+    are = "point outside the body is" if count == 1 else "points outside the body are"
+    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m"
+
+
+def plan_of_outputs(study: OutputInversion) -> list[str]:
+    """Say what is inverted, and how long that will take."""
+    from workflows.studies.output_inversion import derivable
+
+    spec, sets, method = study.spec, study.data.sets, study.method
+    counts = [len(found.values) for found in study.measurements if found is not None]
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        f"unknown     {len(study.names)}: {', '.join(study.names)}",
+        f"outputs     {', '.join(study.parts)}",
+        f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
+        f"solves      about {study.solves // len(counts):,} for each",
+    ]
+    cost = spec.cost()
+    if cost is None:
+        derivable(study.spec.build(None, study.inputs.names), spec.kind)
+    else:
+        d = len(study.inputs.names)
+        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4)
+        if method.mesh_check:
+            seconds += 8**2 * cost.textbook
+            lines.append(f"mesh check  one solve of about {8 * spec.unknowns:,} unknowns")
+        else:
+            lines.append(f"mesh check  {NOT_ASKED}")
+        lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")
+    return [*lines, *(f"warning     {item.refused}" for item in sets if item.refused)]

@@ -1,0 +1,50 @@
+"""Parts of what studies say of themselves before they run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.finer import finer
+
+if TYPE_CHECKING:
+    from forward.fem.cost import Times
+    from forward.fem.locking import Decision
+    from forward.spec import ModelSpec
+    from forward.specimen import Specimen
+
+NOT_ASKED = "not asked for: nothing will be said to be trusted"
+
+
+def times_of(spec: ModelSpec) -> Times:
+    """Return the predicted times of a model that has some."""
+    found = spec.cost()
+    assert found is not None
+    return found
+
+
+def formulation(decision: Decision) -> str:
+    """Say which formulation is taken, and why."""
+    return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+
+
+def mesh_check(spec: Specimen) -> tuple[float, str]:
+    """Predict the processor time (s) of a solve on a finer mesh, and say what is solved."""
+    try:
+        if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
+            unknowns, once = 8 * spec.unknowns, 8**2 * sum(times_of(spec.loaded(case)).textbook for case in spec.cases)
+        else:
+            fine = finer(spec)
+            unknowns, once = fine.unknowns, sum(times_of(fine.loaded(case)).textbook for case in fine.cases)
+    except ValueError as error:
+        return 0.0, f"not possible: {error}; nothing will be said to be trusted"
+    return once, f"one solve of {unknowns:,} displacements, about {duration(once)}"
+
+
+def duration(seconds: float) -> str:
+    """Write a time for a prediction."""
+    if seconds < 9.5:
+        return f"{seconds:.2g} s"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

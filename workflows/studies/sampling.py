@@ -1,0 +1,187 @@
+"""A study that samples a model: a written-down constructor call of a model, its random parameters and a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from pydantic import Field, ValidationError, model_validator
+
+from forward.model import Finding, ModelError
+from forward.registry import OfKind
+from forward.scalars import Mistake
+from forward.spec import MODELS, ModelSpec
+from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.random_parameters import Inputs
+from uq.methods.method import MESH, METHODS, Method
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import refused
+from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.config.report import Report
+from workflows.studies.study import StudyKind
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.evaluate import Evaluations
+    from workflows.studies.job import Job
+
+
+class Study(StudyKind):
+    """What to compute.
+
+    Parameters
+    ----------
+    model
+        A body, or a model of another program.
+    parameters
+        Distributions by the paths of the numbers of the model that they override; may be left out where the model has
+        random fields, whose coefficients are parameters by themselves.
+    correlations
+        Correlations between them.
+    method
+        What is computed and how.
+    parallel
+        Use of ranks.
+    report
+        Sections of one's own in the report.
+    """
+
+    stopped: ClassVar[str] = "one linearisation"
+    explains: ClassVar[bool] = False
+    patient: ClassVar[bool] = False
+
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    method: Annotated[Method, OfKind(METHODS)]
+    parallel: Parallel = Parallel()
+    report: Report | None = None
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
+        return Inputs(self._marginals, tuple((*c.between, c.value) for c in self.correlations))
+
+    @property
+    def _marginals(self) -> dict[str, Distribution]:
+        return self.parameters | dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        return self.model.over(ranges(self.parameters))
+
+    @property
+    def models(self) -> dict[str, ModelSpec]:
+        """The models that the method may ask for beside that one, by name."""
+        return self.method.models(self.spec)
+
+    @property
+    def meshes(self) -> tuple[ModelSpec, ...]:
+        """The model, and the same on the finer meshes that a multilevel method may use."""
+        return self.spec, *(model for name, model in self.models.items() if name.startswith(MESH))
+
+    @property
+    def planned(self) -> int:
+        """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
+        return self.method.planned(len(self._marginals))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is to be said of the study before anything is solved."""
+        materials = self.spec.materials(self.inputs.names)
+        of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
+        return (*self.model.findings_over(ranges(self.parameters)), *of_draws)
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model, and those beside it."""
+        return self.spec, *self.models.values()
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the model."""
+        return self.model.modules
+
+    def plan(self, groups: int) -> list[str]:
+        """Say what is sampled, how often, and how long that will take."""
+        from workflows.studies.sampling_plan import plan
+
+        return plan(self, groups)
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the model, and others that the method may want, at the points of the method; collective."""
+        from workflows.studies.sampling_job import job
+
+        return job(self, ensemble)
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the random parameters."""
+        return self.inputs.names
+
+    def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
+        """Add how the stability of each sample was looked at."""
+        from workflows.studies.sampling_job import with_stability
+
+        return with_stability(self, dataset, evaluations["/"])
+
+    def summary(self, job: Job) -> dict[str, Any]:
+        """Return what was solved on each mesh, where there are several."""
+        from workflows.studies.sampling_job import of_meshes
+
+        return {"meshes": of_meshes(self, job)} if len(self.meshes) > 1 else {}
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that decides on evaluations; of a file, its contents and not its place."""
+        return super().identity() | {"model": self.model.identity()}
+
+    @model_validator(mode="after")
+    def _check(self) -> Study:
+        refused("Study", list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        unfit = list(self.method.unfit(self.spec))
+        yield from unfit
+        if not unfit:
+            yield from self._mistakes_of_models()
+        yield from self._mistakes_of_parameters()
+        not_sampled = list(self.spec.mistakes_of_samples())
+        yield from not_sampled
+        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
+            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        inputs = Inputs(self._marginals)
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            materials = self.spec.materials(inputs.names)
+            if materials is not None:
+                yield from mistakes_of_materials(inputs.within(materials), materials)
+        if not not_sampled:
+            yield from self.method.mistakes(inputs, self.spec)
+
+    def _mistakes_of_models(self) -> Iterator[Mistake]:
+        try:
+            _ = self.models
+        except ValidationError as error:
+            message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
+            yield ("method", "levels"), message, getattr(self.method, "levels", None)
+        except ModelError as error:
+            yield ("method", "kind"), str(error), self.method.kind
+
+    def _mistakes_of_parameters(self) -> Iterator[Mistake]:
+        spec = self.spec
+        if not self._marginals:
+            or_field = ", or one of model.fields" if spec.meshed else ""
+            yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
+        materials = spec.materials(self.parameters)
+        constants = () if materials is None else materials.names
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants)

@@ -1,0 +1,102 @@
+"""The job of a study that samples a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from forward.model import Stability
+from uq.estimators import branch
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder
+from uq.findings import add
+from uq.inputs.sampling import random_points
+from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
+from workflows.results.norms import node_volumes
+from workflows.studies.findings_solves import measured
+from workflows.studies.job import Job, MethodJob
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.fem.model import HyperelasticModel
+    from forward.model import FloatArray, ForwardModel
+    from uq.evaluation.ensemble import Ensemble
+    from uq.inputs.random_parameters import Inputs
+    from workflows.studies.sampling import Study
+
+REALISATIONS = 3  # of random fields, to look at
+
+
+def job(study: Study, ensemble: Ensemble) -> Job:
+    """One model, and others that the method may want, at the points of a method; collective over the group."""
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
+    recorders: dict[str, Recorder] = {}
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        method = study.method.with_sources(lambda place: read_dataset(Path(place)))
+        return method.run(inputs, recorders["/"])
+
+    others: dict[str, Callable[[], ForwardModel]] = {
+        name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
+    }
+    function = study.spec.build(ensemble.group, inputs.names)
+    if not study.spec.meshed:
+        return MethodJob(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+
+    model = cast("HyperelasticModel", function)
+    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    cells, kind = model.space.cells()
+    regions = model.space.regions()
+    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    locking = measured(study, model) if ensemble.index == 0 else []
+
+    def labelled(found: xr.Dataset) -> xr.Dataset:
+        found = label(found, units, model.space.coordinates, cells, kind)
+        add(found, *locking)
+        found = with_regions(found, model.spec.body.regions, regions)
+        return with_random_fields(found, factors, model.space.variance_kept)
+
+    volumes = partial(node_volumes, model.space.coordinates, cells)
+    return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes)
+
+
+def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
+    """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
+
+    They are the first samples of Monte Carlo with the seed of the study.
+    """
+    if not study.model.coefficients:
+        return {}
+    seed = getattr(study.method, "seed", 0)
+    return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
+
+
+def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
+    """Add how the stability of each sample was looked at, and say where there is no answer."""
+    continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
+    add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
+    if not branch.counts([evaluations]):
+        return dataset
+    if "points" in dataset and dataset.points.dims == ("sample", "parameter"):
+        known = branch.by_sample(dataset.points.to_numpy(), evaluations)
+        meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
+        dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
+    return dataset
+
+
+def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:
+    """What was solved on each mesh, and what it took."""
+    assert isinstance(job, MethodJob)
+    recorder = job.recorders["/"]
+    found = []
+    for name, mesh in zip([OWN, *study.models], study.meshes, strict=True):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == name]
+        if not parts:  # it was not needed
+            continue
+        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
+        solves = sum(len(part.points) for part in parts)
+        found.append({"unknowns": mesh.unknowns, "solves": solves, "cpu_seconds": seconds})
+    return found

@@ -1,0 +1,100 @@
+"""What a study that samples a model will cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple
+
+from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START
+from forward.machine import MIB, compiled_forms
+from uq.evaluation.evaluate import OWN
+from workflows.config.priors import ranges
+from workflows.studies.predictions import duration, times_of
+
+if TYPE_CHECKING:
+    from workflows.studies.sampling import Study
+
+
+def plan(study: Study, groups: int) -> list[str]:
+    """Say what is sampled, how often, and how long that will take."""
+    method, spec, planned = study.method, study.spec, study.planned
+    up_to = "up to " if method.open_ended and not method.undecided else ""
+    later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
+    lines = [
+        f"method      {method.kind}",
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+    ]
+    for k, mesh in enumerate(study.meshes[1:], 1):
+        cost = mesh.cost()
+        taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
+        lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
+    lines += [
+        f"parameters  {', '.join([*study.parameters, *_in_series(spec.coefficients)])}",
+        f"outputs     {', '.join(output.name for output in spec.outputs)}",
+        f"solves      {up_to}{planned:,}{later}",
+    ]
+    if spec.cost() is None:  # no one knows how long a solve takes
+        return lines
+    needed = sum(times_of(one).bytes for one in study.specs) + BYTES_OF_PROGRAM
+    return [
+        *lines,
+        f"memory      about {needed / MIB:,.0f} MiB for each group of ranks",
+        *_told(parts(study), groups, up_to, later and ", then more"),
+    ]
+
+
+def _in_series(paths: Sequence[str]) -> Iterator[str]:
+    """Name the coefficients of each random field by the first and the last."""
+    for _, series in groupby(paths, lambda path: path.rpartition(".")[0]):
+        first, *rest = series
+        yield f"{first} to {len(rest)}"
+
+
+class Part(NamedTuple):
+    """What a part of a study takes: predicted processor time (s), what for, and whether groups of ranks share it."""
+
+    seconds: float
+    what: str
+    shared: bool = False
+
+
+def parts(study: Study) -> list[Part]:
+    """Predict what a study of a body takes, part by part.
+
+    Samples are the most that there may be; those that multilevel methods add after their pilots are not known.
+    """
+    method, dimension = study.method, len(study.inputs.names)
+    costs = {OWN: times_of(study.spec)} | {name: times_of(model) for name, model in study.models.items()}
+    found = [times_of(mesh) for mesh in study.meshes]
+    samples = study.planned - len(found)
+    seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and found[0].predicted
+    further = f"{samples:,} further solves, {found[0].sample:.2g} s each"
+    return [
+        Part(START, "start of the program"),
+        *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
+        Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
+        Part(sum(one.tangents(dimension) for one in found), "its tangents"),
+        *([Part(sum(one.reference(dimension) for one in found), "reference factor")] if corrected else []),
+        *([Part(seconds, further, shared=True)] if samples > 0 else []),
+        Part(REPORT, "results and report"),
+    ]
+
+
+def _compiled_before() -> bool:
+    """Whether forms were compiled on this machine; which, only a run can tell."""
+    return any(compiled_forms().glob("forms-*/*/"))
+
+
+def _told(found: Sequence[Part], groups: int, up_to: str, more: str) -> list[str]:
+    """Say what a study takes by the clock, if every group of ranks has a core, and of what that is the sum."""
+    by_clock = [part.seconds / (groups if part.shared else 1) for part in found]
+    cores = f"{groups} core{'s' if groups > 1 else ''}"
+    lines = [f"time        {up_to}about {duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]
+    lines += [f"            {duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
+    if _compiled_before():
+        lines.append(
+            f"            and {COMPILATION:.0f} s or more where the forms of this kind of body are not compiled yet"
+        )
+    return lines

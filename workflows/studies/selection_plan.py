@@ -1,0 +1,40 @@
+"""What a comparison of models will cost."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from workflows.studies.predictions import NOT_ASKED, duration, mesh_check
+
+if TYPE_CHECKING:
+    from workflows.studies.selection import Comparison
+
+SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
+
+
+def plan(study: Comparison) -> list[str]:
+    """Say what is compared, and how long that will take."""
+    method = study.method
+    evidences = study.evidences
+    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
+    meshes = [mesh_check(one) for one in getattr(study, "specimens", {}).values() if study.unchecked]
+    if not getattr(method, "mesh_check", True):
+        meshes = [(0.0, NOT_ASKED)]
+    seconds += sum(once for once, _ in meshes)
+    check = " and nested sampling, which takes minutes" if method.check else ""
+    data = study.groups.values()
+    tests = sum(len(study.tests(group)) for group in study.group_names)
+    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    kind = "stresses" if study.quantity == "stress" else "displacements"
+    count = (
+        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
+    )
+    return [
+        f"method      {method.kind}",
+        f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
+        f"data        {count}{groups}",
+        f"evidences   {evidences}{check}",
+        *(f"mesh check  {words}" for words in dict.fromkeys(words for _, words in meshes)),
+        f"solves      about {study.planned:,}",
+        f"time        about {duration(seconds)} on 1 core (rough)",
+    ]
