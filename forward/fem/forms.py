@@ -1,0 +1,273 @@
+"""Forms of a hyperelastic body: its energies, loads and their derivatives, in UFL, and compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from functools import cached_property
+from typing import Any, Literal, assert_never
+
+import numpy as np
+import ufl
+
+from forward.bodies.inclusions import stiffness_factor
+from forward.bodies.mesh_file import OwnMesh
+from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
+from forward.fem.invariants import OPS, Invariants
+from forward.fem.layout import Layout
+from forward.fem.vertex_fields import VertexField
+from forward.hyperelastic import CONTRAST, Hyperelastic
+from forward.materials.material import energy_of, isochoric
+from forward.terms.term import Place, Term
+
+
+class Forms:
+    """What is integrated over a body, as functions of its state, its parameters and directions of both.
+
+    Forms that only derivatives need are compiled when they are first used.
+    """
+
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+        self.spec = spec
+        self.comm = comm
+        self.parameters = parameters
+        self.mesh, self.facets = meshes.mesh_body(comm, spec.body)
+        self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
+        self.size = self.unknowns.size
+        self.space = self.unknowns.displacement
+        self.layout = Layout(self.space, comm, self.unknowns.pressure)
+        self.nodes_owned = spaces.owned_nodes(self.space)
+        self.dx = ufl.dx(domain=self.mesh, metadata={"quadrature_degree": spec.body.quadrature})
+        self._ds, self._tags = meshes.facet_measure(self.mesh, self.facets, spec.body.quadrature)
+
+        self._values = {path: scalar.value for path, scalar in spec.scalars.items()}
+        self._constants = {
+            path: spaces.constant(self.mesh, value)
+            for path, value in self._values.items()
+            if not path.startswith("displacements.")
+        }
+        self._variables = {path: ufl.variable(constant) for path, constant in self._constants.items()}
+        self.scalars = np.array([i for i, path in enumerate(parameters) if path in self._values], dtype=np.int64)
+        self.fields = tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
+        self._directions = {path: spaces.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
+        self._load = spaces.constant(self.mesh, 1.0)
+
+        self._state = spaces.function(self.unknowns.whole)
+        self._along = spaces.function(self.unknowns.whole)
+        self._variation = ufl.TestFunction(self.unknowns.whole)
+        self.u, self.p = self.unknowns.split(self._state)
+        self.test, self._test_pressure = self.unknowns.split(self._variation)
+        fibres = [spaces.constant(self.mesh, unit) for unit in spec.fibres]
+        self._invariants = Invariants(
+            spec.energy, self.mesh, self.u, lambda whole: self.unknowns.split(whole)[0], fibres
+        )
+        self.F = self._invariants.F
+        self.J = ufl.det(self.F)
+        self._pressure = None if self.p is None else ufl.variable(self.p)
+        self.stored_energy, self._potential, self.dilation = self._energies()
+        self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
+        self._loads = self._virtual_works()
+        self.symmetric = spec.symmetric
+
+    @cached_property
+    def energy(self) -> Any:
+        """Energy density; in the mixed form, without that of the change of volume."""
+        energy = energy_of(self.spec.energy) if self.p is None else isochoric(self.spec.energy)
+        return self.stiffness_factor * energy(OPS, *self._invariants.measures.values(), **self._material)
+
+    @cached_property
+    def _regions(self) -> dict[str, Any]:
+        """Indicators of the regions that have numbers of their own."""
+        if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
+            return {}
+        found = spaces.region_indicators(self.comm, self.spec.body, self.mesh)
+        return {name: found[name] for name in self.spec.regions}
+
+    @property
+    def _material(self) -> dict[str, Any]:
+        """Constants of the material, by their names, each as an expression of the place."""
+        values = self._numbers("material")
+        for region, inside in self._regions.items():
+            for name, number in self._numbers(f"regions.{region}").items():
+                if name != CONTRAST:
+                    values[name] = (1 - inside) * values[name] + inside * number
+        return values
+
+    @cached_property
+    def stiffness_factor(self) -> Any:
+        """What regions, inclusions and fields multiply every modulus by, by the place, in UFL; 1 without any."""
+        factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
+        for region, inside in self._regions.items():
+            if CONTRAST in self.spec.regions[region]:
+                factor *= 1 - inside + inside * self._variables[f"regions.{region}.{CONTRAST}"]
+        X = ufl.SpatialCoordinate(self.mesh)
+        for inclusion in self.spec.inclusions:
+            numbers = self._numbers(f"inclusions.{inclusion.label}")
+            factor *= stiffness_factor(OPS, X, inclusion.kind, **numbers)
+        return factor * self._factor_of("stiffness")
+
+    def _factor_of(self, quantity: Literal["stiffness", "density"]) -> Any:
+        """Product of the random fields on a quantity; 1 without any."""
+        factor = 1
+        for field in self.fields:
+            match field.field.of:
+                case "stiffness" | "density" as of:
+                    factor = factor * field.factor if of == quantity else factor
+                case _:
+                    assert_never(field.field.of)
+        return factor
+
+    def _numbers(self, block: str) -> dict[str, Any]:
+        """Return the numbers of a block of the model, by their names, as variables of forms."""
+        paths = (path.rpartition(".") for path in self._variables)
+        return {name: self._variables[f"{block}.{name}"] for place, _, name in paths if place == block}
+
+    def _energies(self) -> tuple[Any, Any, Any]:
+        """Densities of the stored energy, of the potential whose derivative is the imbalance, and of the volume change.
+
+        In the mixed form ∫ g(J) dX = ∫ p/κ dX at equilibrium (the sum of the rows of the pressures), of which the
+        latter keeps its digits however small it is.
+        """
+        dilation, p = self._invariants.deformation.dilation, self._pressure
+        energy, j = self.energy, self._invariants.measures.get("j", dilation)
+        if p is None:
+            return energy, energy, dilation
+        bulk, g = self._invariants.volume(self.stiffness_factor, self._material)
+        of_pressure = p**2 / (2 * bulk)
+        return energy + of_pressure, energy + p * g - of_pressure, p / bulk if g is j else p / bulk + (j - g)
+
+    def stress_of(self, density: Any) -> Any:
+        """P = ∂W/∂F (Pa) of a density of the measures of the energy, as UFL."""
+        return self._invariants.stress(density)
+
+    def _variation_of(self, density: Any) -> Any:
+        """First variation of a density of its measures and the pressure: P : ∇v, and that of the pressure."""
+        work = ufl.inner(self.stress_of(density), ufl.grad(self.test))
+        return work if self._pressure is None else work + ufl.diff(density, self._pressure) * self._test_pressure
+
+    def derivative(self, form: Any, direction: Any | None = None) -> Any:
+        """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
+        return self._invariants.derivative(form, self._state, self._variation if direction is None else direction)
+
+    def surface(self, boundary: str) -> Any:
+        """Measure of a named boundary."""
+        return self._ds(self._tags[boundary])
+
+    def vector(self, form: Any) -> assembly.VectorAssembler:
+        """Compile a linear form."""
+        return assembly.VectorAssembler(self._invariants.inserted(form), self.unknowns, self.comm)
+
+    def by_vertices(self, form: Any) -> assembly.VectorAssembler:
+        """Compile a form that is linear in values at the vertices."""
+        return assembly.VectorAssembler(self._invariants.inserted(form), None, self.comm)
+
+    def scalar(self, form: Any) -> assembly.ScalarAssembler:
+        """Compile a functional."""
+        return assembly.ScalarAssembler(self._invariants.inserted(form), self.comm)
+
+    def at_points(self, expression: Any) -> assembly.PointValues:
+        """Compile an expression that is wanted at the quadrature points."""
+        points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
+        return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
+
+    def _bilinear(self, form: Any) -> Any:
+        return compile.compile_form(self._invariants.inserted(form), self.comm)
+
+    def _virtual_works(self) -> list[Any]:
+        """Forms of the virtual works of the loads, with the sign of forces that are out of balance.
+
+        In load steps the numbers of a load are scaled where it is linear in them, else the whole load.
+        """
+        works = []
+        for load in self.spec.loads:
+            numbers = self._numbers(f"loads.{load.label}")
+            work = self._out_of_balance(load, {name: self._load * number for name, number in numbers.items()})
+            if not _linear(work, numbers.values()):
+                self._proportional = False
+                work = self._load * self._out_of_balance(load, numbers)
+            works.append(work)
+        return works
+
+    def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
+        at = Place(
+            u=self.u,
+            v=self.test,
+            F=self.F,
+            J=self.J,
+            X=ufl.SpatialCoordinate(self.mesh),
+            normal=ufl.FacetNormal(self.mesh),
+            dx=self.dx,
+            on=self.surface,
+            numbers=numbers,
+            density=self._factor_of("density"),
+            constant=lambda value: spaces.constant(self.mesh, value),
+        )
+        potential = load.potential(at)
+        if potential is None:
+            return load.virtual_work(at)
+        return ufl.algorithms.expand_derivatives(ufl.derivative(potential, self._state, self._variation))
+
+    def _imbalance_form(self, change: Callable[[Any], Any | None] = lambda integrand: integrand) -> Any | None:
+        """Virtual work of all forces, with each integrand replaced by its `change`; None if all vanish."""
+        density = change(self._potential)
+        terms = [] if density is None else [self._variation_of(density) * self.dx]
+        for integral in (integral for work in self._loads for integral in work.integrals()):
+            changed = change(integral.integrand())
+            if changed is not None:
+                terms.append(ufl.Form([integral.reconstruct(changed)]))
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def along_parameters(self, integrand: Any) -> Any | None:
+        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction dω that is set; nothing if it depends on no parameter."""
+        present = set(ufl.algorithms.analysis.extract_constants(integrand * self.dx))
+        terms = [
+            direction * ufl.diff(integrand, self._variables[path])
+            for path, direction in self._directions.items()
+            if self._constants[path] in present
+        ]
+        terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
+        return sum(terms[1:], terms[0]) if terms else None
+
+    @cached_property
+    def _parameter_force(self) -> assembly.VectorAssembler | None:
+        form = self._imbalance_form(self.along_parameters)
+        return None if form is None else self.vector(form)
+
+    @cached_property
+    def _field_forces(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
+        """The fields that forces depend on, each with ∂(wᵀF)/∂m by its values m at the vertices, w being `_along`."""
+        found = []
+        for field in self.fields:
+
+            def by_vertices(integrand: Any, field: VertexField = field) -> Any | None:
+                return field.test * ufl.diff(integrand, field.log) if field.inside(integrand) else None
+
+            form = self._imbalance_form(by_vertices)
+            if form is not None:
+                form = ufl.replace(form, {self._variation: self._along})
+                found.append((field, self.by_vertices(form)))
+        return tuple(found)
+
+    @cached_property
+    def _stiffness_action(self) -> assembly.VectorAssembler:
+        return self.vector(self.derivative(self._imbalance_form(), self._along))
+
+    @cached_property
+    def _transposed_action(self) -> assembly.VectorAssembler:
+        if self.symmetric:
+            return self._stiffness_action
+        return self.vector(self.derivative(ufl.action(self._imbalance_form(), self._along)))
+
+    @cached_property
+    def gradients(self) -> assembly.NodalGradients:
+        """Deformation gradients at the nodes, at the state that is set."""
+        return assembly.NodalGradients(self.F, self.space, self.comm)
+
+
+def _linear(work: Any, numbers: Collection[Any]) -> bool:
+    """Whether a form is proportional to all of these numbers, which are variables, together."""
+    integrands = [integral.integrand() for integral in work.integrals()]
+    zero = {number.expression(): ufl.as_ufl(0.0) for number in numbers}
+    slopes = [ufl.algorithms.expand_derivatives(ufl.diff(one, number)) for one in integrands for number in numbers]
+    if any(c in zero for slope in slopes for c in ufl.algorithms.analysis.extract_constants(slope)):
+        return False
+    return all(ufl.replace(ufl.algorithms.strip_variables(one), zero) == 0 for one in integrands)

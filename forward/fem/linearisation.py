@@ -1,0 +1,279 @@
+"""The linearised equations of a body: K = ∂F/∂u, what solves with it, and ∂F/∂ω."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import ufl
+
+from forward.bodies.geometry import AXES
+from forward.fem import ranks
+from forward.fem.cost import factor
+from forward.fem.dolfinx import linear, spaces
+from forward.fem.forms import Forms
+from forward.fem.latest import Latest
+from forward.hyperelastic import Hyperelastic
+from forward.model import FloatArray, Work
+from forward.solvers.linear import LinearSolver
+
+
+class Linearisation(Forms):
+    """Stiffness and forces of the parameters, assembled at the state and the parameters that are set.
+
+    Vectors hold this rank's part (U_local,); rows of prescribed unknowns are those of the identity.
+    """
+
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+        super().__init__(spec, comm, parameters)
+        self.work = Work()
+        self.latest = Latest()
+        imbalance = self._imbalance_form()
+        self._residual = self.vector(imbalance)
+        self._prescribe()
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        self._stiffness = self._bilinear(self.derivative(imbalance, trial))
+        self._matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
+        self._solver: LinearSolver = linear.DirectSolver(self._matrix)
+
+    def _prescribe(self) -> None:
+        """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""
+        moved: dict[tuple[int, int], str] = {}
+        self._constraints = []
+        for displacement in self.spec.displacements:
+            nodes = spaces.boundary_nodes(self.space, self.facets[displacement.on])
+            for axis in displacement.components:
+                a = AXES.index(axis)
+                self._constraints.append(self.unknowns.constraint(a, nodes))
+                moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
+        for boundary in self.spec.clamp:
+            nodes = spaces.boundary_nodes(self.space, self.facets[boundary])
+            for a in range(3):
+                self._constraints.append(self.unknowns.constraint(a, nodes))
+                moved |= {(int(n), a): "" for n in nodes}
+        owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
+        self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
+        paths = [path for _, path in owned]
+        self._movers = {
+            path: np.array([p == path for p in paths], dtype=float)
+            for path in self._values
+            if path.startswith("displacements.")
+        }
+        self._targets = np.zeros(len(self.fixed))
+        self._moves = False
+
+    def set_state(self, u: FloatArray) -> None:
+        """Give the unknowns (U_local,) their values, ghosts included."""
+        self.latest.moved()
+        self.unknowns.give(self._state, u)
+
+    def state(self) -> FloatArray:
+        """This rank's part (U_local,) of the state that is set."""
+        return self.unknowns.take(self._state.x.array)
+
+    def displacements(self) -> FloatArray:
+        """Displacements (nodes_owned, 3) of the state that is set."""
+        return self.state()[: 3 * self.nodes_owned].reshape(-1, 3)
+
+    def with_pressures(self, displacements: FloatArray) -> FloatArray:
+        """Extend this rank's part (3 nodes_owned,) of a vector by zeros for the pressures, where they are unknowns."""
+        return np.append(displacements, np.zeros(self.size - len(displacements)))
+
+    def dot(self, x: FloatArray, y: FloatArray) -> float:
+        """Inner product over all ranks."""
+        return float(ranks.total(self.comm, np.array([x @ y]))[0])
+
+    def total(self, values: FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+        return ranks.total(self.comm, values)
+
+    def norms(self, rows: FloatArray) -> FloatArray:
+        """Euclidean norms over the displacements of rows (k, U_local), of all ranks."""
+        displacements = rows[:, : 3 * self.nodes_owned]
+        return np.asarray(np.sqrt(self.total(np.einsum("kn,kn->k", displacements, displacements))))
+
+    def norm(self, x: FloatArray) -> float:
+        """Euclidean norm over the displacements (or their forces) of all ranks."""
+        return float(self.norms(x[None])[0])
+
+    @cached_property
+    def free_displacements(self) -> FloatArray:
+        """1 on free displacements, 0 on other unknowns (U_local,)."""
+        free = np.zeros(self.size)
+        free[: 3 * self.nodes_owned] = 1
+        free[self.fixed] = 0
+        return free
+
+    @cached_property
+    def _symmetric_stiffness(self) -> Any:
+        """The symmetric part of the stiffness, compiled; the stiffness itself where it is symmetric."""
+        if self.symmetric:
+            return self._stiffness
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        works = list(zip(self.spec.loads, self._loads, strict=True))
+        rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
+        of_rest, of_followers = (
+            self.derivative(work, trial) for work in (rest, sum(work for load, work in works if not load.symmetric))
+        )
+        return self._bilinear(of_rest + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
+
+    def new_solver(self) -> LinearSolver:
+        """Return a solver for the stiffness, with a matrix of its own."""
+        return linear.DirectSolver(self._new_matrix(self._stiffness, symmetric=self.symmetric))
+
+    def new_symmetric_solver(self) -> LinearSolver:
+        """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""
+        return linear.DirectSolver(self._new_matrix(self._symmetric_stiffness, symmetric=True))
+
+    def _new_matrix(self, form: Any, *, symmetric: bool) -> linear.StiffnessMatrix:
+        expected = factor(self.spec.body, mixed=self.spec.mixed)
+        return linear.StiffnessMatrix(
+            form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
+        )
+
+    @cached_property
+    def _symmetric_part(self) -> LinearSolver:
+        return self.new_symmetric_solver()
+
+    def factorise(self, u: FloatArray) -> None:
+        """Assemble and factorise the stiffness at u (U_local,)."""
+        self.set_state(u)
+        self.work.assemblies += 1
+        self.work.factorisations += 1
+        self.latest.factorised = None  # a factorisation that fails leaves no factor
+        self._solver.factorise()
+        self.latest.factorised_at = u
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve K x = right; rows of prescribed unknowns give their values."""
+        if self._moves or self._movers:
+            known = right[self.fixed]
+            if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
+                w = np.zeros_like(right)
+                w[self.fixed] = known
+                assert self.latest.factorised_at is not None
+                self.set_state(self.latest.factorised_at)
+                right = right - self.stiffness_times(w)
+                right[self.fixed] = known
+        return self.back_substitute(right)
+
+    def back_substitute(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve with K, or with Kᵀ, whose prescribed rows and columns are those of the identity; (n,) or (k, n)."""
+        self.work.back_substitutions += 1 if right.ndim == 1 else len(right)
+        return self._solver.solve(right, transpose=transpose)
+
+    def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Product of the stiffness of all unknowns (or its transpose) with w (U_local,), at the state that is set."""
+        self.unknowns.give(self._along, w)
+        self.work.residuals += 1
+        return (self._transposed_action if transpose else self._stiffness_action)()
+
+    def free_stiffness_times(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Product (k, n) of the matrix that `back_substitute` inverts, at the state that is set, with rows x (k, n)."""
+        w = np.array(x)
+        w[:, self.fixed] = 0
+        y = np.array([self.stiffness_times(row, transpose=transpose) for row in w])
+        y[:, self.fixed] = x[:, self.fixed]
+        return y
+
+    def assembled_stiffness(self) -> Any:
+        """The stiffness at the state that is set, for `products`; the factor of `factorise` is lost."""
+        self.latest.factorised = None
+        return self._matrix.assembled()
+
+    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
+        """Products (k, U_local) of such a matrix with rows (k, U_local)."""
+        return self._matrix.products(matrix, rows)
+
+    def inertia(self) -> int | None:
+        """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; None if unknown."""
+        return self._condensed(self._solver.negative_eigenvalues())
+
+    def negative_eigenvalues(self, u: FloatArray) -> int | None:
+        """Factorise at u (U_local,); return the number of negative eigenvalues, of the symmetric part under pressures.
+
+        Those of the condensed stiffness: in the mixed form each pressure adds one, which does not count.
+        """
+        if self.symmetric:
+            self.factorise(u)
+            return self.inertia()
+        self.set_state(u)
+        self.work.assemblies += 1
+        self.work.factorisations += 1
+        self._symmetric_part.factorise()
+        return self._condensed(self._symmetric_part.negative_eigenvalues())
+
+    def _condensed(self, negative: int | None) -> int | None:
+        return None if negative is None else negative - self.unknowns.pressures
+
+    def unit_directions(self) -> Iterator[str]:
+        """Set the direction to each unit vector of the s parameters that are numbers of the model in turn."""
+        self._set_field_directions(np.zeros(len(self.parameters)))
+        for i in self.scalars:
+            path = self.parameters[i]
+            for other, direction in self._directions.items():
+                direction.value = 1.0 if other == path else 0.0
+            yield path
+
+    def _set_field_directions(self, direction: FloatArray) -> None:
+        for field in self.fields:
+            field.set_direction(direction)
+
+    def parameter_forces(self) -> FloatArray:
+        """∂F/∂ω (s, U_local) over all unknowns, at the state that is set, by the numbers of the model."""
+        forces = np.zeros((len(self.scalars), self.size))
+        for i, path in enumerate(self.unit_directions()):
+            if path in self._directions and self._parameter_force is not None:
+                self.work.residuals += 1
+                forces[i] = self._parameter_force()
+        return forces
+
+    def right_sides(self) -> FloatArray:
+        """Right-hand sides (s, U_local) of the tangents at the state that is set: K du/dω_i = b_i."""
+        right = -self.parameter_forces()
+        for i, path in enumerate(self.parameters[j] for j in self.scalars):
+            right[i, self.fixed] = 0
+            if path in self._movers:
+                w = np.zeros(right.shape[1])
+                w[self.fixed] = self._movers[path]
+                right[i] -= self.stiffness_times(w)
+                right[i, self.fixed] = self._movers[path]
+        return right
+
+    def right_sides_of_all(self) -> FloatArray:
+        """Right-hand sides (d, U_local) of the tangents along every parameter, at the state set."""
+        return self.right_sides_along(np.eye(len(self.parameters)))
+
+    def right_sides_along(self, directions: FloatArray) -> FloatArray:
+        """Right-hand sides (k, U_local) of the tangents along directions (k, d) of the parameters, at the state set."""
+        right = directions[:, self.scalars] @ self.right_sides()
+        return right + self.field_right_sides(directions) if self.fields else right
+
+    def field_right_sides(self, directions: FloatArray) -> FloatArray:
+        """Right-hand sides (k, U_local) of tangents along what directions (k, d) change of fields, at the state set."""
+        right = np.zeros((len(directions), self.size))
+        for direction in self._directions.values():
+            direction.value = 0.0
+        positions = np.concatenate([field.positions for field in self.fields])
+        for row, direction in zip(right, directions, strict=True):
+            if self._parameter_force is not None and direction[positions].any():
+                self._set_field_directions(direction)
+                self.work.residuals += 1
+                row[:] = -self._parameter_force()
+        right[:, self.fixed] = 0
+        return right
+
+    def field_products(self, w: FloatArray) -> FloatArray:
+        """Products wᵀ∂F/∂ω (d,) with w (U_local,) at the state that is set; zero for the numbers of the model.
+
+        One assembly for each field, however many parameters it has.
+        """
+        products = np.zeros(len(self.parameters))
+        if self._field_forces:
+            self.unknowns.give(self._along, w)
+        for field, assemble in self._field_forces:
+            self.work.residuals += 1
+            products[field.positions] = field.pull(assemble())
+        return products
