@@ -21,7 +21,7 @@ from forward.materials.admissible import Materials
 from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
 from forward.model import Finding
-from forward.observables.outputs import Output, PointDisplacement, Reaction
+from forward.observables.observable import Output
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
@@ -232,7 +232,7 @@ class Hyperelastic(ModelSpec):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is to be said of the body before anything is solved."""
-        points = {output.name: output.at for output in self.outputs if isinstance(output, PointDisplacement)}
+        points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
         return (
             *(Finding("warning", text) for text in self.body.warnings),
             *too_narrow(self.body, self.inclusions),
@@ -384,14 +384,11 @@ class Hyperelastic(ModelSpec):
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
         held = set(self.clamp) | {item.on for item in self.displacements}
         for i, output in enumerate(self.outputs):
-            if isinstance(output, Reaction) and output.on in self.body.boundaries and output.on not in held:
-                yield (
-                    ("outputs", i, "on"),
-                    "nothing holds this boundary, expected one that is clamped or moved",
-                    output.on,
-                )
-            if isinstance(output, PointDisplacement) and not holds(self.body, output.at):
-                yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(output.at)
+            on, at = getattr(output, "on", None), getattr(output, "at", None)
+            if output.of_held and on in self.body.boundaries and on not in held:
+                yield ("outputs", i, "on"), "nothing holds this boundary, expected one that is clamped or moved", on
+            if at is not None and not holds(self.body, at):
+                yield ("outputs", i, "at"), f"outside the body, which lies in {self._bounds}", list(at)
 
     def _mistakes_of_materials(self) -> Iterator[Mistake]:
         wrong = list(self._mistakes_of_regions())

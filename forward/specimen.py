@@ -27,7 +27,8 @@ from forward.materials.admissible import Materials
 from forward.materials.block import Material
 from forward.materials.material import splits
 from forward.model import Finding, FloatArray, Guess, ModelError, OneByOne, Reference, SolveError, Stability, Work
-from forward.observables.outputs import Output, PointDisplacement
+from forward.observables.displacement import PointDisplacement
+from forward.observables.observable import Output
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings

@@ -148,6 +148,11 @@ class Forms:
         """Gâteaux derivative of a functional with respect to all unknowns, along a direction or any variation."""
         return self._invariants.derivative(form, self._state, self._variation if direction is None else direction)
 
+    @cached_property
+    def volume(self) -> float:
+        """Volume (m³) of the undeformed mesh, which is not that of the body where linear tetrahedra cut its faces."""
+        return self.scalar(spaces.constant(self.mesh, 1.0) * self.dx)()
+
     def surface(self, boundary: str) -> Any:
         """Measure of a named boundary."""
         return self._ds(self._tags[boundary])

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from forward.fem.equations import Discretisation
-from forward.fem.functionals import functional
 from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
@@ -60,7 +59,7 @@ class HyperelasticModel(OneByOne):
         self.body = Discretisation(spec, comm, parameters)
         self.space = BodySpace(self.body)
         self.differentiable = True
-        self._functionals = [functional(output, self.body) for output in spec.outputs]
+        self._functionals = [output.functional(self.body) for output in spec.outputs]
 
     @cached_property
     def reference(self) -> ReferenceFactor:

@@ -1,1 +1,1 @@
-"""What is asked of a deformed body."""
+"""What is asked of a deformed body: outputs, one file each."""

@@ -119,9 +119,8 @@ def _kinds() -> set[str]:
     from typing import get_args
 
     from forward.bodies import geometry, inclusions
-    from forward.observables import outputs
 
-    unions = (geometry.Body, inclusions.Inclusion, outputs.Output, Distribution)
+    unions = (geometry.Body, inclusions.Inclusion, Distribution)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return {member.model_fields["kind"].default for member in members}
 

@@ -9,7 +9,7 @@ from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.hyperelastic import Hyperelastic
 from forward.materials.material import MATERIALS, constants, energy_of, units
-from forward.observables.outputs import Output
+from forward.observables.observable import Observable
 from forward.terms.term import Term
 from forward.words import listed, number, settings, with_unit
 from workflows.studies.sampling import Study
@@ -109,10 +109,11 @@ def _external_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     yield "outputs", [f"{output.name}{'' if output.unit == '1' else f' ({output.unit})'}" for output in model.outputs]
 
 
-def _output(output: Output) -> str:
-    details = settings(output.model_dump(), "kind", "name")
+def _output(output: Observable) -> str:
+    block = output.model_dump()
+    details = settings(block, "kind", "name")
     unit = "" if output.unit == "1" else f" ({output.unit})"
-    return f"{output.name}: {output.kind}{', ' if details else ''}{details}{unit}"
+    return f"{output.name}: {block['kind']}{', ' if details else ''}{details}{unit}"
 
 
 def _inclusion(study: Study, inclusion: Inclusion) -> str:

@@ -9,7 +9,7 @@ import pytest
 
 from forward.bodies.geometry import Box
 from forward.hyperelastic import Hyperelastic
-from forward.observables.outputs import MaxDisplacement
+from forward.observables.max_displacement import MaxDisplacement
 from forward.terms.gravity import Gravity
 from uq.inputs.distributions import Normal, Uniform
 from uq.methods.monte_carlo import MonteCarlo

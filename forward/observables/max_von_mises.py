@@ -1,0 +1,82 @@
+"""Largest stress."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from forward.materials import kinematics
+from forward.model import FloatArray
+from forward.observables.observable import DiscreteBody, Functional, Observable
+
+if TYPE_CHECKING:
+    from forward.observables.functionals import Integral
+
+
+class MaxVonMises(Observable):
+    """Largest von Mises stress (Pa, Cauchy) over the quadrature points; derivatives are those at that point."""
+
+    kind: Literal["max-von-mises"] = "max-von-mises"
+    unit: ClassVar[str] = "Pa"
+
+    def functional(self, body: DiscreteBody) -> Functional:
+        """Prepare the evaluation."""
+        return _MaxVonMises(body)
+
+
+class _MaxVonMises:
+    """ψ = max of the von Mises stress over the quadrature points; of points that tie, the first of the lowest rank.
+
+    The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
+    so that its derivatives are those of an integral.
+    """
+
+    def __init__(self, body: DiscreteBody) -> None:
+        import ufl
+
+        from forward.fem.dolfinx import spaces
+
+        self._body = body
+        # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
+        cauchy = body.stress_of(body.energy) * body.F.T / body.J
+        stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
+        degree = body.spec.body.quadrature
+        self._values = body.at_points(stress)
+        self._selector = spaces.function(spaces.quadrature_space(body.mesh, degree))
+        self._stress = stress
+
+    def value(self) -> float:
+        from forward.fem import ranks
+
+        return -ranks.smallest(self._body.comm, -self._values().max(initial=0.0))
+
+    def _at_place(self) -> Integral:
+        """Return the stress at the point where it is largest now."""
+        body = self._body
+        here = np.argwhere(self._values() >= self.value())
+        holders = body.comm.allgather(len(here) > 0)
+        self._selector.x.array[:] = 0
+        if holders.index(True) == body.comm.rank:
+            cell, point = here[0]
+            self._selector.x.array[self._selector.function_space.dofmap.cell_dofs(cell)[point]] = 1
+        self._selector.x.scatter_forward()
+        self._selected.size = self._weight()
+        return self._selected
+
+    @cached_property
+    def _selected(self) -> Integral:
+        from forward.observables.functionals import Integral
+
+        return Integral(self._body, self._selector * self._stress)
+
+    @cached_property
+    def _weight(self) -> Any:
+        return self._body.scalar(self._selector * self._body.dx)
+
+    def gradient(self) -> FloatArray:
+        return self._at_place().gradient()
+
+    def partial(self) -> FloatArray:
+        return self._at_place().partial()

@@ -1,0 +1,29 @@
+"""Mean displacement of a boundary."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from forward.bodies.geometry import AXES, Axis
+from forward.observables.observable import DiscreteBody, Functional, Observable
+
+
+class MeanDisplacement(Observable):
+    """Mean of a displacement component (m) over a boundary."""
+
+    kind: Literal["mean-displacement"] = "mean-displacement"
+    on: str
+    component: Axis
+
+    def functional(self, body: DiscreteBody) -> Functional:
+        """Prepare the evaluation."""
+        import ufl
+
+        from forward.fem.dolfinx import spaces
+        from forward.observables.functionals import Linear
+
+        axis = spaces.constant(body.mesh, np.eye(3)[AXES.index(self.component)])
+        weights = body.vector(ufl.inner(axis, body.test) * body.surface(self.on))()
+        return Linear(body, weights / body.dot(weights, np.ones_like(weights)))

@@ -1,0 +1,187 @@
+"""What every output is: a block of settings with a unit, that knows its value and its derivatives.
+
+An output is a class with one file, here or beside a study (``kind = "my_tissue.Lengthening"``):
+
+    class Lengthening(Observable):
+        "Mean of λ² − 1 along x."
+
+        kind: str
+        unit: ClassVar[str] = "1"
+
+        def functional(self, body: DiscreteBody) -> Functional:
+            from forward.observables.functionals import Integral
+
+            return Integral(body, (body.F.T * body.F)[0, 0] - 1, body.volume)
+
+A field that is called `on` is the name of a boundary, one that is called `at` a point (m) of the undeformed body. UFL
+and FEniCSx are imported inside the methods, so that a study can be checked without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from forward.model import FloatArray
+from forward.registry import Kinds, OfKind
+from forward.settings import Settings
+
+
+class Functional(Protocol):
+    """An output ψ(u, ω) of a discrete body, at the state and the parameters that this is set to.
+
+    Every method is collective over its ranks.
+    """
+
+    def value(self) -> float:
+        """Return ψ, the same on every rank."""
+
+    def gradient(self) -> FloatArray:
+        """Return this rank's part (U_local,) of ∂ψ/∂u, over free and prescribed unknowns, pressures included."""
+
+    def partial(self) -> FloatArray:
+        """Return the explicit derivative ∂ψ/∂ω (d,)."""
+
+
+class DiscreteBody(Protocol):
+    """What outputs ask of a discrete body (`forward.fem.equations`); what is written in UFL or of DOLFINx is `Any`.
+
+    Attributes
+    ----------
+    spec
+        Specification of the model.
+    comm
+        Communicator of the ranks that share the body.
+    parameters
+        Paths of the parameters.
+    scalars
+        Which of them (s,) are numbers of the model, and no coefficients of random fields.
+    fields
+        Random fields.
+    mesh, facets, space
+        Mesh, facets of each boundary, space of the displacements.
+    layout
+        Order of the nodes.
+    nodes_owned, size
+        Numbers of this rank's nodes and unknowns.
+    dx
+        Measure of the undeformed body.
+    u, test, F, J
+        Displacement, virtual displacement, deformation gradient and its determinant.
+    """
+
+    spec: Any
+    comm: Any
+    parameters: tuple[str, ...]
+    scalars: NDArray[np.int64]
+    fields: tuple[Any, ...]
+    mesh: Any
+    facets: Any
+    space: Any
+    layout: Any
+    nodes_owned: int
+    size: int
+    dx: Any
+    u: Any
+    test: Any
+    F: Any
+    J: Any
+    stored_energy: Any
+    dilation: Any
+
+    @property
+    def energy(self) -> Any:
+        """Energy density; in the mixed form, without that of the change of volume."""
+
+    @property
+    def volume(self) -> float:
+        """Volume (m³) of the undeformed mesh."""
+
+    def surface(self, boundary: str) -> Any:
+        """Measure of a named boundary."""
+
+    def stress_of(self, density: Any) -> Any:
+        """P = ∂W/∂F (Pa) of an energy density."""
+
+    def derivative(self, form: Any) -> Any:
+        """Gâteaux derivative of a form with respect to all unknowns."""
+
+    def along_parameters(self, integrand: Any) -> Any | None:
+        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction that is set; None if it depends on no parameter."""
+
+    def unit_directions(self) -> Iterator[str]:
+        """Set the direction to each unit vector of the numbers of the model in turn."""
+
+    def scalar(self, form: Any) -> Any:
+        """Compile a functional."""
+
+    def vector(self, form: Any) -> Any:
+        """Compile a linear form."""
+
+    def by_vertices(self, form: Any) -> Any:
+        """Compile a form that is linear in values at the vertices."""
+
+    def at_points(self, expression: Any) -> Any:
+        """Compile an expression that is wanted at the quadrature points."""
+
+    def state(self) -> FloatArray:
+        """This rank's part (U_local,) of the state."""
+
+    def displacements(self) -> FloatArray:
+        """Displacements (nodes_owned, 3)."""
+
+    def with_pressures(self, displacements: FloatArray) -> FloatArray:
+        """Extend this rank's part (3 nodes_owned,) of a vector by zeros for the pressures, where they are unknowns."""
+
+    def dot(self, x: FloatArray, y: FloatArray) -> float:
+        """Inner product over all ranks."""
+
+    def imbalance(self) -> FloatArray:
+        """Imbalance (U_local,); on prescribed unknowns, the reactions."""
+
+    def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Product of the stiffness of all unknowns (or its transpose) with w (U_local,)."""
+
+    def parameter_forces(self) -> FloatArray:
+        """∂F/∂ω (s, U_local), by the numbers of the model."""
+
+    def field_products(self, w: FloatArray) -> FloatArray:
+        """Products wᵀ∂F/∂ω (d,) with w (U_local,); zero for the numbers of the model."""
+
+
+class Observable(Settings):
+    """An output of a body; `kind` and `functional` are defined by every kind."""
+
+    name: str = Field(min_length=1)
+    unit: ClassVar[str] = "m"  # SI unit of the value
+    of_held: ClassVar[bool] = False  # whether its boundary has to be clamped or moved
+
+    def functional(self, body: DiscreteBody) -> Functional:
+        """Prepare the evaluation; collective.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be evaluated on the mesh.
+        """
+        raise NotImplementedError
+
+
+OUTPUTS = Kinds(
+    "output",
+    {
+        "max-displacement": "forward.observables.max_displacement:MaxDisplacement",
+        "displacement": "forward.observables.displacement:PointDisplacement",
+        "mean-displacement": "forward.observables.mean_displacement:MeanDisplacement",
+        "reaction": "forward.observables.reaction:Reaction",
+        "strain-energy": "forward.observables.strain_energy:StrainEnergy",
+        "volume-change": "forward.observables.volume_change:VolumeChange",
+        "max-von-mises": "forward.observables.max_von_mises:MaxVonMises",
+    },
+    Observable,
+)
+Output = Annotated[Observable, OfKind(OUTPUTS)]
