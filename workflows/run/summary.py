@@ -67,6 +67,7 @@ def summarised(
             **({} if source is None else {"source": source}),
             "versions": {"python": platform.python_version(), **versions()},
         },
+        **study.summary(job),
     }
 
 

@@ -44,7 +44,9 @@ def job(study: Study, ensemble: Ensemble) -> Job:
     }
     function = study.spec.build(ensemble.group, inputs.names)
     if not study.spec.meshed:
-        return MethodJob(function, others, task, recorders, lambda found: label(found, units, None, None, 0))
+        return MethodJob(
+            function, others, task, recorders, lambda found: label(_without_nodes(found), units, None, None, 0)
+        )
 
     model = cast("HyperelasticModel", function)
     # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
@@ -61,6 +63,11 @@ def job(study: Study, ensemble: Ensemble) -> Job:
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
     return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes)
+
+
+def _without_nodes(found: xr.Dataset) -> xr.Dataset:
+    """Leave out fields where states are no displacement fields."""
+    return found.drop_dims([dim for dim in ("node",) if dim in found.dims])
 
 
 def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
