@@ -116,7 +116,8 @@ class Reference:
     state
         This rank's part (U_local,) of the state there.
     spread
-        Standard deviations (d,) of the parameters, where they are known.
+        How far the parameters vary, where that is known: standard deviations (d,) of independent ones, or a few random
+        draws (k, d) of their differences from a mean.
     """
 
     parameters: FloatArray

@@ -429,7 +429,7 @@ class SpecimenModel(OneByOne):
             if near is None:
                 yield Guess(state, iterations=guess.iterations)
             else:
-                spread = None if near.spread is None else near.spread[where]
+                spread = None if near.spread is None else near.spread[..., where]
                 reference = Reference(near.parameters[where], self.states(near.state)[k], spread)
                 yield Guess(state, reference, guess.iterations)
 

@@ -50,8 +50,9 @@ SLENDER = 3.0  # longest extent over the shortest
 NEWTON = {True: 5.5, False: 4.0}  # factorisations from zero
 CORRECTIONS = {True: 10, False: 7}  # with a reference factor
 ACTIONS = 7  # products with the stiffness for the screen of a sample, each like a residual
-DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen, each of two stiffnesses
-SUBSTITUTIONS = 18  # for the natural modes, and as many for each direction
+DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
+CHANGES = 40  # products with the stiffness for each of these, each like a residual
+SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and corrections that they take then
 
 
@@ -150,7 +151,7 @@ class Times:
     def reference(self, parameters: int) -> float:
         """The factor of a reference, and the vectors for the screen of stability."""
         directions = min(parameters, DIRECTIONS)
-        vectors = 2 * directions * self.assembly + SUBSTITUTIONS * (1 + directions) * self.substitution
+        vectors = CHANGES * directions * self.residual + SUBSTITUTIONS * (1 + directions) * self.substitution
         return self.setup + self.assembly + self.factorisation + vectors
 
     def tangents(self, parameters: int) -> float:

@@ -179,13 +179,9 @@ class Linearisation(Forms):
         return y
 
     def assembled_stiffness(self) -> Any:
-        """The stiffness at the state that is set, for `products`; the factor of `factorise` is lost."""
+        """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
         self.latest.factorised = None
         return self._matrix.assembled()
-
-    def products(self, matrix: Any, rows: FloatArray) -> FloatArray:
-        """Products (k, U_local) of such a matrix with rows (k, U_local)."""
-        return self._matrix.products(matrix, rows)
 
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness beyond one for each pressure; None if unknown."""

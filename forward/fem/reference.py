@@ -6,7 +6,6 @@ It is turned along with the body (`forward.solvers.rotations`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from forward.solvers.linear import LinearSolver
 from forward.solvers.rotations import rotations, turn, turned
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
 
-STEP = 1e-3  # of the differences of stiffnesses, in standard deviations
+STEP = 1e-2  # of the differences of stiffnesses, in standard deviations
 DIRECTIONS = 6  # in which parameters are changed for the screen: one after the other or, if there are more, at random
 
 
@@ -97,38 +96,47 @@ class ReferenceFactor:
         return self._screening
 
     def _changes(self, reference: Reference, random: np.random.Generator) -> Iterator[Rows]:
-        """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents."""
+        """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents.
+
+        They are differences of differences of forces: a product is two of them, where a stiffness is assembled in the
+        time of forty.
+        """
         assert reference.spread is not None
         body, d = self._body, len(reference.parameters)
-        if d <= DIRECTIONS:
+        if reference.spread.ndim == 2:
+            directions = reference.spread
+        elif d <= DIRECTIONS:
             directions = np.diag(reference.spread)[reference.spread > 0]
         else:
             directions = random.standard_normal((DIRECTIONS, d)) * reference.spread
         self._set(reference)
         slopes = self._solver.solve(body.right_sides_along(directions))
         for direction, slope in zip(directions, slopes, strict=True):
-            ends: list[tuple[float, Any, FloatArray]] = []
+            ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
             for step in (STEP, -STEP):
-                state = reference.state + step * slope
+                parameters, state = reference.parameters + step * direction, reference.state + step * slope
                 R = self.rotation(state)
-                body.set_parameters(reference.parameters + step * direction)
+                body.set_parameters(parameters)
                 body.at_load(1.0)
                 body.set_state(state)
-                ends.append((step, body.assembled_stiffness(), R))
+                ends.append((step, parameters, state, body.imbalance(), R))
 
-            def multiply(rows: FloatArray, ends: list[tuple[float, Any, FloatArray]] = ends) -> FloatArray:
+            def multiply(
+                rows: FloatArray, ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = ends
+            ) -> FloatArray:
                 # As the screen sees it: turned along with the body, so that its rotations are no change.
                 total = np.zeros_like(rows)
-                for step, matrix, R in ends:
+                for step, parameters, state, imbalance, R in ends:
                     along = turn(rows, R)
                     along[:, body.fixed] = 0
-                    total += turn(body.products(matrix, along), R.swapaxes(0, 1)) / (2 * step)
+                    body.set_parameters(parameters)
+                    body.at_load(1.0)
+                    products = body.stiffness_near(state, imbalance, along)
+                    total += turn(products, R.swapaxes(0, 1)) / (2 * step)
                 total[:, body.fixed] = 0
                 return total
 
             yield multiply
-            for _, matrix, _ in ends:
-                matrix.destroy()
 
     def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
         """Return what the screen says of a state u (U_local,), with its imbalance, turned by R from the reference."""

@@ -88,6 +88,9 @@ def solve(
         system.at_load(1.0)
         try:
             return known(predict_correct(system, settings, guesses[0], way, history))
+        except Unstable as stop:
+            failed(stop)
+            guesses = [zero]  # from the same prediction Newton would only find the same equilibrium
         except Diverged as stop:
             failed(stop)
     for guess in guesses:
@@ -96,7 +99,7 @@ def solve(
         except Diverged as stop:
             failed(stop)
     try:
-        return known(load_steps(system, settings, zero, history))
+        return known(load_steps(system, settings, zero, history, unstable=refused != Stability.NOT_TESTED))
     except SolveError as error:
         if refused != Stability.NOT_TESTED:
             message = f"{error.reason}; the equilibrium that was found at full load is unstable"

@@ -15,25 +15,39 @@ GROWTH = 4.0  # a Newton step that is longer than all before by this factor mean
 NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
-LOCATED = 1 / 64  # load step that is not halved any more where it leads to an unstable equilibrium
+LOCATED = 1 / 64  # of the load: how near the end of a stable branch is looked for
+REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
 
 
-def load_steps(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> Found:
-    """Raise the load from zero; halve the step where Newton fails, double it where it is quick."""
-    reached, step = 0.0, 0.5
+def load_steps(
+    system: System, settings: SolverSettings, zero: FloatArray, history: list[str], *, unstable: bool
+) -> Found:
+    """Raise the load from zero; halve the step where Newton fails, double it where it is quick.
+
+    The load at which an equilibrium was found unstable is not tried again before the stable branch has been followed to
+    within `LOCATED` of it: from further away Newton would only find the same. Once an equilibrium was unstable (at full
+    load, if `unstable` says so), the branch is expected to end, and only `REFUSALS` more attempts may fail.
+    """
+    reached, step, refusals = 0.0, 0.5, 0
+    barrier = 1.0 if unstable else np.inf
     found, slope = Found(zero, 0.0), np.zeros_like(zero)
     while reached < 1:
         load = min(1.0, reached + step)
+        if load >= barrier:
+            load = barrier if barrier - reached <= LOCATED else (reached + barrier) / 2
         try:
             # The secant through the last two states predicts the next one.
             there, iterations = newton(system, settings, found.state + (load - reached) * slope, history, load)
         except Diverged as stop:
-            step /= 2
+            step = (load - reached) / 2
             slope = np.zeros_like(zero)
-            smallest = settings.minimum_load_step
             if isinstance(stop, Unstable):
-                smallest = max(smallest, LOCATED)  # smaller steps find the same branch and where it ends
-            if step < smallest:
+                barrier, unstable = load, True
+            refusals += unstable
+            smallest = settings.minimum_load_step
+            if unstable:
+                smallest = max(smallest, LOCATED)
+            if step < smallest or refusals > REFUSALS:
                 message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
                 jacobian = system.smallest_jacobian(found.state)
                 if jacobian < SQUEEZED:
@@ -42,6 +56,8 @@ def load_steps(system: System, settings: SolverSettings, zero: FloatArray, histo
             continue
         slope = (there.state - found.state) / (load - reached)
         found, reached = there, load
+        if reached >= barrier:
+            barrier = np.inf
         system.work.load_steps += 1
         if iterations <= QUICK:
             step *= 2

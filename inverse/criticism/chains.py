@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 ACCEPTED = 0.3  # share of proposals that β aims at during the burn-in
 FIRST_STEP = 0.5  # β at its start
 STRONG = 30.0  # λ of the directions of a field that follow the others
+DRAWS = 6  # of the Gaussian of a field, for the screen of stability
 SPREAD = 1.3  # of the starts of chains, in standard deviations of the Gaussian
 WIDER = 1.2  # standard deviations of the Gaussian of weighted points, over those of the points
 MIXED = 1.01  # R̂ up to which chains say the same
@@ -340,7 +341,9 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
     pairs = found.spectrum
     slopes = mode.solution.state_tangent(found.directions)
     state = np.array(mode.solution.state)
-    reference = Reference(mode.values, state)
+    # Where the samples go is what the screen of stability has to know.
+    draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.noise))))
+    reference = Reference(mode.values, state, mode.posterior.prior.root(draws))
     strong = pairs.values > STRONG
     vectors, images, stiffness = pairs.vectors[strong], pairs.images[strong], 1 + pairs.values[strong]
     centre = vectors @ mode.noise

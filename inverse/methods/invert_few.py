@@ -51,21 +51,32 @@ Look = Callable[[FloatArray], FloatArray]  # parameters (n, d) → ln of the sti
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """A linear prediction of the state from a solution that this group of ranks has; a `Start`."""
+    """A linear prediction of the state from a solution that this group of ranks has; a `Start`.
+
+    Attributes
+    ----------
+    point
+        Where (d,).
+    state, slopes
+        State (U_local,) there, and its derivatives (d, U_local).
+    spread
+        Standard deviations (d,) of the prior.
+    """
 
     point: FloatArray
     state: FloatArray
     slopes: FloatArray
+    spread: FloatArray
 
     @classmethod
-    def at(cls, model: ForwardModel, point: FloatArray) -> Nearby:
+    def at(cls, model: ForwardModel, point: FloatArray, spread: FloatArray) -> Nearby:
         """Solve at parameters (d,); collective."""
         solution = model.solve(point)
-        return cls(point, np.array(solution.state), solution.state_tangent(np.eye(len(point))))
+        return cls(point, np.array(solution.state), solution.state_tangent(np.eye(len(point))), spread)
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) with its reference."""
-        reference = Reference(self.point, self.state)
+        reference = Reference(self.point, self.state, self.spread)
         return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
 
 
@@ -98,7 +109,7 @@ def invert_by_group(
         If the model has no answer where the search needs one.
     """
     solve = evaluate or SerialEvaluate(model)
-    return _invert(inputs, solve, data, method, look, errors, finer, lambda point: Nearby.at(model, point))
+    return _invert(inputs, solve, data, method, look, errors, finer, lambda point: Nearby.at(model, point, inputs.std))
 
 
 def invert_by_all(

@@ -13,6 +13,7 @@ from benchmarks import buckling
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, Reference, SolveError, Stability
 from forward.solvers import stability
+from forward.solvers.rotations import turn
 from uq.estimators import branch
 from uq.evaluation.evaluate import Evaluations, Failure, SerialEvaluate
 from uq.inputs.random_parameters import Inputs
@@ -180,6 +181,50 @@ def test_what_a_derivative_sees_counts(column, monkeypatch):
     with pytest.raises(SolveError) as counted:
         model.solve(beyond, guess(beyond))
     assert counted.value.stability == Stability.MISSED
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(("load", "most"), [(124.6, 25), (145.0, 25)])
+def test_what_a_refusal_costs_is_bounded(column, load, most):
+    problem, centre = column
+    model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
+    point = np.array([load])
+    with pytest.raises(SolveError, match=r"^stopped at") as refused:
+        model.solve(point, centre.prediction.on(model)(point))
+    work = refused.value.work
+    assert work.factorisations <= most
+    # Where the branch ends is still said to a sixty-fourth of the load; the column buckles at 123 to 125 Pa.
+    reached = float(re.match(r"stopped at ([\d.]+) %", refused.value.reason)[1])
+    assert 123 / load - 1 / 64 < reached / 100 < 125 / load
+    assert refused.value.history.count("load 1: " + refused.value.history[-1].partition(": ")[2]) <= 3
+
+
+@pytest.mark.fem
+def test_changes_of_the_stiffness_are_those_of_assembled_ones(column):
+    problem, centre = column
+    model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
+    reference = centre.prediction.on(model)(np.array([115.0])).reference
+    factor, body = model.take_reference(reference), model.body
+    spread, step = float(reference.spread[0]), 1e-3
+    rows = np.random.default_rng(0).standard_normal((3, body.size)) * body.free_displacements
+    slope = spread * factor.slopes()[0]
+    assembled = np.zeros_like(rows)
+    for h in (step, -step):
+        state = reference.state + h * slope
+        body.set_parameters(reference.parameters + h * spread)
+        body.at_load(1.0)
+        body.set_state(state)
+        matrix = body.assembled_stiffness()
+        R = factor.rotation(state)
+        along = turn(rows, R) * body.free_displacements
+        for i, row in enumerate(along):
+            x, y = matrix.createVecs()
+            x.array[:] = body.unknowns.reorder(row)
+            matrix.mult(x, y)
+            assembled[i] += turn(body.unknowns.take(y.array_r), R.swapaxes(0, 1)) / (2 * h)
+    assembled *= body.free_displacements
+    (change,) = factor._changes(reference, np.random.default_rng(0))
+    np.testing.assert_allclose(change(rows), assembled, rtol=0, atol=1e-3 * np.abs(assembled).max())
 
 
 # --- what is said of it ----------------------------------------------------------------------------------------------

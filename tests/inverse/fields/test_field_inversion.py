@@ -12,9 +12,10 @@ from forward.bodies.geometry import Box
 from forward.bodies.random_fields import Matern
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
-from forward.model import Guess, SolveError
+from forward.model import Guess, SolveError, Stability
 from forward.specimen import Specimen
-from inverse.fields.field_posterior import FieldPosterior
+from inverse.criticism.chains import bent
+from inverse.fields.field_posterior import FieldPosterior, Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from tests.launch import run_script
@@ -213,6 +214,28 @@ def test_the_mode_is_found_and_explains_the_data():
     again = mode.point.product(found.spectrum.vectors[:3])
     expected = found.spectrum.values[:3, None] * found.spectrum.vectors[:3]
     np.testing.assert_allclose(again, expected, atol=1e-2 * found.spectrum.values[2])
+
+
+def test_samples_near_the_mode_are_screened_rather_than_counted():
+    posterior, _, mode = coarse()
+    seen = []
+
+    class Watched:
+        def __getattr__(self, name):
+            return getattr(posterior.model, name)
+
+        def solve(self, parameters, guess=None):
+            solution = posterior.model.solve(parameters, guess)
+            seen.append(solution.stability)
+            return solution
+
+    watched = FieldPosterior(Watched(), posterior.data, posterior.sigma, posterior.prior)
+    point = Point(watched, mode.point.noise, mode.point.values, mode.point.solution)
+    found = LowRankPosterior.at(mode.point, cutoff=1.0)
+    _, densities = bent(point, found)(np.random.default_rng(3).standard_normal((4, posterior.size)))
+    assert np.isfinite(densities).all()
+    assert len(seen) == 8
+    assert seen.count(Stability.SCREENED) >= 4  # some are counted at random, in any of three cases
 
 
 def test_three_load_cases_constrain_more_directions_than_any_one():

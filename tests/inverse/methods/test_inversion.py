@@ -10,15 +10,17 @@ import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
+from mpi4py import MPI
 
 import inverse.methods.invert_field
-from forward.model import FunctionModel
+from benchmarks import buckling
+from forward.model import FunctionModel, SolveError, Stability
 from inverse.criticism.chains import weigh_field
 from inverse.data.observations import Components
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import invert_by_all, invert_by_group
+from inverse.methods.invert_few import Nearby, invert_by_all, invert_by_group
 from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.record import as_dataset, stacked
 from inverse.methods.synthesize import Synthesize
@@ -111,6 +113,18 @@ def test_the_noise_can_be_unknown():
     assert record["lower"][3] < 1 < record["upper"][3]
     assert np.isnan(record["alone_std"][:, 3]).all()
     np.testing.assert_array_equal(record["direction_parameter"][:, 3], 0)
+
+
+@pytest.mark.fem
+def test_solves_near_the_mode_are_screened_rather_than_counted():
+    case = buckling.column()
+    model = case.spec.build(MPI.COMM_SELF, case.inputs.names)
+    near = Nearby.at(model, np.array([90.0]), case.inputs.std).on(model)
+    points = np.linspace(82.0, 100.0, 10)[:, None]
+    assert [model.solve(point, near(point)).stability for point in points].count(Stability.SCREENED) >= 6
+    for point in np.array([[130.0], [145.0]]):
+        with pytest.raises(SolveError, match="the body buckles"):
+            model.solve(point, near(point))
 
 
 @pytest.mark.parametrize("kind", ["pcn", pytest.param("emcee", marks=pytest.mark.slow)])
