@@ -110,11 +110,20 @@ def run_page(page, folder, monkeypatch):
         exec(compile(code, str(page), "exec"), {})
         if "def beam" in code:
             (folder / "cantilever.py").write_text(code, encoding="utf-8")
+    for name, code in (
+        re.match(r"# (\w+\.py)\n(.*)", code, re.DOTALL).groups() for at, code in named_files() if at == page
+    ):
+        (folder / name).write_text(code, encoding="utf-8")
+
+
+def named_files():
+    """The Python files of pages that begin with their names."""
+    return [(at, code) for at, code in fences("python", runs=False) if re.match(r"# \w+\.py\n", code)]
 
 
 @pytest.mark.parametrize(("page", "text"), fences("toml"), ids=lambda given: getattr(given, "stem", ""))
 def test_study_files_parse(page, text, tmp_path, monkeypatch):
-    if 'kind = "mesh"' in text:
+    if 'kind = "mesh"' in text or page in {at for at, _ in named_files()}:
         run_page(page, tmp_path, monkeypatch)
     parse(whole(text, tmp_path), folder=tmp_path)
 

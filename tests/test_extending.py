@@ -1,0 +1,95 @@
+"""Kinds from outside the program, as the how-to page has them: one file each, checked, run on two ranks, reported."""
+
+import json
+import re
+import tomllib
+
+import jsonschema
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.launch import ROOT, TISSUQ, run
+
+PAGE = ROOT / "docs" / "how-to" / "extending.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The files of the page."""
+    made = tmp_path_factory.mktemp("extending")
+    files = re.findall(r"^```(?:python|toml)\n# (\S+)\n(.*?)^```", PAGE.read_text(), re.M | re.S)
+    for name, text in files:
+        (made / name).write_text(text)
+    return made
+
+
+@pytest.fixture(scope="module")
+def schema():
+    done = run(None, TISSUQ, "schema")
+    return json.loads(done.stdout)
+
+
+def test_the_page_has_one_file_for_each_kind(folder):
+    assert {path.name for path in folder.iterdir()} >= {
+        "my_tissue.py", "my_loads.py", "my_methods.py", "my_sections.py", "my_models.py", "wound.toml", "beam.toml",
+    }  # fmt: skip
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_a_study_of_a_body_on_two_ranks(folder, schema):
+    study, out = folder / "wound.toml", folder / "wound"
+    jsonschema.validate(tomllib.loads(study.read_text()), schema)
+    checked = run(None, TISSUQ, "check", study)
+    assert checked.returncode == 0, checked.stderr
+    done = run(2, TISSUQ, "run", study, "--out", out)
+    assert done.returncode == 0, done.stderr
+    data = xr.load_dataset(out / "results.nc")
+    assert 0 < data["smallest"].item() < data["largest"].item()
+    page = (out / "report.html").read_text()
+    assert "The ends of what is likely" in page
+    assert f"{data['largest'].item():.4g}" in page
+    sources = json.loads((out / "sources.json").read_text())["files"]
+    assert {"my_tissue", "my_loads", "my_methods"} <= sources.keys()
+    again = run(None, TISSUQ, "run", study, "--out", folder / "one")
+    assert again.returncode == 0, again.stderr
+    assert (folder / "one" / "results.nc").read_bytes() == (out / "results.nc").read_bytes()
+    loads = folder / "my_loads.py"
+    loads.write_text(loads.read_text().replace("/ 2", "/ 3"))
+    other = run(None, TISSUQ, "run", study, "--out", out)
+    loads.write_text(loads.read_text().replace("/ 3", "/ 2"))
+    assert other.returncode == 2
+    assert "my_loads.py has changed" in other.stderr
+
+
+@pytest.mark.mpi
+def test_a_model_with_numbers_of_its_own(folder, schema):
+    study = folder / "beam.toml"
+    jsonschema.validate(tomllib.loads(study.read_text()), schema)
+    done = run(2, TISSUQ, "run", study, "--out", folder / "beam")
+    assert done.returncode == 0, done.stderr
+    data = xr.load_dataset(folder / "beam" / "results.nc")
+    cube = (0.12**4 - 0.08**4) / (4 * 0.04)
+    expected = 0.5 * cube / 3 / 2.0 * (1 + 0.1**2)  # the mean of 1/x of a log-normal x of coefficient of variation v
+    assert data["mean"].item() == pytest.approx(expected, abs=4 * data["mean_error"].item())
+    assert np.isfinite(data["std"]).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("my_tissue.fung", "my_tissue.fang", "did you mean 'fung'"),
+        ("my_loads.Springs", "my_load.Springs", "cannot be imported"),
+        ("k = 2e4", "k = -1", "greater than or equal to 0"),
+        ("c = 2e3, ", "", "material.c: missing"),
+    ],
+)
+def test_mistakes_have_their_places(folder, tmp_path, old, new, said):
+    for path in folder.glob("*.py"):
+        (tmp_path / path.name).write_text(path.read_text())
+    (tmp_path / "bad.toml").write_text((folder / "wound.toml").read_text().replace(old, new))
+    done = run(None, TISSUQ, "check", tmp_path / "bad.toml")
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
