@@ -107,17 +107,19 @@ def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, by which editors complete and check it."""
     from workflows.studies.inversion import Inversion
     from workflows.studies.output_inversion import OutputInversion
+    from workflows.studies.output_selection import OutputFile, OutputSelection
     from workflows.studies.sampling import Study
     from workflows.studies.selection import DataFile, Selection
     from workflows.studies.specimen_selection import DisplacementFile, SpecimenSelection
     from workflows.studies.synthesis import Synthesis
 
     adapter: TypeAdapter[Any] = TypeAdapter(
-        Study | Selection | SpecimenSelection | Inversion | OutputInversion | Synthesis
+        Study | Selection | SpecimenSelection | OutputSelection | Inversion | OutputInversion | Synthesis
     )
     found = adapter.json_schema(ref_template="#/$defs/{model}")
     # A file may name a table in place of the data themselves.
-    for name, file in (("Selection", DataFile), ("SpecimenSelection", DisplacementFile)):
+    files = (("Selection", DataFile), ("SpecimenSelection", DisplacementFile), ("OutputSelection", OutputFile))
+    for name, file in files:
         table = TypeAdapter(file).json_schema(ref_template="#/$defs/{model}")
         found["$defs"] |= table.pop("$defs", {}) | {file.__name__: table}
         data = found["$defs"][name]["properties"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -373,6 +373,22 @@ class Comparison(StudyKind):
         """Make the model of a candidate in a group on a communicator; collective."""
         raise NotImplementedError
 
+    def build_finer(self, name: str, make: Callable[[], ForwardModel], comm: Any = None) -> ForwardModel:
+        """Make what a candidate's model is on a finer mesh, where it is looked at (see `unchecked`); collective.
+
+        Parameters
+        ----------
+        name
+            Of the candidate.
+        make
+            Makes its model, or returns the one that was made before.
+        comm
+            As of `build`.
+        """
+        from workflows.studies.finer import once_on_finer_mesh
+
+        return once_on_finer_mesh(make)
+
     @property
     def group_names(self) -> tuple[str, ...]:
         """Names of the groups."""
@@ -412,7 +428,13 @@ class Comparison(StudyKind):
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
-        """Check the blocks of a comparison on a specimen, where there is one, or on material points."""
+        """Check the blocks of a comparison on a specimen, on another model, or without one on material points."""
+        model = blocks.get("model")
+        body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
+        if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
+            from workflows.studies import output_selection
+
+            return output_selection.OutputSelection.model_validate(output_selection.expanded(blocks, folder))
         if "model" in blocks:
             from workflows.studies import specimen_selection
 

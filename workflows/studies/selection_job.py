@@ -10,7 +10,7 @@ from inverse.criticism.finer import Finer
 from uq.evaluation.evaluate import Evaluate, Recorder, SerialEvaluate
 from uq.findings import add
 from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
-from workflows.studies.finer import FINER, once_on_finer_mesh, solved_by
+from workflows.studies.finer import FINER, solved_by
 from workflows.studies.job import MethodJob
 from workflows.studies.selection import groups
 
@@ -53,6 +53,6 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         return trusted_on_meshes(found)
 
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
-    others |= {f"{n}/{g}/{FINER}": partial(once_on_finer_mesh, makers[n, g]) for n, g in checked}
+    others |= {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}
     first = makers[study.pairs[0]]()
     return MethodJob(first, others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)

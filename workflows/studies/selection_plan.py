@@ -10,6 +10,12 @@ if TYPE_CHECKING:
     from workflows.studies.selection import Comparison
 
 SECONDS_PER_SURROGATE = 0.8  # fits and clouds for one evidence
+# What data of a quantity are called, and what they are of.
+DATA = {
+    "stress": ("stresses", "tests"),
+    "displacement": ("displacements", "load cases"),
+    "output": ("values", "outputs"),
+}
 
 
 def plan(study: Comparison) -> list[str]:
@@ -25,10 +31,8 @@ def plan(study: Comparison) -> list[str]:
     data = study.groups.values()
     tests = sum(len(study.tests(group)) for group in study.group_names)
     groups = f" in {len(data)} groups" if len(data) > 1 else ""
-    kind = "stresses" if study.quantity == "stress" else "displacements"
-    count = (
-        f"{sum(one.values.size for one in data)} {kind} of {tests} {'tests' if kind == 'stresses' else 'load cases'}"
-    )
+    kind, parts = DATA[study.quantity]
+    count = f"{sum(one.values.size for one in data)} {kind} of {tests} {parts}"
     return [
         f"method      {method.kind}",
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",

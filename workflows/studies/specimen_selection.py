@@ -191,7 +191,7 @@ class SpecimenSelection(Comparison):
     def specimens(self) -> dict[str, Specimen]:
         """The specimen of each candidate."""
         given = {
-            name: Specimen.model_validate(_changed(self.model, candidate.model))
+            name: Specimen.model_validate(changed(self.model, candidate.model))
             for name, candidate in self.candidates.items()
         }
         of_inputs = {name: ranges(candidate.parameters) for name, candidate in self.candidates.items()}
@@ -305,7 +305,7 @@ class SpecimenSelection(Comparison):
         for name, candidate in self.candidates.items():
             place = ("candidates", name)
             try:
-                specimen = Specimen.model_validate(_changed(self.model, candidate.model))
+                specimen = Specimen.model_validate(changed(self.model, candidate.model))
             except ValidationError as error:
                 for line in error.errors(include_url=False):
                     yield (*place, "model", *line["loc"]), line["msg"], line["input"]
@@ -348,18 +348,18 @@ def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     name, first = next(iter(candidates.items()))
     changes = first.get("model", {}) if isinstance(first, Mapping) else {}
     try:
-        specimen = Specimen.model_validate(_changed(blocks["model"], changes))
+        specimen = Specimen.model_validate(changed(blocks["model"], changes))
     except ValidationError as error:
         place = f"candidates.{name}.model"
         raise StudyError(*lines(error, place)) from None
     return {**blocks, "data": file.read(folder, specimen)}
 
 
-def _changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a block with other values; a block with a kind takes the place of what was there."""
     found = dict(block)
     for key, value in changes.items():
         here = found.get(key)
         inside = isinstance(value, Mapping) and isinstance(here, Mapping) and "kind" not in value
-        found[key] = _changed(here, value) if inside else value  # type: ignore[arg-type]
+        found[key] = changed(here, value) if inside else value  # type: ignore[arg-type]
     return found

@@ -14,7 +14,7 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     import xarray as xr
 
-UNITS = {"stress": "Pa", "displacement": "m"}
+UNITS = {"stress": "Pa", "displacement": "m", "output": "1"}  # outputs have units of their own
 
 
 class Averages(Section):

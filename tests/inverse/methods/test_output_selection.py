@@ -1,0 +1,170 @@
+"""Models compared by measured outputs: linear ones with evidences in closed form, bodies on finer meshes, mistakes."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from forward.conformance import check_derivatives
+from forward.model import FunctionModel
+from inverse.data.measured_model import MeasuredModel
+from workflows.__main__ import main
+from workflows.config.study import StudyError, document, load, parse
+
+LINES = """
+import numpy as np
+
+ONE = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
+OTHER = np.array([[1.0, 0.0], [0.5, 0.3], [3.0, -2.0]])
+
+
+def one(p):
+    return ONE @ p
+
+
+def one_slopes(p):
+    return ONE
+
+
+def other(p):
+    return OTHER @ p
+
+
+def other_slopes(p):
+    return OTHER
+"""
+STUDY = """
+[model]
+kind = "python"
+function = "rival_lines.one"
+jacobian = "rival_lines.one_slopes"
+parameters = { a = 1.0, b = -1.0 }
+outputs = ["u", "v", "w"]
+
+[data]
+outputs = { w = [3.1, 2.9], u = 0.4 }
+sigma = { u = 0.05, w = 0.3 }
+
+[candidates.one]
+parameters.a = { kind = "normal", mean = 1.0, std = 0.5 }
+parameters.b = { kind = "normal", mean = -1.0, std = 2.0 }
+
+[candidates.one-alone]
+parameters.a = { kind = "normal", mean = 1.0, std = 0.5 }
+
+[candidates.other]
+model = { function = "rival_lines.other", jacobian = "rival_lines.other_slopes" }
+parameters.a = { kind = "normal", mean = 1.0, std = 0.5 }
+parameters.b = { kind = "normal", mean = -1.0, std = 2.0 }
+
+[method]
+kind = "select"
+samples = 32
+starts = 1
+noise = {}
+"""
+ONE = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
+OTHER = np.array([[1.0, 0.0], [0.5, 0.3], [3.0, -2.0]])
+MEAN, STD = np.array([1.0, -1.0]), np.array([0.5, 2.0])
+
+
+def log_evidence(A, std):
+    """Of the measured values, for independent normal priors; b is at its mean where its deviation is zero."""
+    B, sigma = A[[2, 2, 0]], np.array([0.3, 0.3, 0.05])
+    S = np.diag(sigma**2) + (B * std**2) @ B.T
+    gap = np.array([3.1, 2.9, 0.4]) - B @ MEAN
+    return -(gap @ np.linalg.solve(S, gap) + np.linalg.slogdet(2 * np.pi * S)[1]) / 2
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "rival_lines.py").write_text(LINES)
+    (tmp_path / "rivals.toml").write_text(STUDY)
+    (tmp_path / "table.csv").write_text("# by hand\noutput,value,sigma\nw,3.1,0.3\nw,2.9,\nu,0.4,0.05\n")
+    return tmp_path
+
+
+def test_linear_models_have_their_exact_evidences(folder):
+    """Stated in the study or in a table; the report and summary.json name them; nothing is said of meshes."""
+    out = folder / "out"
+    assert main(["run", str(folder / "rivals.toml"), "--out", str(out), "--quiet"]) == 0
+    expected = [log_evidence(ONE, STD), log_evidence(ONE, STD * [1, 0]), log_evidence(OTHER, STD)]
+    with xr.open_dataset(out / "results.nc", engine="h5netcdf") as found:
+        np.testing.assert_allclose(found["log_evidence"], expected, rtol=1e-9)
+        odds = np.exp(np.array(expected) - max(expected))
+        np.testing.assert_allclose(found["probability"], odds / odds.sum(), rtol=1e-8)
+        assert "mesh_checked" not in found
+        assert found["output_test"].values.tolist() == ["w", "w", "u"]
+        assert found.attrs["quantity"] == "output"
+    assert set(json.loads((out / "summary.json").read_text())["models"]) == {"one", "one-alone", "other"}
+    assert "one-alone" in (out / "report.html").read_text()
+    study, table = load(folder / "rivals.toml"), 'data={file="table.csv", sigma={w=0.3}}'
+    assert load(folder / "rivals.toml", [table]).groups["all"].sigma.tolist() == study.groups["all"].sigma.tolist()
+    assert parse(document(study)) == study
+    assert main(["check", str(folder / "rivals.toml")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("outputs = { w", "outputs = { q = 1.0, w", "no output 'q', of which there are data"),
+        ("sigma = { u = 0.05, w = 0.3 }", "", "neither absolute nor relative noise, and no sigma"),
+        ("parameters.b = {", "parameters.q = {", "not a number of the model"),
+        ("outputs = { w = [3.1, 2.9], u = 0.4 }", "", "expected either a file or outputs"),
+    ],
+)
+def test_mistakes_have_their_places(folder, old, new, told):
+    (folder / "bad.toml").write_text(STUDY.replace(old, new, 1))
+    with pytest.raises(StudyError) as error:
+        load(folder / "bad.toml")
+    assert told in str(error.value)
+
+
+def test_derivatives_of_what_is_measured():
+    """Of some outputs, of one of them twice: those of the model."""
+    A = np.arange(6.0).reshape(3, 2)
+    model = MeasuredModel(
+        FunctionModel(lambda p: A @ p**2, ("a", "b"), ("u", "v", "w"), lambda p: 2 * A * p), (2, 0, 2)
+    )
+    assert model.outputs == ("w.0", "u", "w.1")
+    check_derivatives(model, np.array([0.5, 1.5]), np.ones(2))
+    solution = model.solve(np.array([0.5, 1.5]))
+    weights = np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(solution.adjoint(weights), weights @ (2 * A * [0.5, 1.5])[[2, 0, 2]])
+
+
+BARS = """
+[model]
+body = { size = [1.0, 1.0, 1.0], cells = [2, 1, 1], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e4, lmbda = 4e4 }
+clamp = ["x-min"]
+loads = [{ kind = "traction", on = "x-max", direction = [1, 0, 0], size = 900 }]
+outputs = [{ name = "ux", kind = "max-displacement", component = "x" }]
+
+[data]
+outputs = { ux = 0.03 }
+
+[candidates.coarse]
+parameters."material.mu" = { kind = "log-normal", mean = 1e4, std = 3e3 }
+
+[candidates.long]
+model.body = { cells = [3, 1, 1] }
+parameters."material.mu" = { kind = "log-normal", mean = 1e4, std = 3e3 }
+
+[method]
+kind = "select"
+samples = 32
+starts = 1
+noise = { relative = 0.05 }
+"""
+
+
+@pytest.mark.fem
+def test_bodies_are_looked_at_on_finer_meshes(tmp_path):
+    (tmp_path / "bars.toml").write_text(BARS)
+    assert main(["run", str(tmp_path / "bars.toml"), "--out", str(tmp_path / "out"), "--quiet"]) in (0, 3)
+    with xr.open_dataset(tmp_path / "out" / "results.nc", engine="h5netcdf") as found:
+        assert found["mesh_checked"].to_numpy().all()
+        assert np.isfinite(found["mesh_log_evidence"]).all()
+        np.testing.assert_allclose(found["prediction_mean"], 0.03, rtol=0.05)
