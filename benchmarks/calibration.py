@@ -16,7 +16,8 @@ import numpy as np
 from mpi4py import MPI
 
 from benchmarks.beams import CONFIG
-from forward.specimen import Specimen, SpecimenModel
+from forward.fem.specimen import SpecimenModel
+from forward.specimen import Specimen
 from inverse.criticism.calibration import Kind, calibrate
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import Prediction, SerialEvaluate

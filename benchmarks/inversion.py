@@ -10,8 +10,9 @@ import numpy as np
 from mpi4py import MPI
 
 from forward.bodies.random_fields import RandomField
+from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray
-from forward.specimen import Specimen, SpecimenModel
+from forward.specimen import Specimen
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode

@@ -1,19 +1,11 @@
-"""A specimen under several load cases: one body with the same parameters, of which displacements are observed.
-
-Every case has a model of its own, and with it a factor of its own: products with the derivatives of all cases, however
-they alternate, use the factors of one solution. What is observed of a case is Bu with a sparse B.
-"""
+"""The specification of a specimen: one body under several load cases, of which displacements are observed."""
 
 from __future__ import annotations
 
-import copy
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from functools import cached_property
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
@@ -26,7 +18,7 @@ from forward.hyperelastic import Hyperelastic, materials
 from forward.materials.admissible import Materials
 from forward.materials.block import Material
 from forward.materials.material import splits
-from forward.model import Finding, FloatArray, Guess, ModelError, OneByOne, Reference, SolveError, Stability, Work
+from forward.model import Finding, ModelError
 from forward.observables.displacement import PointDisplacement
 from forward.observables.observable import Output
 from forward.scalars import Mistake, Scalar
@@ -37,10 +29,7 @@ from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
-    from forward.fem.layout import Layout
-    from forward.fem.model import FiniteElementSolution, HyperelasticModel
+    from forward.fem.specimen import SpecimenModel
 
 
 SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
@@ -253,6 +242,8 @@ class Specimen(ModelSpec):
         parameters
             As of `Hyperelastic.build`.
         """
+        from forward.fem.specimen import SpecimenModel
+
         return SpecimenModel(self, comm, parameters)
 
     @model_validator(mode="after")
@@ -299,262 +290,3 @@ def _mistake(place: tuple[str | int, ...], message: str, given: Any) -> InitErro
     return InitErrorDetails(
         type=PydanticCustomError("model", "{message}", {"message": message}), loc=place, input=given
     )
-
-
-class SpecimenModel(OneByOne):
-    """A specimen as a `ForwardModel`: its outputs are what is observed in all cases, its states those of all cases.
-
-    Attributes
-    ----------
-    parameters, outputs
-        Names.
-    places
-        Where (n, 3) each output is observed (m, undeformed).
-    axes
-        Its component (n,): 0, 1 or 2.
-    cases
-        Which case (n,) it belongs to.
-    models
-        The models of the cases.
-    positions
-        Where the parameters of each case stand among all.
-    observations
-        B (n, U_local) of each case, sparse.
-    distances
-        How far (n,) the places lie outside the mesh (m), where the displacements of the nearest ones are observed.
-    """
-
-    def __init__(self, spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> None:
-        self.spec = spec
-        self.parameters = parameters
-        known = {*spec.scalars, *spec.coefficients}
-        for path in parameters:
-            if path not in known:
-                message = f"'{path}' is not a number of any load case, expected one of: {', '.join(spec.scalars)}"
-                raise ValueError(message)
-        bodies = [spec.loaded(case) for case in spec.cases]
-        self.positions = [np.flatnonzero(np.isin(parameters, [*body.scalars, *body.coefficients])) for body in bodies]
-        self.models = tuple(
-            body.build(comm, tuple(parameters[i] for i in where))
-            for body, where in zip(bodies, self.positions, strict=True)
-        )
-        self.space = SpecimenSpace(self)
-        self.differentiable = True
-        names: list[str] = []
-        places: list[FloatArray] = []
-        axes: list[int] = []
-        cases: list[int] = []
-        for number, (case, model) in enumerate(zip(spec.cases, self.models, strict=True)):
-            for item in spec.seen(case):
-                where = _places(model, item)
-                names += [f"{case.name}.{item.label}.{i}.{axis}" for i in range(len(where)) for axis in item.components]
-                places.append(np.repeat(where, len(item.components), axis=0))
-                axes += [AXES.index(axis) for axis in item.components] * len(where)
-                cases += [number] * len(where) * len(item.components)
-        self._observing(np.concatenate(places) if places else np.zeros((0, 3)), axes, cases, tuple(names))
-
-    def observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int]) -> SpecimenModel:
-        """Return the same model with other outputs; collective. Both share meshes, forms and factors.
-
-        Parameters
-        ----------
-        places
-            Where (n, 3) displacements are observed, in the undeformed body (m).
-        axes
-            Their components (n,): 0, 1 or 2.
-        cases
-            Their load cases (n,) by number, which do not fall.
-        """
-        other = copy.copy(self)
-        labels = [(self.spec.cases[case].name, AXES[axis]) for case, axis in zip(cases, axes, strict=True)]
-        other._observing(places, axes, cases, tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels)))
-        return other
-
-    def _observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], names: tuple[str, ...]) -> None:
-        self.outputs, self.places = names, places
-        self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
-        numbers = range(len(self.models))
-        self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
-        found = [
-            _interpolation(model, self.places[self.cases == number], self.axes[self.cases == number])
-            for number, model in zip(numbers, self.models, strict=True)
-        ]
-        self.observations: list[csr_matrix] = [matrix for matrix, _ in found]
-        self.distances = np.concatenate([distances for _, distances in found])
-
-    @cached_property
-    def vertices(self) -> Layout:
-        """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
-        from forward.fem.dolfinx import spaces
-        from forward.fem.layout import Layout
-
-        body = self.models[0].body
-        return Layout(spaces.scalar_space(body.space.mesh, 1), body.comm)
-
-    def log_fields(self, points: FloatArray) -> FloatArray:
-        """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
-
-        That of all random fields on it together; on every rank.
-        """
-        model = self.models[0]
-        found = np.zeros((len(points), self.spec.body.vertex_count))
-        if self.spec.fields:
-            factors = model.body.comm.bcast(self.space.factors(points, 1))
-            found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
-        return found
-
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> SpecimenSolution:
-        """Find the equilibria of all cases at `parameters` (d,), as `HyperelasticModel.solve` does; collective.
-
-        Raises
-        ------
-        SolveError
-            With the case that has no answer.
-        """
-        solutions = []
-        guesses = self._guesses(guess or Guess())
-        for case, model, where, known in zip(self.spec.cases, self.models, self.positions, guesses, strict=True):
-            try:
-                solutions.append(model.solve(parameters[where], known))
-            except SolveError as error:
-                message = f"load case '{case.name}': {error.reason}"
-                raise type(error)(message, error.history, error.work, error.stability) from error
-        return SpecimenSolution(self, tuple(solutions))
-
-    def _guesses(self, guess: Guess) -> Iterator[Guess]:
-        """Split a guess into those of the cases."""
-        near = guess.reference
-        for k, where in enumerate(self.positions):
-            state = None if guess.state is None else self.states(guess.state)[k]
-            if near is None:
-                yield Guess(state, iterations=guess.iterations)
-            else:
-                spread = None if near.spread is None else near.spread[..., where]
-                reference = Reference(near.parameters[where], self.states(near.state)[k], spread)
-                yield Guess(state, reference, guess.iterations)
-
-    def states(self, rows: FloatArray) -> list[FloatArray]:
-        """Split this rank's states (…, U_local) into those of the cases."""
-        return np.split(rows, np.cumsum([model.body.size for model in self.models])[:-1], axis=-1)
-
-    def values(self, rows: FloatArray) -> list[FloatArray]:
-        """Split what is observed (…, n) into that of the cases."""
-        return np.split(rows, self._ends, axis=-1)
-
-
-class SpecimenSpace:
-    """The `NodalSpace` of a specimen: states hold those of its cases, one after the other."""
-
-    def __init__(self, model: SpecimenModel) -> None:
-        self._model = model
-        first = model.models[0].space
-        self.coordinates, self.cells, self.regions = first.coordinates, first.cells, first.regions
-        self.variance_kept = first.variance_kept
-        self.displacements = 0  # states of several cases are no displacement field
-
-    def gather(self, rows: FloatArray) -> FloatArray | None:
-        """Collect (k, U_local) as (k, U), case after case, on the first rank."""
-        model = self._model
-        parts = [case.space.gather(part) for case, part in zip(model.models, model.states(rows), strict=True)]
-        whole = [part for part in parts if part is not None]
-        return np.concatenate(whole, axis=1) if whole else None
-
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Take this rank's part (k, U_local) of (k, U)."""
-        models = self._model.models
-        parts = np.split(rows, len(models), axis=1)  # the cases have as many unknowns
-        return np.concatenate([case.space.scatter(part) for case, part in zip(models, parts, strict=True)], axis=1)
-
-    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
-        """Return the factors (n, N) of each random field at parameters (n, d), which all cases share; collective."""
-        return self._model.models[0].space.factors(points[:, self._model.positions[0]], degree)
-
-
-class SpecimenSolution:
-    """The equilibria of all cases with their linearisations; k derivatives of a case are solved for together."""
-
-    def __init__(self, model: SpecimenModel, solutions: tuple[FiniteElementSolution, ...]) -> None:
-        self._model = model
-        self.solutions = solutions
-        self.state = np.concatenate([solution.state for solution in solutions])
-        self.outputs = self._observe([solution.state for solution in solutions])
-        for array in (self.state, self.outputs):
-            array.flags.writeable = False
-        self.residual = max(solution.residual for solution in solutions)
-        self.converged = all(solution.converged for solution in solutions)
-
-    @property
-    def stability(self) -> Stability:
-        """What is known of the case of which least is known; an instability that was missed counts more."""
-        known = [solution.stability for solution in self.solutions]
-        return max(known) if Stability.MISSED in known else min(known)
-
-    @property
-    def work(self) -> Work:
-        """What the solutions of all cases have cost so far."""
-        return Work(*sum(solution.work.as_array() for solution in self.solutions).tolist())  # type: ignore[union-attr]
-
-    def _observe(self, states: list[FloatArray]) -> FloatArray:
-        parts = zip(self._model.models, self._model.observations, states, strict=True)
-        return np.concatenate([model.body.total((B @ u.T).T) for model, B, u in parts], axis=-1)
-
-    def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
-        parts = zip(self.solutions, self._model.positions, strict=True)
-        return [solution.state_tangent(direction[..., where]) for solution, where in parts]
-
-    def state_tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        return np.concatenate(self._state_tangents(direction), axis=-1)
-
-    def tangent(self, direction: FloatArray) -> FloatArray:
-        """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
-        return self._observe(self._state_tangents(direction))
-
-    def adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
-        model = self._model
-        gradients = np.zeros((*np.shape(weights)[:-1], len(model.parameters)))
-        parts = zip(self.solutions, model.positions, model.observations, model.values(weights), strict=True)
-        for solution, where, B, w in parts:
-            gradients[..., where] += solution.state_adjoint((B.T @ w.T).T)
-        return gradients
-
-
-def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
-    """Where (n, 3) displacements are observed; collective."""
-    if item.on is None:
-        return np.array(item.at)
-    from forward.fem.dolfinx import spaces
-
-    body, layout = model.body, model.body.layout
-    mine = layout.nodes()[spaces.boundary_nodes(body.space, body.facets[item.on])]
-    return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
-
-
-def _interpolation(
-    model: HyperelasticModel, places: FloatArray, axes: NDArray[np.int64]
-) -> tuple[csr_matrix, FloatArray]:
-    """Return B (n, U_local) of components (n,) at places (n, 3), and how far (n,) these lie outside; collective.
-
-    Raises
-    ------
-    ValueError
-        If a place is farther from the mesh than the mesh can be from the body.
-    """
-    from scipy.sparse import csr_matrix
-
-    body, layout = model.body, model.body.layout
-    different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
-    which = which.ravel()
-    held, distances = model.space.interpolation(different)
-    local = np.full(len(layout.coordinates), -1)
-    local[layout.positions] = np.arange(len(layout.positions))
-    rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for row, (i, axis) in enumerate(zip(which, axes, strict=True)):
-        at, w = held[i]
-        owned = local[at] >= 0
-        rows.append(np.full(owned.sum(), row))
-        columns.append(3 * local[at][owned] + axis)
-        values.append(w[owned])
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(entries, shape=(len(places), body.size)), distances[which]

@@ -18,7 +18,8 @@ from forward.bodies.random_fields import RandomField
 from forward.model import FloatArray, ModelError
 
 if TYPE_CHECKING:
-    from forward.specimen import Specimen, SpecimenModel
+    from forward.fem.specimen import SpecimenModel
+    from forward.specimen import Specimen
 
 TIMES = 1.5  # cells along an edge, over those of the specimen
 # Of the error of configs/inclusion.toml at 120 points, as 14³ graded cells have it, this mesh tells 83 %; without the

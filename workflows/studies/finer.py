@@ -13,8 +13,8 @@ from uq.evaluation.evaluate import Request
 
 if TYPE_CHECKING:
     from forward.fem.finer import FinerMesh
+    from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray, ForwardModel
-    from forward.specimen import SpecimenModel
     from uq.evaluation.evaluate import Evaluate
 
 FINER = "finer mesh"  # in names of models
@@ -45,7 +45,7 @@ def on_finer_mesh(observed: ForwardModel, outputs: Callable[[FloatArray], FloatA
 def once_on_finer_mesh(make: Callable[[], ForwardModel]) -> ForwardModel:
     """Return a model on a finer mesh of a specimen, which is made for each solve: there is one for each candidate."""
     from forward.fem.finer import FinerMesh
-    from forward.specimen import SpecimenModel
+    from forward.fem.specimen import SpecimenModel
 
     specimen = make()
     assert isinstance(specimen, SpecimenModel)

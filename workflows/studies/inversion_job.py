@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.finer import FinerMesh
-    from forward.specimen import SpecimenModel
+    from forward.fem.specimen import SpecimenModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.kept import KeptEvaluate, KeptModel

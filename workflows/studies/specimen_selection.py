@@ -29,8 +29,8 @@ from workflows.config.report import Report
 from workflows.studies.selection import WHOLE, Comparison
 
 if TYPE_CHECKING:
+    from forward.fem.specimen import SpecimenModel
     from forward.model import Finding
-    from forward.specimen import SpecimenModel
 
 Positive = Annotated[float, Field(gt=0)]
 

@@ -31,8 +31,8 @@ from workflows.studies.study import StudyKind
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.fem.specimen import SpecimenModel
     from forward.model import Finding, FloatArray
-    from forward.specimen import SpecimenModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.evaluate import Evaluate
