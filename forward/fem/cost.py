@@ -166,19 +166,23 @@ class Times:
 
 
 def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool = True, factors: int = 1) -> Times:
-    """Predict what solves of a body take, with some factors; without symmetry of the stiffness, LU is twice LDLᵀ."""
-    triangles = 1 if symmetric else 2
+    """Predict what solves of a body take, with some factors.
+
+    Where the stiffness is not symmetric, each has beside it a factor of the symmetric part, for the test of stability.
+    """
     extents = [high - low for low, high in body.bounds]
-    found, kind, more = factor(body, mixed=mixed), (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
+    kind, more = (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
+    found = factor(body, mixed=mixed, symmetric=symmetric)
+    size = found.bytes if symmetric else found.bytes + factor(body, mixed=mixed).bytes
     return Times(
         CALL + more * ASSEMBLY[kind] * body.cell_count,
         CALL + RESIDUAL[kind] * body.cell_count,
         CALL + PER_NONZERO * found.nonzeros,
-        CALL + triangles * (PER_ENTRY * found.entries + PER_OPERATION * found.operations),
-        CALL + triangles * PER_ENTRY_SOLVED * found.entries,
+        CALL + PER_ENTRY * found.entries + PER_OPERATION * found.operations,
+        CALL + PER_ENTRY_SOLVED * found.entries,
         max(extents) > SLENDER * min(extents),
         predicted,
-        BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * found.bytes,
+        BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * size,
     )
 
 
@@ -188,8 +192,9 @@ def sum_of(parts: Sequence[Times]) -> Times:
     return replace(parts[0], **totals)
 
 
-def factor(body: Meshed, *, mixed: bool) -> Factor:
-    """Predict the factor of a body's stiffness."""
+def factor(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Factor:
+    """Predict the factor of a body's stiffness: LDLᵀ or, without symmetry, LU, which is two triangles."""
+    triangles = 1 if symmetric else 2
     cells = getattr(body, "cells", None)
     if cells is not None:
         lattice = [body.degree * n + 1.0 for n in cells]
@@ -200,8 +205,8 @@ def factor(body: Meshed, *, mixed: bool) -> Factor:
     pressures = body.vertex_count / body.nodes if mixed else 0.0
     operations, entries = _dissected(tuple(sorted(lattice)), (0, 0, 0), 3 + pressures)
     return Factor(
-        ENTRIES * entries,
-        OPERATIONS * operations,
+        triangles * ENTRIES * entries,
+        triangles * OPERATIONS * operations,
         ROW[body.cell, min(body.degree, 2)] * 3 * body.nodes * (1 + pressures / 3) ** 2,
     )
 

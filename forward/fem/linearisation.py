@@ -128,7 +128,7 @@ class Linearisation(Forms):
         return linear.DirectSolver(self._new_matrix(self._symmetric_stiffness, symmetric=True))
 
     def _new_matrix(self, form: Any, *, symmetric: bool) -> linear.StiffnessMatrix:
-        expected = factor(self.spec.body, mixed=self.spec.mixed)
+        expected = factor(self.spec.body, mixed=self.spec.mixed, symmetric=symmetric)
         return linear.StiffnessMatrix(
             form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
         )

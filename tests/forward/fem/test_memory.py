@@ -1,8 +1,11 @@
-"""Long sample loops do not leak communicators, PETSc objects or anything else."""
+"""Long sample loops do not leak communicators, PETSc objects or anything else; what a factor takes is foreseen."""
 
 import pytest
+from mpi4py import MPI
 
 from benchmarks.throughput import memory_over
+from forward.fem.cost import factor
+from forward.hyperelastic import Hyperelastic
 
 
 @pytest.mark.fem
@@ -10,3 +13,30 @@ from benchmarks.throughput import memory_over
 def test_memory_is_flat_over_ten_thousand_realisations():
     sizes = memory_over(10_000)
     assert max(sizes) - sizes[0] < 1, sizes
+
+
+@pytest.mark.fem
+def test_without_symmetry_two_triangles_are_foreseen_and_a_factor_of_the_symmetric_part():
+    blocks = {
+        "body": {"size": [1.0, 1.0, 1.0], "cells": [4, 4, 4], "degree": 2},
+        "material": {"kind": "neo-hookean", "C1": 1e4, "D1": 1e5},
+        "clamp": ["x-min"],
+        "formulation": "displacement",
+        "outputs": [{"kind": "strain-energy", "name": "W"}],
+    }
+    following, dead = (
+        Hyperelastic.model_validate(blocks | {"loads": [load]})
+        for load in (
+            {"kind": "pressure", "on": "x-max", "size": 100.0},
+            {"kind": "traction", "on": "x-max", "direction": [1, 0, 0], "size": 100.0},
+        )
+    )
+    whole, half = (factor(following.body, mixed=False, symmetric=symmetric) for symmetric in (False, True))
+    assert following.cost().bytes - dead.cost().bytes == pytest.approx(2 * whole.bytes)
+    body = following.build(MPI.COMM_SELF, ()).body
+    found = {}
+    for solver, expected in ((body.new_solver(), whole), (body.new_symmetric_solver(), half)):
+        assert solver._stiffness.expected == expected  # what is asked for before it is made
+        solver.factorise()
+        found[expected] = solver._ksp.pc.getFactorMatrix().getMumpsInfog(29)  # entries, by MUMPS
+    assert found[whole] / found[half] == pytest.approx(whole.entries / half.entries, rel=0.15)
