@@ -57,12 +57,12 @@ def study(parameters, **changes):
 )
 def test_one_formulation_for_all_values_of_the_inputs(parameters, changes, mixed):
     found = study(parameters, **changes)
-    assert found.body.mixed == mixed
-    assert {model.formulation for model in found.models} == {"mixed" if mixed else "displacement"}
+    assert found.spec.mixed == mixed
+    assert {model.formulation for model in found.specs} == {"mixed" if mixed else "displacement"}
     assert (
         parse(
             {"model": found.model.model_dump(), "parameters": parameters, "method": found.method.model_dump()}
-        ).body.mixed
+        ).spec.mixed
         == mixed
     )
     (line,) = [line for line in plan(found) if line.startswith("form ")]
