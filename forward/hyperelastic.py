@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -294,6 +294,12 @@ class Hyperelastic(ModelSpec):
         yield from body.listed.items()
         yield "unknowns", f"{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+
+    def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
+        """Say for a report what was solved."""
+        from forward.bodies.in_words import in_words
+
+        return in_words(self, said, where)
 
     def identity(self) -> dict[str, Any]:
         """Return all that decides on results; of the file of a mesh its hash counts, not its place."""

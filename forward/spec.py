@@ -7,13 +7,14 @@ package (`forward.registry`): it says its numbers and its outputs, and `build` m
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from forward.model import ModelError
 from forward.registry import Kinds
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings
+from forward.words import named
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
@@ -74,6 +75,20 @@ class ModelSpec(Settings):
     @abstractmethod
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what it is, for values of parameters within ranges by their paths: words and what they are of."""
+
+    def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
+        """Say for a report what was solved: headings, each with its lines.
+
+        Parameters
+        ----------
+        said
+            What is said of a number of the model, by its path.
+        where
+            What is added to what is true of one mesh only.
+        """
+        yield "model", [self.description]
+        yield "parameters", [f"{name} = {said(name)}" for name in self.scalars]
+        yield "outputs", [named(output.name, output.unit) for output in self.outputs]
 
     @property
     def description(self) -> str:

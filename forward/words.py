@@ -58,6 +58,11 @@ def with_unit(text: str, unit: str) -> str:
     return text if unit == "1" or text == NONE else f"{text} {unit}"
 
 
+def named(name: str, unit: str) -> str:
+    """Write the unit after a name, if it has one."""
+    return name if unit == "1" else f"{name} ({unit})"
+
+
 def per(unit: str, divisor: str) -> str:
     """Unit of a derivative."""
     if divisor == "1":

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from forward.words import named
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span
-from workflows.report.words import named, unit_of
+from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.words import with_error
+from forward.words import named, with_error
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, axes, span
-from workflows.report.words import named, unit_of_constant
+from workflows.report.words import unit_of_constant
 from workflows.studies.findings_selection import ranking
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.words import number, with_error
+from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import named, unit_of
+from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr

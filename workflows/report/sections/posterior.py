@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from forward.words import number, with_error
+from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.section import Results, Section
-from workflows.report.words import named, unit_of
+from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr
