@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from forward.specimen import Specimen
 
+HOPELESS = 100  # times a solve by the textbook that one may take which fails, with its load steps
 NOT_ASKED = "not asked for: nothing will be said to be trusted"
 
 
@@ -38,7 +39,8 @@ def mesh_check(spec: Specimen) -> tuple[float, str]:
             unknowns, once = fine.unknowns, sum(times_of(fine.loaded(case)).textbook for case in fine.cases)
     except ValueError as error:
         return 0.0, f"not possible: {error}; nothing will be said to be trusted"
-    return once, f"one solve of {unknowns:,} displacements, about {duration(once)}"
+    longest = duration(HOPELESS * once)
+    return once, f"one solve of {unknowns:,} displacements, about {duration(once)}; up to {longest} if it has no answer"
 
 
 def duration(seconds: float) -> str:

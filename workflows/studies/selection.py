@@ -350,8 +350,8 @@ class Comparison(StudyKind):
         raise NotImplementedError
 
     @property
-    def seconds_per_solve(self) -> float:
-        """Processor time of a solve, roughly."""
+    def seconds_of_solves(self) -> float:
+        """Processor time of all solves and their derivatives, roughly."""
         raise NotImplementedError
 
     @property
@@ -416,8 +416,12 @@ class Comparison(StudyKind):
     @property
     def planned(self) -> int:
         """Number of solves, roughly: the searches for the modes take as many as they take."""
-        searches = sum(10 * self.method.starts + 2 * len(self.candidates[name].parameters) for name, _ in self.pairs)
+        searches = sum(self.searches(name) for name, _ in self.pairs)
         return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
+
+    def searches(self, name: str) -> int:
+        """Number of solves that the searches for the mode of a candidate take, roughly."""
+        return 10 * self.method.starts + 2 * len(self.candidates[name].parameters)
 
     @property
     def evidences(self) -> int:
@@ -529,9 +533,9 @@ class Selection(Comparison):
         return tuple(test.label for test in self._measured(group))
 
     @property
-    def seconds_per_solve(self) -> float:
+    def seconds_of_solves(self) -> float:
         """Processor time of the stresses and their derivatives, roughly."""
-        return SECONDS_PER_STRESS
+        return SECONDS_PER_STRESS * self.planned
 
     def described(self, name: str) -> str:
         """Material of a candidate."""

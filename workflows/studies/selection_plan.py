@@ -22,7 +22,7 @@ def plan(study: Comparison) -> list[str]:
     """Say what is compared, and how long that will take."""
     method = study.method
     evidences = study.evidences
-    seconds = study.seconds_per_solve * study.planned + SECONDS_PER_SURROGATE * evidences
+    seconds = study.seconds_of_solves + SECONDS_PER_SURROGATE * evidences
     meshes = [mesh_check(one) for one in getattr(study, "specimens", {}).values() if study.unchecked]
     if not getattr(method, "mesh_check", True):
         meshes = [(0.0, NOT_ASKED)]

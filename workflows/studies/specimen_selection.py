@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import AXES, Vector, tolerance
-from forward.fem.cost import times
+from forward.bodies.mesh_file import OwnMesh
 from forward.fem.finer import finer
 from forward.scalars import Mistake
 from forward.settings import Settings
@@ -206,8 +206,10 @@ class SpecimenSelection(Comparison):
 
     @property
     def specs(self) -> tuple[Specimen, ...]:
-        """The specimens of all candidates."""
-        return tuple(self.specimens.values())
+        """The specimens of all candidates, and the largest of the finer meshes that they are checked on."""
+        checked = [specimen for name, specimen in self.specimens.items() if not self.unchecked[name]]
+        fine = [finer(one) for one in checked if not isinstance(one.body, OwnMesh)]
+        return *self.specimens.values(), *sorted(fine, key=lambda one: one.unknowns)[-1:]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -273,10 +275,15 @@ class SpecimenSelection(Comparison):
         return tuple(dict.fromkeys(self.data.cases))
 
     @property
-    def seconds_per_solve(self) -> float:
-        """Processor time of a solve of all load cases, roughly, averaged over the candidates."""
-        bodies = [specimen.loaded(case) for specimen in self.specimens.values() for case in specimen.cases]
-        return sum(times(one.body, mixed=one.mixed).corrected for one in bodies) / len(self.specimens)
+    def seconds_of_solves(self) -> float:
+        """Processor time of all solves and their derivatives, roughly: searches for modes have no reference."""
+        seconds = 0.0
+        for name, specimen in self.specimens.items():
+            cost = specimen.cost()
+            derivatives = cost.tangents_of_sample(len(self.candidates[name].parameters))
+            seconds += self.searches(name) * (cost.textbook + derivatives)
+            seconds += self.method.samples * (cost.corrected + derivatives)
+        return seconds * self.evidences / len(self.specimens)
 
     def described(self, name: str) -> str:
         """Material and mesh of a candidate."""

@@ -25,7 +25,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.report.sections.finer_meshes import meshes
 from workflows.run import run as study_runs
-from workflows.run.plan import plan
+from workflows.run.plan import memory, plan
 
 pytestmark = pytest.mark.fem
 STUDY = """
@@ -225,3 +225,14 @@ def test_same_bits_after_a_kill(study):
         done = run(None, TISSUQ, "run", study, "--out", out, "--set", "method.samples=256")
         assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (directory / "results.nc").read_bytes() == (study.parent / "whole/results.nc").read_bytes()
+
+
+def test_a_plan_counts_searches_derivatives_and_finer_meshes(study):
+    """Time and memory: searches are solved by the textbook, each solve has derivatives; the finer mesh has a factor."""
+    it, blind = load(study), load(study, ["method.mesh_check=false"])
+    cost = {name: specimen.cost() for name, specimen in it.specimens.items()}
+    least = sum(12 * one.textbook + 32 * one.corrected for one in cost.values())
+    assert 1.2 * least < it.seconds_of_solves < 3 * least
+    largest = max(finer(specimen).cost().bytes for specimen in it.specimens.values())
+    assert memory(it) - memory(blind) == pytest.approx(largest)
+    assert any("if it has no answer" in line for line in it.plan(1))
