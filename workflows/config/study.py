@@ -106,10 +106,11 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, by which editors complete and check it."""
     from workflows.studies.inversion import Inversion
+    from workflows.studies.material_tests import DataFile
     from workflows.studies.output_inversion import OutputInversion
     from workflows.studies.output_selection import OutputFile, OutputSelection
     from workflows.studies.sampling import Study
-    from workflows.studies.selection import DataFile, Selection
+    from workflows.studies.selection import Selection
     from workflows.studies.specimen_selection import DisplacementFile, SpecimenSelection
     from workflows.studies.synthesis import Synthesis
 

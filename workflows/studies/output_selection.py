@@ -25,8 +25,9 @@ from workflows.config.blocks import Parallel
 from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
+from workflows.studies.material_tests import WHOLE
 from workflows.studies.output_inversion import derivable
-from workflows.studies.selection import WHOLE, Comparison
+from workflows.studies.selection import Comparison
 from workflows.studies.specimen_selection import SpecimenCandidate, changed
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from uq.findings import add
 from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
 from workflows.studies.finer import FINER, solved_by
 from workflows.studies.job import MethodJob
-from workflows.studies.selection import groups
+from workflows.studies.selection_results import groups
 
 if TYPE_CHECKING:
     import xarray as xr

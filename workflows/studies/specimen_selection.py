@@ -26,7 +26,8 @@ from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
-from workflows.studies.selection import WHOLE, Comparison
+from workflows.studies.material_tests import WHOLE
+from workflows.studies.selection import Comparison
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
