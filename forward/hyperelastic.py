@@ -22,6 +22,7 @@ from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
 from forward.model import Finding
 from forward.observables.observable import Output
+from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
@@ -318,9 +319,8 @@ class Hyperelastic(ModelSpec):
             Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
             random fields that it does not hold are zero.
         """
-        from forward.fem.model import HyperelasticModel
-
-        return HyperelasticModel(self, comm, parameters)
+        model: type[HyperelasticModel] = named("forward.fem.model:HyperelasticModel")
+        return model(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Hyperelastic:

@@ -107,6 +107,12 @@ class Kinds:
         return found
 
 
+def named(text: str) -> Any:
+    """Return what a text "module:Name" names, of which the module is imported now."""
+    module, _, name = text.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
 def dotted(document: Any) -> Iterator[str]:
     """Return the modules of all kinds in a document that are dotted paths, wherever in it they are."""
     if isinstance(document, Mapping):

@@ -21,6 +21,7 @@ from forward.materials.material import splits
 from forward.model import Finding, ModelError
 from forward.observables.displacement import PointDisplacement
 from forward.observables.observable import Output
+from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
@@ -242,9 +243,8 @@ class Specimen(ModelSpec):
         parameters
             As of `Hyperelastic.build`.
         """
-        from forward.fem.specimen import SpecimenModel
-
-        return SpecimenModel(self, comm, parameters)
+        model: type[SpecimenModel] = named("forward.fem.specimen:SpecimenModel")
+        return model(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Specimen:
