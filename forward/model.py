@@ -2,6 +2,8 @@
 
 A model maps parameters (d,) to a solution; the solution is immutable and carries its own linearisation, so that a
 stale derivative cannot be written. Nothing here knows FEniCSx or MPI.
+
+The module is longer than others because the whole contract, most of which is words, stands in one place.
 """
 
 from __future__ import annotations
