@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from forward.external.own_modules import imported
 from forward.external.patience import TimeLimitError, time_limit
-from forward.machine import StopError, out_of_memory, reason_to_stop
+from forward.machine import MIB, StopError, headroom, out_of_memory, reason_to_stop
 from forward.model import FloatArray, FunctionModel, ModelError, SolveError, real
 from forward.scalars import Scalar
 from forward.settings import Settings, nearest
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
 PROTOCOL = 1.0
+LITTLE = 1024 * MIB  # of memory left, below which it is worth a word
 MISUSED = ("InvalidInput", "UnsupportedFeature", "ModelNotFound")  # errors of a server that no other parameters mend
 
 
@@ -172,12 +173,16 @@ class PythonModel(_External):
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
         """Import function and Jacobian."""
-        function = _guarded(self.function, "function", self.solve_seconds)
-        return function, _guarded(self.jacobian, "jacobian", self.solve_seconds) if self.jacobian else None
+        names, seconds = tuple(self.parameters), self.solve_seconds
+        function = _guarded(self.function, "function", names, seconds)
+        return function, _guarded(self.jacobian, "jacobian", names, seconds) if self.jacobian else None
 
 
-def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray], Any]:
-    """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves."""
+def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -> Callable[[FloatArray], Any]:
+    """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves.
+
+    Where it ends the process or has no memory, which says nothing of the model there, the run ends with the parameters.
+    """
     module, _, name = path.rpartition(".")
     try:
         function = getattr(imported(module), name)
@@ -194,6 +199,9 @@ def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray
         message = f"model.{key}: '{path}' is {type(function).__name__}, expected a function"
         raise ModelError(message)
 
+    def at(point: FloatArray) -> str:
+        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, point, strict=True))
+
     def guarded(point: FloatArray) -> Any:
         try:
             with time_limit(seconds):
@@ -204,9 +212,14 @@ def _guarded(path: str, key: str, seconds: float | None) -> Callable[[FloatArray
             message = f"{path} took longer than solve_seconds = {seconds:g}"
             raise SolveError(message) from None
         except SystemExit as error:
-            message = f"{path} ended the process: {_said(error)}"
+            message = f"{path} ended the process: {_said(error)} at {at(point)}"
             raise StopError(message) from None
         except Exception as error:
+            if out_of_memory(error):
+                have = headroom()
+                left = f"; {have}" if have.size < LITTLE else ""  # there may be plenty, but not for what it asked for
+                message = f"memory ran out: {path} raised {_said(error)} at {at(point)}{left}"
+                raise StopError(message) from None
             if reason_to_stop(error) is not None:
                 raise
             message = f"{path} raised {_said(error)}"
