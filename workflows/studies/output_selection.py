@@ -229,10 +229,14 @@ class OutputSelection(Comparison):
         return tuple(dict.fromkeys(self.data.names))
 
     @property
-    def seconds_per_solve(self) -> float:
-        """Processor time of a solve, roughly, averaged over the candidates."""
-        costs = [spec.cost() for spec in self.of_candidates.values()]
-        return sum(SECONDS if cost is None else cost.sample for cost in costs) / len(costs)
+    def seconds_of_solves(self) -> float:
+        """Processor time of all solves and their derivatives, roughly."""
+        seconds = 0.0
+        for name, spec in self.of_candidates.items():
+            cost, d = spec.cost(), len(self.candidates[name].parameters)
+            each = SECONDS if cost is None else cost.sample + cost.tangents_of_sample(d)
+            seconds += (self.searches(name) + self.method.samples) * each
+        return seconds * self.evidences / len(self.of_candidates)
 
     def described(self, name: str) -> str:
         """A candidate in words."""
