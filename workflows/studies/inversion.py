@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
+from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
 from forward.specimen import Specimen
@@ -136,9 +137,8 @@ class InversionStudy(StudyKind):
         model = blocks.get("model")
         body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
         if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
-            from workflows.studies.output_inversion import OutputInversion
-
-            return OutputInversion.model_validate(blocks).with_data(folder)
+            other: type[InversionStudy] = named("workflows.studies.output_inversion:OutputInversion")
+            return other.model_validate(blocks).with_data(folder)
         return Inversion.model_validate(blocks).with_data(folder)
 
     @property
@@ -154,9 +154,8 @@ class InversionStudy(StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and what is done for each data set; collective."""
-        from workflows.studies.inversion_job import job
-
-        return job(self, ensemble, directory, checkpoint)
+        found: Job = named("workflows.studies.inversion_job:job")(self, ensemble, directory, checkpoint)
+        return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the unknown parameters."""
@@ -319,9 +318,8 @@ class Inversion(InversionStudy):
 
     def plan(self, groups: int) -> list[str]:
         """Say what is inverted, and how long that will take."""
-        from workflows.studies.inversion_plan import plan
-
-        return plan(self)
+        found: list[str] = named("workflows.studies.inversion_plan:plan")(self)
+        return found
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""

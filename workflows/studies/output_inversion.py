@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from pydantic import Field, field_validator, model_validator
 
 from forward.model import ForwardModel, ModelError
-from forward.registry import OfKind
+from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import MODELS, ModelSpec
@@ -150,9 +150,8 @@ class OutputInversion(InversionStudy):
 
     def plan(self, groups: int) -> list[str]:
         """Say what is inverted, and how long that will take."""
-        from workflows.studies.inversion_plan import plan_of_outputs
-
-        return plan_of_outputs(self)
+        found: list[str] = named("workflows.studies.inversion_plan:plan_of_outputs")(self)
+        return found
 
     def read(self, path: Path) -> OutputData:
         """Read a table of outputs; errors as of every inversion."""

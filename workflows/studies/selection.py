@@ -15,7 +15,7 @@ from forward.materials.admissible import Materials
 from forward.materials.material import MATERIALS, constants, incompressible, of_volume
 from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
 from forward.model import Finding, ForwardModel
-from forward.registry import KindError
+from forward.registry import KindError, named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest, shown
 from inverse.criticism.comparison import Candidate, Data
@@ -228,13 +228,9 @@ class Comparison(StudyKind):
         model = blocks.get("model")
         body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
         if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
-            from workflows.studies import output_selection
-
-            return output_selection.OutputSelection.model_validate(output_selection.expanded(blocks, folder))
+            return _elsewhere("workflows.studies.output_selection", "OutputSelection", blocks, folder)
         if "model" in blocks:
-            from workflows.studies import specimen_selection
-
-            return specimen_selection.SpecimenSelection.model_validate(specimen_selection.expanded(blocks, folder))
+            return _elsewhere("workflows.studies.specimen_selection", "SpecimenSelection", blocks, folder)
         return Selection.model_validate(expanded(blocks, folder))
 
     def plan(self, groups: int) -> list[str]:
@@ -385,3 +381,9 @@ class Selection(Comparison):
             if objection is not None:
                 yield ("candidates", name, "material"), objection, candidate.material
         yield from self.mistakes_of_method()
+
+
+def _elsewhere(module: str, name: str, blocks: Mapping[str, Any], folder: Path) -> Comparison:
+    """Check the blocks of a comparison of another kind, in a module that builds on this one."""
+    kind: type[Comparison] = named(f"{module}:{name}")
+    return kind.model_validate(named(f"{module}:expanded")(blocks, folder))
