@@ -57,6 +57,7 @@ lint: $(READY) ## check style, types and layers
 	@$(PYTHON) -m ruff format --check
 	@$(PYTHON) -m mypy
 	@.venv/bin/lint-imports
+	@$(PYTHON) -m tests.circles
 
 bench: $(READY) ## measure times
 	@$(PYTHON) -m benchmarks $(ARGS)

@@ -27,7 +27,7 @@ def test_every_name_is_there():
 @pytest.mark.fem
 def test_a_study_in_memory_is_that_of_the_command(tmp_path):
     study = tissuq.load(TINY, ["method.samples=8"])
-    found = tissuq.run(study)
+    found = study.run()
     kept = tissuq.run(study, tmp_path / "study")
     for name in found.variables:
         assert found[name].to_numpy().tobytes() == kept[name].to_numpy().tobytes()

@@ -3,7 +3,7 @@
     import tissuq
 
     study = tissuq.load("configs/beam.toml")
-    data = tissuq.run(study)                                    # an xarray dataset, which all pictures take
+    data = study.run()                                          # an xarray dataset, which all pictures take
     print(float(data["mean"].sel(output="uy_max")), tissuq.findings(data))
 
     model = tissuq.Model(study.model)
@@ -54,10 +54,10 @@ _installed()
 
 _PUBLIC = {  # MODULE:NAME of what is found here, or a module
     "load": "tissuq.studies:load",
-    "run": "tissuq.studies:run",
+    "run": "workflows.run.from_python:run",
     "read": "tissuq.studies:read",
     "findings": "uq.findings:findings",
-    "Study": "workflows.config.study:Study",
+    "Study": "workflows.studies.sampling:Study",
     "StudyError": "workflows.config.study:StudyError",
     "Model": "tissuq.model:Model",
     "Hyperelastic": "forward.hyperelastic:Hyperelastic",
@@ -77,11 +77,11 @@ if TYPE_CHECKING:
     from tissuq.model import Model as Model
     from tissuq.studies import load as load
     from tissuq.studies import read as read
-    from tissuq.studies import run as run
     from uq.findings import findings as findings
     from workflows.config.mistakes import StudyError as StudyError
     from workflows.report import bodies as bodies
     from workflows.report import plots as plots
+    from workflows.run.from_python import run as run
     from workflows.studies.sampling import Study as Study
 
 

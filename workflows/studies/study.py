@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from forward.registry import Kinds
+from forward.registry import Kinds, named
 from forward.settings import Settings
 
 if TYPE_CHECKING:
@@ -106,6 +106,11 @@ class StudyKind(Settings):
     @abstractmethod
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters of evaluations, by the name that these are kept under."""
+
+    def run(self, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False) -> xr.Dataset:
+        """Run the study from Python, in memory or to a directory, as `workflows.run.from_python.run` does."""
+        found: xr.Dataset = named("workflows.run.from_python:run")(self, directory, quiet=quiet, report=report)
+        return found
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add to results what all evaluations say."""
