@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -29,9 +29,6 @@ from forward.solvers.settings import SolverSettings
 from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
-
-if TYPE_CHECKING:
-    from forward.fem.model import HyperelasticModel
 
 CONTRAST = "contrast"
 
@@ -298,9 +295,8 @@ class Hyperelastic(ModelSpec):
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""
-        from forward.bodies.in_words import in_words
-
-        return in_words(self, said, where)
+        words: Iterator[tuple[str, list[str]]] = named("forward.bodies.in_words:in_words")(self, said, where)
+        return words
 
     def identity(self) -> dict[str, Any]:
         """Return all that decides on results; of the file of a mesh its hash counts, not its place."""
@@ -308,7 +304,7 @@ class Hyperelastic(ModelSpec):
         found["body"].pop("file", None)
         return found
 
-    def build(self, comm: Any, parameters: tuple[str, ...]) -> HyperelasticModel:
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms on a communicator; collective.
 
         Parameters
@@ -319,8 +315,7 @@ class Hyperelastic(ModelSpec):
             Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
             random fields that it does not hold are zero.
         """
-        model: type[HyperelasticModel] = named("forward.fem.model:HyperelasticModel")
-        return model(self, comm, parameters)
+        return named("forward.fem.model:HyperelasticModel")(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Hyperelastic:

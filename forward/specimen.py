@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -28,10 +28,6 @@ from forward.solvers.settings import SolverSettings
 from forward.spec import ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
-
-if TYPE_CHECKING:
-    from forward.fem.specimen import SpecimenModel
-
 
 SHARED = ("body", "material", "regions", "inclusions", "fields", "solver")  # blocks that are the same in all cases
 
@@ -233,7 +229,7 @@ class Specimen(ModelSpec):
         yield "load cases", f"{names}, of {self.over(ranges).unknowns:,} unknowns each"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
-    def build(self, comm: Any, parameters: tuple[str, ...]) -> SpecimenModel:
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms of every case on a communicator; collective.
 
         Parameters
@@ -243,8 +239,7 @@ class Specimen(ModelSpec):
         parameters
             As of `Hyperelastic.build`.
         """
-        model: type[SpecimenModel] = named("forward.fem.specimen:SpecimenModel")
-        return model(self, comm, parameters)
+        return named("forward.fem.specimen:SpecimenModel")(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Specimen:

@@ -1,6 +1,6 @@
 """Find modules that import each other in a circle, also inside functions: `python -m tests.circles`, in `make lint`.
 
-Imports for types alone do not count. A specification names what builds it by a text (`forward.registry`), which is no
+Imports for types alone count too. A specification names what builds it by a text (`forward.registry`), which is no
 import: what is below is not tied to what is above.
 """
 
@@ -43,7 +43,7 @@ def circles(imports: dict[str, set[str]]) -> list[list[str]]:
 
 def main() -> int:
     """Print the circles; 1 if there are any."""
-    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True)
+    graph = grimp.build_graph(*PACKAGES)
     found = circles({module: graph.find_modules_directly_imported_by(module) for module in graph.modules})
     for group in found:
         sys.stdout.write(f"a circle of imports: {', '.join(group)}\n")

@@ -65,7 +65,8 @@ class FinerMesh:
     @cached_property
     def _model(self) -> SpecimenModel:
         numbers = tuple(self._coarse.parameters[i] for i in self._scalars)
-        return self.spec.build(self._coarse.models[0].body.comm, (*numbers, *self.spec.coefficients))
+        model: SpecimenModel = self.spec.build(self._coarse.models[0].body.comm, (*numbers, *self.spec.coefficients))
+        return model
 
     @cached_property
     def _scalars(self) -> list[int]:

@@ -56,7 +56,7 @@ class SpecimenModel(OneByOne):
                 raise ValueError(message)
         bodies = [spec.loaded(case) for case in spec.cases]
         self.positions = [np.flatnonzero(np.isin(parameters, [*body.scalars, *body.coefficients])) for body in bodies]
-        self.models = tuple(
+        self.models: tuple[HyperelasticModel, ...] = tuple(
             body.build(comm, tuple(parameters[i] for i in where))
             for body, where in zip(bodies, self.positions, strict=True)
         )

@@ -129,7 +129,8 @@ class _Specimen:
 
     @classmethod
     def of(cls, study: Inversion, ensemble: Ensemble) -> _Specimen:
-        model = study.specimen.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
+        names = study.model.coefficients if study.field else study.inputs.names
+        model: SpecimenModel = study.specimen.build(ensemble.group, names)
         vertices = (model.vertices.coordinates, *model.vertices.cells())
 
         def look(points: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from pydantic import Field, ValidationError, model_validator
 
 from forward.model import Finding, ModelError
-from forward.registry import OfKind
+from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from uq.inputs.distributions import Distribution, Normal
@@ -110,15 +110,13 @@ class Study(StudyKind):
 
     def plan(self, groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
-        from workflows.studies.sampling_plan import plan
-
-        return plan(self, groups)
+        lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, groups)
+        return lines
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and others that the method may want, at the points of the method; collective."""
-        from workflows.studies.sampling_job import job
-
-        return job(self, ensemble)
+        made: Job = named("workflows.studies.sampling_job:job")(self, ensemble)
+        return made
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the random parameters."""
@@ -126,14 +124,13 @@ class Study(StudyKind):
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         """Add how the stability of each sample was looked at."""
-        from workflows.studies.sampling_job import with_stability
-
-        return with_stability(self, dataset, evaluations["/"])
+        with_stability = named("workflows.studies.sampling_job:with_stability")
+        found: xr.Dataset = with_stability(self, dataset, evaluations["/"])
+        return found
 
     def summary(self, job: Job) -> dict[str, Any]:
         """Return what was solved on each mesh, where there are several."""
-        from workflows.studies.sampling_job import of_meshes
-
+        of_meshes = named("workflows.studies.sampling_job:of_meshes")
         return {"meshes": of_meshes(self, job)} if len(self.meshes) > 1 else {}
 
     def identity(self) -> dict[str, Any]:

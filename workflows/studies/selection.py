@@ -235,15 +235,13 @@ class Comparison(StudyKind):
 
     def plan(self, groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""
-        from workflows.studies.selection_plan import plan
-
-        return plan(self)
+        lines: list[str] = named("workflows.studies.selection_plan:plan")(self)
+        return lines
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the candidates, each for each group of data; collective."""
-        from workflows.studies.selection_job import job
-
-        return job(self, ensemble)
+        made: Job = named("workflows.studies.selection_job:job")(self, ensemble)
+        return made
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters of a candidate."""

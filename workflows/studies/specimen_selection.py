@@ -298,7 +298,7 @@ class SpecimenSelection(Comparison):
         """Make the model of a candidate; collective."""
         specimen = self.specimens[name]
         numbers = {case.name: i for i, case in enumerate(specimen.cases)}
-        model = specimen.build(comm, tuple(self.candidates[name].parameters))
+        model: SpecimenModel = specimen.build(comm, tuple(self.candidates[name].parameters))
         return model.observing(np.array(self.data.places), self._axes, [numbers[case] for case in self.data.cases])
 
     @model_validator(mode="after")
