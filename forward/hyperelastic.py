@@ -1,4 +1,7 @@
-"""The specification of a hyperelastic body: geometry, material, loads, outputs and solver; no FEniCSx until built."""
+"""The specification of a hyperelastic body: geometry, material, loads, outputs and solver; no FEniCSx until built.
+
+It is long because it is one block of a study: every number, mistake and finding that only the whole body can know.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Bodies with named boundaries, as specifications; the mesh itself is made in `forward.fem.dolfinx`."""
+"""Bodies with named boundaries, as specifications; the mesh itself is made in `forward.fem.dolfinx`.
+
+Boxes and blocks share one parametrisation by the unit cube, and so one file.
+"""
 
 from __future__ import annotations
 

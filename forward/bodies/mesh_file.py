@@ -2,6 +2,8 @@
 
 A study keeps, beside the name of the file, what it needs to know of it (`Contents`), so that results can be read where
 the file is not; a hash says whether it is the same file.
+
+Most of its length is what may be wrong with a file, each mistake in words.
 """
 
 from __future__ import annotations

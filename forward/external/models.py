@@ -1,6 +1,8 @@
 """Models that are not of this program, as specifications: a Python function, or a server of the UM-Bridge protocol.
 
 UM-Bridge: L. Seelinger et al., J. Open Source Softw. 8 (2023) 4748; protocol 1.0.
+
+Functions and servers share this file because they share all but the way a point is evaluated.
 """
 
 from __future__ import annotations

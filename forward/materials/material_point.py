@@ -10,6 +10,8 @@ with k = 2 where two equal stretches are prescribed. An incompressible specimen 
 that. SymPy reads the energy and differentiates it, so that stresses and their derivatives with respect to the constants
 are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics
 (2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
+
+All modes of test are one system of equations with different unknowns, hence one file.
 """
 
 from __future__ import annotations

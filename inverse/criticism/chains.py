@@ -20,6 +20,8 @@ one). So the L above is bent: with the part w of Lz in the directions U of λ �
 the strong directions s follow by a step of Gauss–Newton. As a depends on w alone, the determinant of this map is that
 of L, and all formulas stay as they are; for linear models a = 0. Samples x of independent z have the weights w ∝
 exp(ℓ(x) + ½|z|²), and the mean of these is the evidence.
+
+Chains and weighted samples share proposals, diagnostics and the verdict, and so one file.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@ sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and cas
 and ``nan`` say that a component was not measured. Lines that begin with # say where the data are from; those that read
 ``# truth.NAME = VALUE`` what they were made of, if they are synthetic. Other files are meshes that meshio reads, with
 the displacements of a load case at their points as ``displacement_CASE``, or ``displacement`` where there is one.
+
+Most of its length is what may be wrong with a table, each mistake with its line.
 """
 
 from __future__ import annotations

@@ -15,6 +15,8 @@ parameter with tails), its second moment is known from where no sample is, and n
 So a control that leaves more of the scatter than there was is dropped: β = 0, see `_helps`.
 
 Either expectation may also be a sum of independently estimated terms (a telescoping sum over meshes): see `combine`.
+
+Scalars and fields, with and without controls, use the same sums: one file, so that each formula stands once.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Work is cut into blocks of fixed size; sums of fields are formed in index order inside a block and the blocks are added
 in order. So the result does not depend on who computed which block.
+
+Requests, evaluations and the serial way between them are one contract, hence one file.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ Chaospy's own hold to six digits where there is no closed form, and not at all f
 and for normals that are cut beyond eight standard deviations.
 
 Polynomials are of the coordinate in which they converge (`logarithmic`), see docs/decisions/0009-coordinates.md.
+
+It is long because there are many distributions, each a small class.
 """
 
 from __future__ import annotations

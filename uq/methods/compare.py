@@ -6,6 +6,8 @@ repeats whose claimed 95 % interval holds e* says whether its claims are honest.
 samples for the same error, where s² is the variance of one sample: σ² of the output for the mean.
 
 Points that several methods or budgets ask for are solved once, and charged to each as if it had solved them itself.
+
+Sharing of points, charging of costs and judging of claims refer to the same runs, hence one file.
 """
 
 from __future__ import annotations

@@ -20,6 +20,8 @@ standardised coordinates (`uq.inputs.coordinates`): the directions along which Ï
 
 Points are independent scrambles of Sobol' points, and errors come from drawing whole scrambles again
 (`uq.estimators.indices`).
+
+The bounds, the active subspace and their errors are computed from the same products of gradients, hence one file.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ tangent prediction T_l and V_l = E[T_l²], the terms of the mean and of the seco
     ⟨w_l² − w_{l−1}² − (T_l² − V_l − T_{l−1}² + V_{l−1})⟩
 
 of which the controls, in brackets, have the expectation zero. `moments.combine` adds them up.
+
+How samples are allotted, differences estimated and errors added depend on each other at every step: one file.
 """
 
 from __future__ import annotations

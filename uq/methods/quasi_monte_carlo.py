@@ -3,6 +3,8 @@
 The mean over one scramble is unbiased, since each of its points is uniform by itself; the scrambles are independent, so
 their scatter gives an honest standard error without any assumption on the smoothness that makes it small
 (A. B. Owen, SIAM J. Numer. Anal. 34 (1997) 1884–1910; C. Lemieux, Monte Carlo and Quasi-Monte Carlo Sampling (2009)).
+
+The three controls share the scrambles and their sums, and so one file.
 """
 
 from __future__ import annotations

@@ -8,6 +8,8 @@ estimators average would be of other points.
 The rows belong to one scrambled Sobol' sequence: independent scrambles of a sixteenth of the rows each err two to four
 times more at a thousand rows. Errors come from drawing its R parts of consecutive rows again, each a net by itself. The
 parts complement each other, which this does not see: it claims the error of R independent parts, which is no smaller.
+
+The three designs share groups, fields and intervals, and so one file.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ scatter of the designs.
 What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
 residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there by (I − H_z)⁻¹ r_z, and its coefficients differ
 by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
+
+Choice of functions, fit and leave-one-out errors update the same factorisation, hence one file.
 """
 
 from __future__ import annotations
