@@ -32,7 +32,8 @@ def schema():
 
 def test_the_page_has_one_file_for_each_kind(folder):
     assert {path.name for path in folder.iterdir()} >= {
-        "my_tissue.py", "my_loads.py", "my_methods.py", "my_sections.py", "my_models.py", "wound.toml", "beam.toml",
+        "my_tissue.py", "my_loads.py", "my_outputs.py", "my_methods.py", "my_sections.py", "my_models.py",
+        "wound.toml", "beam.toml",
     }  # fmt: skip
 
 
@@ -46,12 +47,16 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     done = run(2, TISSUQ, "run", study, "--out", out)
     assert done.returncode == 0, done.stderr
     data = xr.load_dataset(out / "results.nc")
-    assert 0 < data["smallest"].item() < data["largest"].item()
+    assert (data["smallest"] > 0).all()
+    assert (data["smallest"] < data["largest"]).all()
+    area = 0.02 * 0.02  # of the face that is pulled: what it sweeps is its mean displacement times that
+    swept, stretch = (data["largest"].sel(output=name).item() for name in ("swept", "stretch"))
+    assert swept == pytest.approx(area * stretch, rel=1e-10)
     page = (out / "report.html").read_text()
     assert "The ends of what is likely" in page
-    assert f"{data['largest'].item():.4g}" in page
+    assert f"{swept:.4g}" in page
     sources = json.loads((out / "sources.json").read_text())["files"]
-    assert {"my_tissue", "my_loads", "my_methods"} <= sources.keys()
+    assert {"my_tissue", "my_loads", "my_outputs", "my_methods"} <= sources.keys()
     again = run(None, TISSUQ, "run", study, "--out", folder / "one")
     assert again.returncode == 0, again.stderr
     assert (folder / "one" / "results.nc").read_bytes() == (out / "results.nc").read_bytes()

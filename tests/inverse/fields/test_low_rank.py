@@ -9,8 +9,6 @@ from inverse.fields.low_rank import LowRankPosterior, leading_pairs
 from inverse.fields.newton_cg import find_mode
 from tests.problems import DATA, Linear, N, curved, solved
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize("holes", [0, 7])
 def test_everything_is_exact_with_all_pairs(holes):

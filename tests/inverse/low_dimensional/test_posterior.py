@@ -11,8 +11,6 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
-pytestmark = pytest.mark.unit
-
 
 def ridge(noise=None):
     """Two outputs of three parameters, one pair of them correlated."""
