@@ -64,7 +64,7 @@ class Conformance:
     changed: tuple[str, ...]
 
     def mistakes(self) -> tuple[str, ...]:
-        """Say what is wrong, one line each; nothing for a model that conforms."""
+        """Say what is wrong, one line each; none for a model that conforms."""
         return tuple(self._mistakes())
 
     def require(self) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.model import Finding, FloatArray
 from forward.settings import Settings
 
@@ -390,7 +390,7 @@ def _box_by_default(value: Any) -> Any:
     return {"kind": "box"} | value if isinstance(value, dict) else value
 
 
-Body = Annotated[Box | Block | OwnMesh, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
+Body = Annotated[Box | Block | MeshFile, Field(discriminator="kind"), BeforeValidator(_box_by_default)]
 
 
 def tolerance(body: Body) -> float:
@@ -403,7 +403,7 @@ def outside(body: Body, point: Vector) -> float:
     if body.contains(point):
         return 0.0
     at = np.array([point])
-    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, OwnMesh) else body.nearest(at)
+    place = np.clip(at, *np.transpose(body.bounds)) if isinstance(body, MeshFile) else body.nearest(at)
     return float(np.linalg.norm(place - at))
 
 

@@ -131,7 +131,7 @@ class Contents(Settings):
     regions: dict[str, float]
 
 
-class OwnMesh(Settings):
+class MeshFile(Settings):
     """A body from a file with a mesh of linear tetrahedra or hexahedra.
 
     Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
@@ -169,7 +169,7 @@ class OwnMesh(Settings):
     contents: Contents | None = None
 
     @model_validator(mode="after")
-    def _read(self) -> OwnMesh:
+    def _read(self) -> MeshFile:
         if self.contents is None:
             object.__setattr__(self, "contents", contents(self.load(), _digest(self.file)))
         lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}

@@ -72,7 +72,7 @@ class Sources:
         return cls(files, {str(name): str(version) for name, version in document["versions"].items()})
 
     def change(self, now: Sources) -> str | None:
-        """Say what is no longer as it was here, or nothing if all is."""
+        """Say what is no longer as it was here, or None if all is."""
         for module, (path, text) in self.files.items():
             file, found = now.files.get(module) or (path, hashed(Path(path)))
             if found != text:

@@ -10,7 +10,7 @@ import numpy as np
 import ufl
 
 from forward.bodies.inclusions import stiffness_factor
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import assembly, compile, meshes, spaces, unknowns
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
@@ -77,7 +77,7 @@ class Forms:
     @cached_property
     def _regions(self) -> dict[str, Any]:
         """Indicators of the regions that have numbers of their own."""
-        if not self.spec.regions or not isinstance(self.spec.body, OwnMesh):
+        if not self.spec.regions or not isinstance(self.spec.body, MeshFile):
             return {}
         found = spaces.region_indicators(self.comm, self.spec.body, self.mesh)
         return {name: found[name] for name in self.spec.regions}
@@ -222,7 +222,7 @@ class Forms:
         return sum(terms[1:], terms[0]) if terms else None
 
     def along_parameters(self, integrand: Any) -> Any | None:
-        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction dω that is set; nothing if it depends on no parameter."""
+        """Σ_i (∂ integrand/∂ω_i) dω_i along the direction dω that is set; None if it depends on no parameter."""
         present = set(ufl.algorithms.analysis.extract_constants(integrand * self.dx))
         terms = [
             direction * ufl.diff(integrand, self._variables[path])

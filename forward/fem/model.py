@@ -243,7 +243,7 @@ class FiniteElementSolution:
     def _solve_near(
         self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
     ) -> FloatArray | None:
-        """Solve with the factor of the reference, turned as for its prediction; nothing if that is too far away."""
+        """Solve with the factor of the reference, turned as for its prediction; None if that is too far away."""
         model = self._model
         factor = model.take_reference(reference)
         fixed = model.body.fixed

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import tolerance
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import meshes, spaces
 from forward.fem.equations import Discretisation
 from forward.model import FloatArray
@@ -25,7 +25,7 @@ class BodySpace:
     def regions(self) -> NDArray[np.int64] | None:
         """Return the number of the region of each cell, in the order of `cells`; None without regions; collective."""
         body = self._body
-        if not isinstance(body.spec.body, OwnMesh):
+        if not isinstance(body.spec.body, MeshFile):
             return None
         return self._layout.by_cell(meshes.region_numbers(body.comm, body.spec.body, body.mesh))
 

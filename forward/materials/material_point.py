@@ -245,7 +245,7 @@ Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray,
 
 
 def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
-    """Say why fibres do not fit a material and a mode, or nothing if they do.
+    """Say why fibres do not fit a material and a mode, or None if they do.
 
     Where a face is free, the material must be alike on both sides of each plane of the mode (reflections leave the
     families of fibres as they are, up to their sign), and in the directions that are stretched alike.

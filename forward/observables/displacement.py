@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from forward.bodies.geometry import AXES, Axis, Vector, tolerance
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.model import ModelError
 from forward.observables.observable import DiscreteBody, Functional, Observable
 
@@ -27,7 +27,7 @@ class PointDisplacement(Observable):
         (found,), (distance,) = spaces.point_weights(body.space, np.array([self.at]))
         spec = body.spec.body
         # Points beside bodies with six sides were refused before; the mesh may cut their curved faces.
-        most = tolerance(spec) if isinstance(spec, OwnMesh) else max(tolerance(spec), spec.longest_edge)
+        most = tolerance(spec) if isinstance(spec, MeshFile) else max(tolerance(spec), spec.longest_edge)
         if distance > most:
             where = ", ".join(f"{x:g}" for x in self.at)
             message = (

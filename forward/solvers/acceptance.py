@@ -86,7 +86,7 @@ def check_jacobian(system: System, u: FloatArray) -> None:
 
 
 def instability(system: System) -> str:
-    """Say what the last factor tells of a failure; nothing where it shows no negative eigenvalue."""
+    """Say what the last factor tells of a failure; empty where it shows no negative eigenvalue."""
     negative = system.inertia()
     if negative is None or negative <= 0:
         return ""

@@ -120,7 +120,7 @@ def block_galerkin(
     Returns
     -------
     numpy.ndarray or None
-        Solutions (k, n); nothing if they are not reached.
+        Solutions (k, n); None if they are not reached.
     """
     x, r = np.zeros_like(right), np.array(right)
     most = (0 if first is None else len(first)) + iterations * len(right)

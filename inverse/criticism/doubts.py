@@ -198,7 +198,7 @@ def mesh_too_coarse(
     shifts
         What that does to unknowns, by name, over their posterior deviations.
     nodes
-        The same of a field at the vertices (N,), or nothing.
+        The same of a field at the vertices (N,), or None.
     """
     if not looked:
         return [Doubt("warning", f"not checked for the mesh: {why}", "not checked for the mesh")]

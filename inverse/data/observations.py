@@ -463,7 +463,7 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
 
 
 def _number(text: str) -> float | None:
-    """A number, NaN for an empty cell, nothing where it is neither."""
+    """A number, NaN for an empty cell, None where it is neither."""
     try:
         return float(text) if text else math.nan
     except ValueError:

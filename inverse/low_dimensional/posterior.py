@@ -108,7 +108,7 @@ class Posterior:
     sigma
         Standard deviations σ (m,) of the errors, or what they are in proportion to where s is unknown.
     noise
-        Prior of s; nothing where s = 1.
+        Prior of s; None where s = 1.
     which
         Outputs (m,) of the model that were measured, by number.
     start

@@ -136,7 +136,7 @@ class Ensemble:
         Returns
         -------
         object
-            What the task returned, on rank 0; nothing on the other ranks.
+            What the task returned, on rank 0; None on the other ranks.
         """
         with self.turns(progress) as turns:
             worker = _Worker(self, _Models(model, others or {}), checkpoint, turns)

@@ -118,7 +118,7 @@ class Chaos(Amount):
         return "design", self.gradients
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters cannot be expanded in, or nothing."""
+        """Say why these parameters cannot be expanded in, or None."""
         return objection(inputs, self.kind)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -186,7 +186,7 @@ class Chaos(Amount):
 
 
 def objection(inputs: Inputs, kind: str) -> str | None:
-    """Say why a method of this kind cannot expand in these parameters, or nothing."""
+    """Say why a method of this kind cannot expand in these parameters, or None."""
     if not inputs.independent:
         return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
     return None

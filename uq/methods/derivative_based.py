@@ -115,7 +115,7 @@ class DerivativeBased(Amount):
         return samples
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why the bounds do not hold for these parameters, or nothing."""
+        """Say why the bounds do not hold for these parameters, or None."""
         if not inputs.independent:
             return (
                 "bounds on Sobol' indices need independent parameters, expected no correlations for "

@@ -99,7 +99,7 @@ class MultilevelChaos(Amount):
         return 1 + self.max_levels * self.per_level(dimension)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters cannot be expanded in, or nothing."""
+        """Say why these parameters cannot be expanded in, or None."""
         return objection(inputs, self.kind)
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
@@ -116,7 +116,7 @@ class MultilevelChaos(Amount):
             yield ("method", "samples"), shortage, self.samples
 
     def shortage(self, dimension: int) -> str | None:
-        """Say that there are too few samples for the terms of the expansion, or nothing."""
+        """Say that there are too few samples for the terms of the expansion, or None."""
         terms = hyperbolic_count(dimension, self.order, 1.0)
         if self.per_level(dimension) > terms:
             return None
@@ -237,7 +237,7 @@ class _Level:
 
 
 def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | None:
-    """Prediction of the first level; nothing for a model without a state."""
+    """Prediction of the first level; None for a model without a state."""
     if centre.state.size == 0:
         return None
     if first == "tangent" and centre.prediction is not None:

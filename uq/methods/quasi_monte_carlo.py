@@ -130,7 +130,7 @@ class QuasiMonteCarlo(MonteCarlo):
         return 0
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters do not allow the control, or nothing."""
+        """Say why these parameters do not allow the control, or None."""
         if self.control == "chaos" and not inputs.independent:
             return (
                 "polynomial chaos needs independent parameters, expected no correlations for method.control = 'chaos'"

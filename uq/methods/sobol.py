@@ -156,7 +156,7 @@ class Sobol(Amount):
         return RowProducts(dimension + len(self.groups), dimension if self.second_order else 0)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters have no Sobol' indices, or nothing."""
+        """Say why these parameters have no Sobol' indices, or None."""
         if not inputs.independent:
             return "Sobol' indices need independent parameters, expected no correlations for method.kind = 'sobol'"
         return None
@@ -169,7 +169,7 @@ class Sobol(Amount):
             yield ("method", "groups"), stranger, self.model_dump()["groups"]
 
     def unknown(self, inputs: Inputs) -> str | None:
-        """Say which member of a group is no parameter, or nothing."""
+        """Say which member of a group is no parameter, or None."""
         for group, names in self.groups.items():
             for name in names:
                 if name not in inputs.names:

@@ -112,7 +112,7 @@ def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
 
 
 def _recur(t: Real, alpha: list[float], beta: list[float], degree: int, *, derivatives: bool) -> tuple[list[Real], ...]:
-    """Return p_k(t) and (or nothing) p_k'(t) for k up to a degree, for numbers t or arrays of them."""
+    """Return p_k(t) and (or None) p_k'(t) for k up to a degree, for numbers t or arrays of them."""
     p, dp = [0 * t + 1], [0 * t]
     for k in range(degree):
         root, step = math.sqrt(beta[k + 1]), t - alpha[k]

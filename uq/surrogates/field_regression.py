@@ -125,7 +125,7 @@ class Deviations:
     ok
         Which samples (n,) had an answer and were fitted.
     prediction
-        Of the state, from which the solver may start; nothing where the state was not wanted.
+        Of the state, from which the solver may start; None where the state was not wanted.
     reach
         Lowest and highest coordinates (2, d) of the samples that were fitted.
     """

@@ -108,7 +108,7 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
 
 
 def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | None:
-    """Draw bodies as PNG, each as `body` does, in a process of its own; nothing where they cannot be drawn.
+    """Draw bodies as PNG, each as `body` does, in a process of its own; None where they cannot be drawn.
 
     A graphics library that is missing or broken ends a process at once: it must not take a study with it.
     """

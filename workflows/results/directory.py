@@ -70,7 +70,7 @@ def digest(directory: Path) -> str:
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
-    """Read summary.json; nothing if there is none, or what stands there is not the summary of a finished study."""
+    """Read summary.json; None if there is none, or if it is not the summary of a finished study."""
     try:
         found = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError, RecursionError):

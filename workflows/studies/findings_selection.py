@@ -38,7 +38,7 @@ def by_probability(dataset: xr.Dataset, values: xr.DataArray) -> list[str]:
 
 
 def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
-    """Say in which way the residuals of a model are not what it says of them; nothing where they may be."""
+    """Say in which way the residuals of a model are not what it says of them; empty where they may be."""
     of_model = dataset.sel(model=model)
     asked = 2 * dataset.sizes["group"]
     said = []

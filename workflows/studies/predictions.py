@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.finer import finer
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def formulation(decision: Decision) -> str:
 def mesh_check(spec: Specimen) -> tuple[float, str]:
     """Predict the processor time (s) of a solve on a finer mesh, and say what is solved."""
     try:
-        if isinstance(spec.body, OwnMesh):  # divided in a run; a factor grows faster than the mesh
+        if isinstance(spec.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
             unknowns, once = 8 * spec.unknowns, 8**2 * sum(times_of(spec.loaded(case)).textbook for case in spec.cases)
         else:
             fine = finer(spec)

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from forward.bodies.geometry import AXES, Vector, tolerance
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.finer import finer
 from forward.scalars import Mistake
 from forward.settings import Settings
@@ -209,7 +209,7 @@ class SpecimenSelection(Comparison):
     def specs(self) -> tuple[Specimen, ...]:
         """The specimens of all candidates, and the largest of the finer meshes that they are checked on."""
         checked = [specimen for name, specimen in self.specimens.items() if not self.unchecked[name]]
-        fine = [finer(one) for one in checked if not isinstance(one.body, OwnMesh)]
+        fine = [finer(one) for one in checked if not isinstance(one.body, MeshFile)]
         return *self.specimens.values(), *sorted(fine, key=lambda one: one.unknowns)[-1:]
 
     @property

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from forward.bodies.geometry import Body
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
@@ -107,7 +107,7 @@ def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
     """
     from scipy.sparse import csr_matrix
 
-    boxed = body if isinstance(body, OwnMesh) else body.model_copy(update={"cell": "hexahedron"})
+    boxed = body if isinstance(body, MeshFile) else body.model_copy(update={"cell": "hexahedron"})
     msh, _ = mesh_body(MPI.COMM_SELF, boxed)
     space = scalar_space(msh, 1)
     v, w = ufl.TestFunction(space), ufl.TrialFunction(space)

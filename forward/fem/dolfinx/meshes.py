@@ -11,7 +11,7 @@ from dolfinx import mesh
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.cost import BYTES_PER_UNKNOWN, SPARE
 from forward.fem.dolfinx import version
 from forward.machine import require
@@ -23,7 +23,7 @@ _CELLS = {"hexahedron": mesh.CellType.hexahedron, "tetrahedron": mesh.CellType.t
 def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Mesh a body; return this rank's part and its facets on each named boundary; collective over `comm`."""
     require(BYTES_PER_UNKNOWN * body.nodes / comm.size + SPARE, "the mesh")
-    if isinstance(body, OwnMesh):
+    if isinstance(body, MeshFile):
         return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     version.name_variant(msh)
@@ -33,7 +33,7 @@ def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]
     return msh, facets
 
 
-def _own_mesh(comm: Any, body: OwnMesh) -> tuple[Any, dict[str, NDArray[np.int32]]]:
+def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int32]]]:
     """Distribute a mesh that the first rank reads."""
     loaded = _on_first(comm, body.load)
     corners = 4 if body.cell == "tetrahedron" else 8
@@ -72,7 +72,7 @@ def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
     return found
 
 
-def region_numbers(comm: Any, body: OwnMesh, msh: Any) -> NDArray[np.int32]:
+def region_numbers(comm: Any, body: MeshFile, msh: Any) -> NDArray[np.int32]:
     """Return the number of the region of each of this rank's cells, ghosts included; collective."""
     loaded = _on_first(comm, body.load)
     region = comm.bcast(None if loaded is None else loaded.region.astype(np.int32))

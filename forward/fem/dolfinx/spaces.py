@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.bodies.location import locate
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compiled, options_for
 from forward.fem.dolfinx.meshes import owned_cells, region_numbers
@@ -35,7 +35,7 @@ def scalar_space(msh: Any, degree: int) -> Any:
     return new_space(msh, version.lagrange(msh.ufl_cell(), degree, vector=False))
 
 
-def region_indicators(comm: Any, body: OwnMesh, msh: Any) -> dict[str, Any]:
+def region_indicators(comm: Any, body: MeshFile, msh: Any) -> dict[str, Any]:
     """Return functions of the cells by the names of the regions of a body: 1 there, 0 elsewhere; collective."""
     of_cells = region_numbers(comm, body, msh)
     space = new_space(msh, version.by_cell(msh.ufl_cell()))

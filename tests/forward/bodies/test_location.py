@@ -74,11 +74,11 @@ from mpi4py import MPI
 
 from forward.fem.dolfinx import meshes, spaces
 from forward.bodies.geometry import Box
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 
 for file in sys.argv[1:]:
     degree = 2
-    body = OwnMesh(file=file, unit=1e-3, degree=degree) if file != "box" else Box(
+    body = MeshFile(file=file, unit=1e-3, degree=degree) if file != "box" else Box(
         size=(0.05, 0.04, 0.03), cells=(3, 3, 2), cell="tetrahedron", degree=degree)
     msh, _ = meshes.mesh_body(MPI.COMM_WORLD, body)
     space = spaces.vector_space(msh, degree)

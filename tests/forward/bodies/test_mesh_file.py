@@ -15,7 +15,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.bodies.geometry import Box
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
@@ -64,7 +64,7 @@ def test_the_same_mesh_gives_the_same_solution(tmp_path, form, extension):
 
 
 def test_what_is_found_is_that_of_the_box(file):
-    own, boxed = OwnMesh(file=str(file)), Box(size=SIZE, cells=CELLS)
+    own, boxed = MeshFile(file=str(file)), Box(size=SIZE, cells=CELLS)
     assert own.nodes == boxed.nodes
     assert own.vertex_count == boxed.vertex_count
     assert own.cell_count == boxed.cell_count
@@ -84,7 +84,7 @@ def test_what_is_found_is_that_of_the_box(file):
 def test_nearest_places_are_those_of_the_box(tmp_path, kind):
     meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
     points = np.random.default_rng(0).uniform(-0.4, 1.4, (60, 3))
-    found = OwnMesh(file=str(tmp_path / "box.vtu")).nearest(points)
+    found = MeshFile(file=str(tmp_path / "box.vtu")).nearest(points)
     np.testing.assert_allclose(found, Box(size=SIZE, cells=CELLS).nearest(points), atol=1e-12)
 
 
@@ -94,7 +94,7 @@ def test_nodes_are_those_of_the_space(tmp_path, kind, degree):
     from forward.fem.dolfinx import meshes, spaces
 
     meshio.write(tmp_path / "box.vtu", numbered(box(kind)))
-    own = OwnMesh(file=str(tmp_path / "box.vtu"), degree=degree)
+    own = MeshFile(file=str(tmp_path / "box.vtu"), degree=degree)
     msh, facets = meshes.mesh_body(MPI.COMM_SELF, own)
     assert len(spaces.node_coordinates(spaces.scalar_space(msh, degree))) == own.nodes
     per_face = 1 if kind == "hexahedron" else 2
@@ -240,7 +240,7 @@ def test_groups_of_gmsh(tmp_path):
     gmsh.write(str(tmp_path / "all.msh"))
     gmsh.finalize()
     for form in (2.2, 4.1):
-        own = OwnMesh(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
+        own = MeshFile(file=str(tmp_path / f"box{form}.msh"), unit=0.1, names={"pulled": 7})
         assert set(own.boundaries) == {"held", "pulled", "whole-liver", "skin"}
         assert own.found.areas == pytest.approx({"held": 0.01, "pulled": 0.01, "whole-liver": 0.04, "skin": 0.04})
         assert own.regions == ("whole-liver",)
@@ -249,7 +249,7 @@ def test_groups_of_gmsh(tmp_path):
         ("all", "has cells in no physical group"),
     ):
         with pytest.raises(ValueError, match=message):
-            OwnMesh(file=str(tmp_path / f"{name}.msh"))
+            MeshFile(file=str(tmp_path / f"{name}.msh"))
     assert own.found.regions["whole-liver"] == pytest.approx(2e-3)
     np.testing.assert_allclose(np.array(own.corners_of("held"))[:, 0], 0, atol=1e-12)
     np.testing.assert_allclose(np.array(own.corners_of("pulled"))[:, 0], 0.2)
@@ -317,21 +317,21 @@ def mixed(mesh):
 def test_one_line_for_a_file_that_will_not_do(tmp_path, change, settings, message):
     path = write(tmp_path / "bad.vtu", change(numbered(box())))
     with pytest.raises(ValueError, match=message):
-        OwnMesh(file=str(path), **settings)
+        MeshFile(file=str(path), **settings)
 
 
 def test_files_that_are_no_meshes(tmp_path, capsys):
     (tmp_path / "text.msh").write_text("hello\n")
     with pytest.raises(ValueError, match=r"cannot be read as a mesh: it is no \.msh file"):
-        OwnMesh(file=str(tmp_path / "text.msh"))
+        MeshFile(file=str(tmp_path / "text.msh"))
     assert capsys.readouterr() == ("", "")
 
 
 def test_numbers_of_an_xdmf_file_count(tmp_path):
     meshio.write(tmp_path / "box.xdmf", numbered(box()))
-    before = OwnMesh(file=str(tmp_path / "box.xdmf")).found.digest
+    before = MeshFile(file=str(tmp_path / "box.xdmf")).found.digest
     meshio.write(tmp_path / "box.xdmf", numbered(box(scale=2.0)))  # the same text, other numbers beside it
-    assert OwnMesh(file=str(tmp_path / "box.xdmf")).found.digest != before
+    assert MeshFile(file=str(tmp_path / "box.xdmf")).found.digest != before
 
 
 def test_files_of_pyvista(tmp_path):
@@ -340,14 +340,14 @@ def test_files_of_pyvista(tmp_path):
         {pyvista.CellType.TETRA: mesh.cells[0].data, pyvista.CellType.TRIANGLE: mesh.cells[1].data}, mesh.points
     )
     grid.save(tmp_path / "bare.vtu")
-    bare = OwnMesh(file=str(tmp_path / "bare.vtu"))
+    bare = MeshFile(file=str(tmp_path / "bare.vtu"))
     assert (bare.boundaries, bare.regions) == (("surface",), ("body",))
     grid.cell_data["part"] = np.concatenate(mesh.cell_data["gmsh:physical"]).astype(np.int64)
     for form in ("vtu", "vtk"):
         before = locale.setlocale(locale.LC_ALL)
         grid.save(tmp_path / f"box.{form}")
         locale.setlocale(locale.LC_ALL, before)  # which VTK changes
-        own = OwnMesh(file=str(tmp_path / f"box.{form}"))
+        own = MeshFile(file=str(tmp_path / f"box.{form}"))
         assert set(own.boundaries) == {f"{10 + k}" for k in range(6)}
         assert own.regions == ("1", "2")
 

@@ -6,7 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
-from forward.bodies.mesh_file import OwnMesh, divided
+from forward.bodies.mesh_file import MeshFile, divided
 from forward.fem.finer import FinerMesh, finer
 from forward.model import ModelError
 from forward.specimen import Specimen
@@ -59,7 +59,7 @@ def volume(mesh):
 
 def test_tetrahedra_are_divided_into_eight(tmp_path):
     meshio.write(tmp_path / "box.vtu", numbered(box("tetra")))
-    whole = OwnMesh(file=str(tmp_path / "box.vtu"))
+    whole = MeshFile(file=str(tmp_path / "box.vtu"))
     mesh = whole.load()
     held = whole.boundaries[0]
     for towards in ((), (held,)):
@@ -83,7 +83,7 @@ def test_tetrahedra_are_divided_into_eight(tmp_path):
         body.finer(1.5, (held,), 8.0, 4.0)
     meshio.write(tmp_path / "hexahedra.vtu", numbered(box("hexahedron")))
     with pytest.raises(ModelError, match="hexahedra of a file are not divided"):
-        OwnMesh(file=str(tmp_path / "hexahedra.vtu")).finer(1.5, (), 8.0, 4.0)
+        MeshFile(file=str(tmp_path / "hexahedra.vtu")).finer(1.5, (), 8.0, 4.0)
 
 
 CUBE = {

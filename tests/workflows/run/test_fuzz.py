@@ -10,7 +10,7 @@ import pytest
 import tomli_w
 from pydantic import ValidationError
 
-from forward.bodies.mesh_file import OwnMesh
+from forward.bodies.mesh_file import MeshFile
 from inverse.data.observations import DataError, read
 from tests.forward.bodies.test_mesh_file import box, numbered
 from tests.fuzz import damaged_bytes, damaged_table, mutations
@@ -192,7 +192,7 @@ def test_meshes_with_mistakes(tmp_path, name, how):
         path.write_bytes(data)
         said = []
         try:
-            OwnMesh(file=str(path))
+            MeshFile(file=str(path))
         except ValidationError as error:
             said += [str(mistake["msg"]) for mistake in error.errors()]
         try:
@@ -211,7 +211,7 @@ def test_corners_that_are_no_points(tmp_path, corner):
     whole.cells[0].data[0, 0] = corner
     meshio.write(tmp_path / "a.vtk", whole)
     with pytest.raises(ValidationError, match="corners that are none of its"):
-        OwnMesh(file=str(tmp_path / "a.vtk"))
+        MeshFile(file=str(tmp_path / "a.vtk"))
 
 
 @pytest.mark.parametrize("numbers", ["mean = 1e300, std = 1", "mean = 1, std = 1e100", "mean = 1e-200, std = 1e-201"])

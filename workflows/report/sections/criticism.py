@@ -56,7 +56,7 @@ def criticism(dataset: xr.Dataset) -> Table:
         "largest k̂",
         "to be trusted",
         "p of larger residuals",
-        "p of more alike neighbours",
+        "p of neighbours that agree more",
         "conflict",
     )
     return Table(head, rows, text=frozenset({0, 4, 7}), long=frozenset({7}))

@@ -108,7 +108,7 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
     if np.isfinite(one["agreement_probability"]):
         yield (
             "neighbouring residuals",
-            f"probability {number(float(one['agreement_probability']), 2)} of more alike ones",
+            f"probability {number(float(one['agreement_probability']), 2)} that neighbours agree more",
         )
     if np.isfinite(one["effective"]):
         words = f"worth {number(float(one['effective']), 3)}, k̂ = {number(float(one['tail']), 2)}"
