@@ -60,7 +60,7 @@ class Kinds:
             If there is none.
         """
         if kind in self.own:
-            return self._imported(kind, *self.own[kind].split(":"))
+            return named(self.own[kind])
         if "." in kind:
             module, _, name = kind.rpartition(".")
             return self._imported(kind, module, name)
@@ -80,8 +80,6 @@ class Kinds:
         return {point.name.removeprefix(prefix): point for point in points if point.name.startswith(prefix)}
 
     def _imported(self, kind: str, module: str, name: str) -> Any:
-        if kind in self.own:
-            return getattr(importlib.import_module(module), name)
         from forward.external.own_modules import imported
 
         try:
@@ -96,7 +94,7 @@ class Kinds:
             message = f"the module '{module}' has no {self.family} '{name}'; {nearest(name, known)}"
             raise KindError(message) from None
         if self.objection is not None:
-            objection = None if kind in self.own else self.objection(found)
+            objection = self.objection(found)
             if objection is not None:
                 raise KindError(f"'{module}.{name}' is no {self.family}: {objection}")
             return found
