@@ -194,14 +194,14 @@ def dense_inertia(model: HyperelasticModel, state: FloatArray, point: FloatArray
     """Negative eigenvalues of the dense stiffness, those of pressures apart, and the smallest over the largest."""
     from scipy.sparse import csr_matrix
 
-    body = model.body
-    body.set_parameters(point)
-    body.at_load(1.0)
-    body.set_state(state)
-    indptr, indices, entries = body.assembled_stiffness().getValuesCSR()
+    equations = model.equations
+    equations.set_parameters(point)
+    equations.at_load(1.0)
+    equations.set_state(state)
+    indptr, indices, entries = equations.assembled_stiffness().getValuesCSR()
     dense = csr_matrix((entries, indices, indptr)).toarray()
     values = np.linalg.eigvalsh((dense + dense.T) / 2)
-    return int((values < 0).sum()) - body.unknowns.pressures, float(np.abs(values).min() / values.max())
+    return int((values < 0).sum()) - equations.unknowns.pressures, float(np.abs(values).min() / values.max())
 
 
 def samples(case: Problem, count: int, seed: int = 0) -> list[Sample]:
@@ -237,10 +237,10 @@ def screened(factor: ReferenceFactor, model: HyperelasticModel, state: FloatArra
     """Return what the screen says of a state."""
     if not factor.prepare_screen():
         return NOT_SCREENED
-    body = model.body
-    body.set_parameters(point)
-    body.at_load(1.0)
-    residual = body.residual(state)
+    equations = model.equations
+    equations.set_parameters(point)
+    equations.at_load(1.0)
+    residual = equations.residual(state)
     return factor.screen(state, residual.vector, factor.rotation(state))
 
 

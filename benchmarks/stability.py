@@ -311,17 +311,17 @@ def inspect(
 
     Returns the row with what was seen, and whether the state is an equilibrium in the other equations.
     """
-    check = other.body
+    check = other.equations
     check.set_parameters(point)
     check.at_load(1.0)
     residual = check.residual(solution.state)
-    body = model.linearise(solution)
-    correction = body.norm(body.back_substitute(-residual.vector)) / body.norm(solution.state)
+    equations = model.linearise(solution)
+    correction = equations.norm(equations.back_substitute(-residual.vector)) / equations.norm(solution.state)
     seen = replace(
         row,
-        smallest_jacobian=body.smallest_jacobian(solution.state),
-        negative=body.inertia(),
-        condition=condition(body),
+        smallest_jacobian=equations.smallest_jacobian(solution.state),
+        negative=equations.inertia(),
+        condition=condition(equations),
         residual=residual.relative,
         correction=correction,
     )
@@ -334,18 +334,18 @@ def negatives(model: HyperelasticModel, solution: FiniteElementSolution) -> int:
     return model.linearise(solution).inertia()
 
 
-def condition(body: Any, iterations: int = 15) -> float:
+def condition(equations: Any, iterations: int = 15) -> float:
     """Estimate |λ|max/|λ|min of the stiffness of the free unknowns, from below, by (inverse) power iterations."""
     rng = np.random.default_rng(0)
     sizes = []
     for inverse in (False, True):
-        v = rng.standard_normal(body.size)
+        v = rng.standard_normal(equations.size)
         for _ in range(iterations):
-            v[body.fixed] = 0
-            v /= body.norm(v)
-            v = body.back_substitute(v) if inverse else body.stiffness_times(v)
-        v[body.fixed] = 0
-        sizes.append(body.norm(v))
+            v[equations.fixed] = 0
+            v /= equations.norm(v)
+            v = equations.back_substitute(v) if inverse else equations.stiffness_times(v)
+        v[equations.fixed] = 0
+        sizes.append(equations.norm(v))
     return float(sizes[0] * sizes[1])
 
 
@@ -354,7 +354,7 @@ def walk(model: HyperelasticModel, point: FloatArray, loads: FloatArray) -> tupl
 
     Returns the solution at full load, or nothing with the fraction where the path is lost.
     """
-    at, step, u, slope, solution = 0.0, 1 / PATH, np.zeros(model.body.size), None, None
+    at, step, u, slope, solution = 0.0, 1 / PATH, np.zeros(model.equations.size), None, None
     end = time.perf_counter() + PATIENCE
     while time.perf_counter() < end and at + step > at:
         to = min(1.0, at + step)

@@ -65,7 +65,8 @@ class FinerMesh:
     @cached_property
     def _model(self) -> SpecimenModel:
         numbers = tuple(self._coarse.parameters[i] for i in self._scalars)
-        model: SpecimenModel = self.spec.build(self._coarse.models[0].body.comm, (*numbers, *self.spec.coefficients))
+        comm = self._coarse.models[0].equations.comm
+        model: SpecimenModel = self.spec.build(comm, (*numbers, *self.spec.coefficients))
         return model
 
     @cached_property

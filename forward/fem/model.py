@@ -56,15 +56,15 @@ class HyperelasticModel(OneByOne):
         self.parameters = parameters
         self._materials = spec.materials(parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
-        self.body = Discretisation(spec, comm, parameters)
-        self.space = BodySpace(self.body)
+        self.equations = Discretisation(spec, comm, parameters)
+        self.space = BodySpace(self.equations)
         self.differentiable = True
-        self._functionals = [output.functional(self.body) for output in spec.outputs]
+        self._functionals = [output.functional(self.equations) for output in spec.outputs]
 
     @cached_property
     def reference(self) -> ReferenceFactor:
         """The factor of the last reference that was given."""
-        return ReferenceFactor(self.body)
+        return ReferenceFactor(self.equations)
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -78,8 +78,8 @@ class HyperelasticModel(OneByOne):
         SolveError
             With the load fraction where the solver stopped, the reason, and the history of its iterations.
         """
-        body = self.body
-        body.latest.begin()
+        equations = self.equations
+        equations.latest.begin()
         for path, value in zip(self.parameters, parameters, strict=True):
             scalar = self._scalars.get(path)
             if scalar is not None:
@@ -98,36 +98,36 @@ class HyperelasticModel(OneByOne):
         if reference is not None:
             self.reference.prepare(reference)
             screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
-        body.work = Work()
-        body.set_parameters(parameters)
+        equations.work = Work()
+        equations.set_parameters(parameters)
         way = None if reference is None else _Way(self, reference, parameters, screen=screen)
-        with body.time_limit(self.spec.solver.solve_seconds):
-            found = solve(body, self.spec.solver, np.zeros(body.size), guess.state, way, guess.iterations)
+        with equations.time_limit(self.spec.solver.solve_seconds):
+            found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
         # Where Newton had to take over, the reference is too far away for the derivatives too.
-        solution = FiniteElementSolution(self, parameters, found, body.work, way if found.corrected else None)
-        if found.stability >= Stability.COUNTED and body.symmetric:
-            body.latest.factorised = solution
+        solution = FiniteElementSolution(self, parameters, found, equations.work, way if found.corrected else None)
+        if found.stability >= Stability.COUNTED and equations.symmetric:
+            equations.latest.factorised = solution
         return solution
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
         """Set parameters and state to those of a solution, if they are not."""
-        body = self.body
-        if body.latest.solution is not solution:
-            body.set_parameters(solution.parameters)
-            body.at_load(1.0)
-            body.set_state(solution.state)
-            body.latest.solution = solution
-        body.work = solution.work
-        return body
+        equations = self.equations
+        if equations.latest.solution is not solution:
+            equations.set_parameters(solution.parameters)
+            equations.at_load(1.0)
+            equations.set_state(solution.state)
+            equations.latest.solution = solution
+        equations.work = solution.work
+        return equations
 
     def linearise(self, solution: FiniteElementSolution) -> Discretisation:
         """Factorise the stiffness at a solution, if the factor at hand is another's."""
-        body = self.visit(solution)
-        if body.latest.factorised is not solution:
-            body.factorise(solution.state)
-            body.latest.factorised = solution
-            if solution.stability == Stability.SCREENED and body.symmetric:
-                negative = body.inertia()
+        equations = self.visit(solution)
+        if equations.latest.factorised is not solution:
+            equations.factorise(solution.state)
+            equations.latest.factorised = solution
+            if solution.stability == Stability.SCREENED and equations.symmetric:
+                negative = equations.inertia()
                 if negative is not None and negative > 0:
                     message = (
                         f"the equilibrium is unstable (its stiffness has {negative} negative eigenvalues), which a "
@@ -135,11 +135,11 @@ class HyperelasticModel(OneByOne):
                     )
                     raise SolveError(message, work=solution.work, stability=Stability.MISSED)
                 solution.stability = Stability.COUNTED
-        return body
+        return equations
 
     def has_factor(self, solution: FiniteElementSolution) -> bool:
         """Whether the factor at hand is that of a solution."""
-        return self.body.latest.factorised is solution
+        return self.equations.latest.factorised is solution
 
     def take_reference(self, reference: Reference) -> ReferenceFactor:
         """Return the factor of a reference; this may change parameters and state."""
@@ -165,7 +165,7 @@ class _Way:
     def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray, *, screen: bool) -> None:
         self._screen = screen
         self.draw = draw(parameters)
-        self._body, self._factor = model.body, model.reference
+        self._equations, self._factor = model.equations, model.reference
         self._from, self._to = reference.parameters, parameters
         self.reference = reference
         self.state = reference.state
@@ -181,8 +181,8 @@ class _Way:
         return self._factor.screen(u, residual.vector, self.rotation)
 
     def at(self, fraction: float) -> None:
-        self._body.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
-        self._body.at_load(1.0)
+        self._equations.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
+        self._equations.at_load(1.0)
 
 
 class FiniteElementSolution:
@@ -246,21 +246,21 @@ class FiniteElementSolution:
         """Solve with the factor of the reference, turned as for its prediction; None if that is too far away."""
         model = self._model
         factor = model.take_reference(reference)
-        fixed = model.body.fixed
+        fixed = model.equations.fixed
         first = None
         if directions is not None and directions.shape[1] <= FEW:
             # Turned along, the tangents at the reference are what a first back-substitution would give.
             first = turn(directions @ factor.slopes(), R)
             first[:, fixed] = 0
-        body = model.visit(self)
+        equations = model.visit(self)
         free = np.array(right)
         free[:, fixed] = 0
         found = block_galerkin(
-            lambda x: body.free_stiffness_times(x, transpose=transpose),
+            lambda x: equations.free_stiffness_times(x, transpose=transpose),
             factor.inverse(R, transpose=transpose),
             free,
-            body.total,
-            body.norms,
+            equations.total,
+            equations.norms,
             model.spec.solver.derivative_tolerance,
             ITERATIONS,
             first,
@@ -272,9 +272,9 @@ class FiniteElementSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return du (U_local,) along a `direction` (d,), or (k, U_local) for k of them; collective."""
         directions = np.atleast_2d(direction)
-        body = self._model.body
-        right = directions[:, body.scalars] @ self._right_sides
-        if body.fields:
+        equations = self._model.equations
+        right = directions[:, equations.scalars] @ self._right_sides
+        if equations.fields:
             right += self._model.visit(self).field_right_sides(directions)
         du = self._solve(right, directions=directions)
         return du.reshape(*np.shape(direction)[:-1], -1)
@@ -282,7 +282,7 @@ class FiniteElementSolution:
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
         du = self.state_tangent(direction)
-        return self._model.body.total(du @ self._gradients.T) + direction @ self._partials.T
+        return self._model.equations.total(du @ self._gradients.T) + direction @ self._partials.T
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
@@ -295,11 +295,11 @@ class FiniteElementSolution:
         """
         loads = np.atleast_2d(weights)
         multipliers = self._solve(loads, transpose=True)
-        body = self._model.body
+        equations = self._model.equations
         gradients = np.zeros((len(loads), len(self.parameters)))
-        gradients[:, body.scalars] = body.total(multipliers @ self._right_sides.T)
-        if body.fields:
-            body = self._model.visit(self)
-            multipliers[:, body.fixed] = 0
-            gradients -= np.array([body.field_products(multiplier) for multiplier in multipliers])
+        gradients[:, equations.scalars] = equations.total(multipliers @ self._right_sides.T)
+        if equations.fields:
+            equations = self._model.visit(self)
+            multipliers[:, equations.fixed] = 0
+            gradients -= np.array([equations.field_products(multiplier) for multiplier in multipliers])
         return gradients.reshape(*np.shape(weights)[:-1], -1)

@@ -23,9 +23,9 @@ DIRECTIONS = 6  # in which parameters are changed for the screen: one after the 
 class ReferenceFactor:
     """The factor of a reference state of a body, as an approximate inverse of the stiffness at other states."""
 
-    def __init__(self, body: Discretisation) -> None:
-        self._body = body
-        self._solver = body.new_solver()
+    def __init__(self, equations: Discretisation) -> None:
+        self._equations = equations
+        self._solver = equations.new_solver()
         self._rotations = np.empty((3, 3, 0))
         self._reference: Reference | None = None
         self._slopes: FloatArray | None = None
@@ -37,26 +37,26 @@ class ReferenceFactor:
         if self._reference is not None and self._reference.same(reference):
             return
         self._reference = self._slopes = self._vectors = None
-        body = self._set(reference)
+        equations = self._set(reference)
         self._solver.factorise()
-        self._rotations = rotations(body.gradients())
+        self._rotations = rotations(equations.gradients())
         self._reference = reference
 
     def _set(self, reference: Reference) -> Discretisation:
-        body = self._body
-        body.set_parameters(reference.parameters)
-        body.at_load(1.0)
-        body.set_state(reference.state)
-        return body
+        equations = self._equations
+        equations.set_parameters(reference.parameters)
+        equations.at_load(1.0)
+        equations.set_state(reference.state)
+        return equations
 
     def slopes(self) -> FloatArray:
         """Derivatives (d, U_local) of the state at the reference; this may change parameters and state."""
         if self._slopes is None:
             assert self._reference is not None
-            body = self._set(self._reference)
-            kept, body.work = body.work, Work()  # the first solution is charged no more than the others
-            self._slopes = self._solver.solve(body.right_sides_of_all())
-            body.work = kept
+            equations = self._set(self._reference)
+            kept, equations.work = equations.work, Work()  # the first solution is charged no more than the others
+            self._slopes = self._solver.solve(equations.right_sides_of_all())
+            equations.work = kept
         return self._slopes
 
     def prepare_screen(self) -> bool:
@@ -65,32 +65,32 @@ class ReferenceFactor:
         False where there are none: without spread of the parameters, or where the reference itself is not stable.
         """
         assert self._reference is not None
-        reference, body = self._reference, self._body
+        reference, equations = self._reference, self._equations
         if reference.spread is None or not np.isfinite(reference.spread).all():
             return False
-        if self._vectors is None and not body.symmetric:
+        if self._vectors is None and not equations.symmetric:
             self._set(reference)
-            self._screening = self._screening or body.new_symmetric_solver()
+            self._screening = self._screening or equations.new_symmetric_solver()
             self._screening.factorise()
-        if self._definite().negative_eigenvalues() != body.unknowns.pressures:
+        if self._definite().negative_eigenvalues() != equations.unknowns.pressures:
             return False
         if self._vectors is None:
-            kept, body.work = body.work, Work()  # charged to none, as the factor
+            kept, equations.work = equations.work, Work()  # charged to none, as the factor
             random = np.random.default_rng(0)
-            forces = body.layout.scatter(random.standard_normal((BLOCK, body.layout.size)))
+            forces = equations.layout.scatter(random.standard_normal((BLOCK, equations.layout.size)))
             self._vectors = screening_vectors(
                 self._changes(reference, random),
                 self._definite().solve,
                 forces,
-                body.free_displacements,
-                body.total,
+                equations.free_displacements,
+                equations.total,
             )
-            body.work = kept
+            equations.work = kept
         return True
 
     def _definite(self) -> LinearSolver:
         """The factor of the symmetric part of the stiffness at the reference."""
-        if self._body.symmetric:
+        if self._equations.symmetric:
             return self._solver
         assert self._screening is not None
         return self._screening
@@ -102,7 +102,7 @@ class ReferenceFactor:
         time of forty.
         """
         assert reference.spread is not None
-        body, d = self._body, len(reference.parameters)
+        equations, d = self._equations, len(reference.parameters)
         if reference.spread.ndim == 2:
             directions = reference.spread
         elif d <= DIRECTIONS:
@@ -110,16 +110,16 @@ class ReferenceFactor:
         else:
             directions = random.standard_normal((DIRECTIONS, d)) * reference.spread
         self._set(reference)
-        slopes = self._solver.solve(body.right_sides_along(directions))
+        slopes = self._solver.solve(equations.right_sides_along(directions))
         for direction, slope in zip(directions, slopes, strict=True):
             ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
             for step in (STEP, -STEP):
                 parameters, state = reference.parameters + step * direction, reference.state + step * slope
                 R = self.rotation(state)
-                body.set_parameters(parameters)
-                body.at_load(1.0)
-                body.set_state(state)
-                ends.append((step, parameters, state, body.imbalance(), R))
+                equations.set_parameters(parameters)
+                equations.at_load(1.0)
+                equations.set_state(state)
+                ends.append((step, parameters, state, equations.imbalance(), R))
 
             def multiply(
                 rows: FloatArray, ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = ends
@@ -128,12 +128,12 @@ class ReferenceFactor:
                 total = np.zeros_like(rows)
                 for step, parameters, state, imbalance, R in ends:
                     along = turn(rows, R)
-                    along[:, body.fixed] = 0
-                    body.set_parameters(parameters)
-                    body.at_load(1.0)
-                    products = body.stiffness_near(state, imbalance, along)
+                    along[:, equations.fixed] = 0
+                    equations.set_parameters(parameters)
+                    equations.at_load(1.0)
+                    products = equations.stiffness_near(state, imbalance, along)
                     total += turn(products, R.swapaxes(0, 1)) / (2 * step)
-                total[:, body.fixed] = 0
+                total[:, equations.fixed] = 0
                 return total
 
             yield multiply
@@ -141,32 +141,32 @@ class ReferenceFactor:
     def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
         """Return what the screen says of a state u (U_local,), with its imbalance, turned by R from the reference."""
         assert self._vectors is not None
-        body, free = self._body, self._body.free_displacements
+        equations, free = self._equations, self._equations.free_displacements
         vectors = turn(self._vectors, R)
-        vectors[:, body.fixed] = 0
+        vectors[:, equations.fixed] = 0
         return screen(
             vectors,
-            lambda rows: body.stiffness_near(u, imbalance, rows),
+            lambda rows: equations.stiffness_near(u, imbalance, rows),
             self._inverse(self._definite(), R),
             free,
-            body.total,
+            equations.total,
         )
 
     def rotation(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
-        body = self._body
-        body.set_state(u)
-        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(body.gradients()), self._rotations))
+        equations = self._equations
+        equations.set_state(u)
+        return np.asarray(np.einsum("ikn,jkn->ijn", rotations(equations.gradients()), self._rotations))
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
         return self._inverse(self._solver, R, transpose=transpose)
 
     def _inverse(self, solver: LinearSolver, R: FloatArray, *, transpose: bool = False) -> Inverse:
-        body = self._body
+        equations = self._equations
 
         def inverse(right: FloatArray) -> FloatArray:
-            body.work.back_substitutions += 1 if right.ndim == 1 else len(right)
+            equations.work.back_substitutions += 1 if right.ndim == 1 else len(right)
             return solver.solve(right, transpose=transpose)
 
-        return turned(inverse, R, body.fixed)
+        return turned(inverse, R, equations.fixed)

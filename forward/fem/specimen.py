@@ -107,8 +107,8 @@ class SpecimenModel(OneByOne):
     @cached_property
     def vertices(self) -> Layout:
         """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
-        body = self.models[0].body
-        return Layout(spaces.scalar_space(body.space.mesh, 1), body.comm)
+        equations = self.models[0].equations
+        return Layout(spaces.scalar_space(equations.space.mesh, 1), equations.comm)
 
     def log_fields(self, points: FloatArray) -> FloatArray:
         """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
@@ -118,7 +118,7 @@ class SpecimenModel(OneByOne):
         model = self.models[0]
         found = np.zeros((len(points), self.spec.body.vertex_count))
         if self.spec.fields:
-            factors = model.body.comm.bcast(self.space.factors(points, 1))
+            factors = model.equations.comm.bcast(self.space.factors(points, 1))
             found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
         return found
 
@@ -154,7 +154,7 @@ class SpecimenModel(OneByOne):
 
     def states(self, rows: FloatArray) -> list[FloatArray]:
         """Split this rank's states (…, U_local) into those of the cases."""
-        return np.split(rows, np.cumsum([model.body.size for model in self.models])[:-1], axis=-1)
+        return np.split(rows, np.cumsum([model.equations.size for model in self.models])[:-1], axis=-1)
 
     def values(self, rows: FloatArray) -> list[FloatArray]:
         """Split what is observed (…, n) into that of the cases."""
@@ -215,7 +215,7 @@ class SpecimenSolution:
 
     def _observe(self, states: list[FloatArray]) -> FloatArray:
         parts = zip(self._model.models, self._model.observations, states, strict=True)
-        return np.concatenate([model.body.total((B @ u.T).T) for model, B, u in parts], axis=-1)
+        return np.concatenate([model.equations.total((B @ u.T).T) for model, B, u in parts], axis=-1)
 
     def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
         parts = zip(self.solutions, self._model.positions, strict=True)
@@ -243,9 +243,9 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
     """Where (n, 3) displacements are observed; collective."""
     if item.on is None:
         return np.array(item.at)
-    body, layout = model.body, model.body.layout
-    mine = layout.nodes()[spaces.boundary_nodes(body.space, body.facets[item.on])]
-    return np.asarray(layout.coordinates[np.unique(np.concatenate(body.comm.allgather(mine)))])
+    equations, layout = model.equations, model.equations.layout
+    mine = layout.nodes()[spaces.boundary_nodes(equations.space, equations.facets[item.on])]
+    return np.asarray(layout.coordinates[np.unique(np.concatenate(equations.comm.allgather(mine)))])
 
 
 def _interpolation(
@@ -258,7 +258,7 @@ def _interpolation(
     ValueError
         If a place is farther from the mesh than the mesh can be from the body.
     """
-    body, layout = model.body, model.body.layout
+    equations, layout = model.equations, model.equations.layout
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     which = which.ravel()
     held, distances = model.space.interpolation(different)
@@ -272,4 +272,4 @@ def _interpolation(
         columns.append(3 * local[at][owned] + axis)
         values.append(w[owned])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(entries, shape=(len(places), body.size)), distances[which]
+    return csr_matrix(entries, shape=(len(places), equations.size)), distances[which]

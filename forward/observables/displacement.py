@@ -9,7 +9,7 @@ import numpy as np
 from forward.bodies.geometry import AXES, Axis, Vector, tolerance
 from forward.bodies.mesh_file import MeshFile
 from forward.model import ModelError
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class PointDisplacement(Observable):
@@ -19,13 +19,13 @@ class PointDisplacement(Observable):
     at: Vector
     component: Axis
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         from forward.fem.dolfinx import spaces
         from forward.observables.functionals import Linear
 
-        (found,), (distance,) = spaces.point_weights(body.space, np.array([self.at]))
-        spec = body.spec.body
+        (found,), (distance,) = spaces.point_weights(equations.space, np.array([self.at]))
+        spec = equations.spec.body
         # Points beside bodies with six sides were refused before; the mesh may cut their curved faces.
         most = tolerance(spec) if isinstance(spec, MeshFile) else max(tolerance(spec), spec.longest_edge)
         if distance > most:
@@ -35,9 +35,9 @@ class PointDisplacement(Observable):
                 f"expected at most {most:.3g} m"
             )
             raise ModelError(message)
-        probe = spaces.function(body.space)
+        probe = spaces.function(equations.space)
         if found is not None:
             nodes, weights = found
             probe.x.array[3 * nodes + AXES.index(self.component)] = weights
         # Weights of ghost nodes travel to the ranks that own them.
-        return Linear(body, body.with_pressures(spaces.sum_ghosts(probe)))
+        return Linear(equations, equations.with_pressures(spaces.sum_ghosts(probe)))

@@ -9,19 +9,19 @@ import numpy as np
 import ufl
 
 from forward.model import FloatArray
-from forward.observables.observable import DiscreteBody
+from forward.observables.observable import Equations
 
 
 class Linear:
     """ψ = ⟨g, u⟩ with a fixed g (U_local,)."""
 
-    def __init__(self, body: DiscreteBody, g: FloatArray) -> None:
-        self._body = body
+    def __init__(self, equations: Equations, g: FloatArray) -> None:
+        self._equations = equations
         self._g = g
 
     def value(self) -> float:
         """Return ψ."""
-        return self._body.dot(self._g, self._body.state())
+        return self._equations.dot(self._g, self._equations.state())
 
     def gradient(self) -> FloatArray:
         """Return ∂ψ/∂u (U_local,)."""
@@ -29,18 +29,18 @@ class Linear:
 
     def partial(self) -> FloatArray:
         """Return ∂ψ/∂ω (d,)."""
-        return np.zeros(len(self._body.parameters))
+        return np.zeros(len(self._equations.parameters))
 
 
 class Integral:
     """ψ = 1/size ∫ density(u, ω), over the body or, by its measure, over a boundary."""
 
-    def __init__(self, body: DiscreteBody, density: Any, size: float = 1.0, measure: Any | None = None) -> None:
-        self._body = body
+    def __init__(self, equations: Equations, density: Any, size: float = 1.0, measure: Any | None = None) -> None:
+        self._equations = equations
         self._density = density
         self.size = size
-        self._measure = body.dx if measure is None else measure
-        self._value = body.scalar(density * self._measure)
+        self._measure = equations.dx if measure is None else measure
+        self._value = equations.scalar(density * self._measure)
 
     def value(self) -> float:
         """Return ψ."""
@@ -49,22 +49,22 @@ class Integral:
     # What is compiled lives as long as the output that it belongs to.
     @cached_property
     def _gradient(self) -> Any:
-        return self._body.vector(self._body.derivative(self._density * self._measure))
+        return self._equations.vector(self._equations.derivative(self._density * self._measure))
 
     @cached_property
     def _partial(self) -> Any:
-        return self._body.scalar(self._body.along_parameters(self._density) * self._measure)
+        return self._equations.scalar(self._equations.along_parameters(self._density) * self._measure)
 
     @cached_property
     def _by_fields(self) -> tuple[tuple[Any, Any], ...]:
         """The random fields that the density depends on, with its derivative by their values at the vertices."""
-        body = self._body
+        equations = self._equations
         return tuple(
             (
                 field,
-                body.by_vertices(field.test * ufl.diff(self._density, field.log) * self._measure),
+                equations.by_vertices(field.test * ufl.diff(self._density, field.log) * self._measure),
             )
-            for field in body.fields
+            for field in equations.fields
             if field.inside(self._density)
         )
 
@@ -74,12 +74,12 @@ class Integral:
 
     def partial(self) -> FloatArray:
         """Return ∂ψ/∂ω (d,)."""
-        body = self._body
-        slopes = np.zeros(len(body.parameters))
-        if body.along_parameters(self._density) is None:
+        equations = self._equations
+        slopes = np.zeros(len(equations.parameters))
+        if equations.along_parameters(self._density) is None:
             return slopes
-        if len(body.scalars):
-            slopes[body.scalars] = [self._partial() for _ in body.unit_directions()]
+        if len(equations.scalars):
+            slopes[equations.scalars] = [self._partial() for _ in equations.unit_directions()]
         for field, assemble in self._by_fields:
             slopes[field.positions] = field.pull(assemble())
         return slopes / self.size

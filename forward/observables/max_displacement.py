@@ -8,7 +8,7 @@ import numpy as np
 
 from forward.bodies.geometry import AXES
 from forward.model import FloatArray
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class MaxDisplacement(Observable):
@@ -20,43 +20,43 @@ class MaxDisplacement(Observable):
     kind: Literal["max-displacement"] = "max-displacement"
     component: Literal["x", "y", "z", "magnitude"] = "magnitude"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
-        return _Extreme(body, None if self.component == "magnitude" else AXES.index(self.component))
+        return _Extreme(equations, None if self.component == "magnitude" else AXES.index(self.component))
 
 
 class _Extreme:
     """ψ = max over the nodes of |u_c|, or of |u|; of nodes that tie, the first in the canonical order counts."""
 
-    def __init__(self, body: DiscreteBody, axis: int | None) -> None:
-        self._body = body
+    def __init__(self, equations: Equations, axis: int | None) -> None:
+        self._equations = equations
         self._axis = axis
 
     def _candidates(self) -> FloatArray:
-        u = self._body.displacements()
+        u = self._equations.displacements()
         return np.asarray(np.linalg.norm(u, axis=1) if self._axis is None else np.abs(u[:, self._axis]))
 
     def value(self) -> float:
         from forward.fem import ranks
 
-        return -ranks.smallest(self._body.comm, -self._candidates().max(initial=0.0))
+        return -ranks.smallest(self._equations.comm, -self._candidates().max(initial=0.0))
 
     def gradient(self) -> FloatArray:
         from forward.fem import ranks
 
         candidates, top = self._candidates(), self.value()
         ties = np.flatnonzero(candidates >= top * (1 - 1e-10))
-        position = self._body.layout.positions[ties]
-        first = ranks.smallest(self._body.comm, float(position.min(initial=np.iinfo(np.int64).max)))
+        position = self._equations.layout.positions[ties]
+        first = ranks.smallest(self._equations.comm, float(position.min(initial=np.iinfo(np.int64).max)))
         g = np.zeros((len(candidates), 3))
         if top > 0:
             for node in ties[position == first]:
-                u = self._body.displacements()[node]
+                u = self._equations.displacements()[node]
                 if self._axis is None:
                     g[node] = u / np.linalg.norm(u)
                 else:
                     g[node, self._axis] = np.sign(u[self._axis])
-        return self._body.with_pressures(g.ravel())
+        return self._equations.with_pressures(g.ravel())
 
     def partial(self) -> FloatArray:
-        return np.zeros(len(self._body.parameters))
+        return np.zeros(len(self._equations.parameters))

@@ -9,7 +9,7 @@ import numpy as np
 
 from forward.materials import kinematics
 from forward.model import FloatArray
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 if TYPE_CHECKING:
     from forward.observables.functionals import Integral
@@ -21,9 +21,9 @@ class MaxVonMises(Observable):
     kind: Literal["max-von-mises"] = "max-von-mises"
     unit: ClassVar[str] = "Pa"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
-        return _MaxVonMises(body)
+        return _MaxVonMises(equations)
 
 
 class _MaxVonMises:
@@ -33,32 +33,32 @@ class _MaxVonMises:
     so that its derivatives are those of an integral.
     """
 
-    def __init__(self, body: DiscreteBody) -> None:
+    def __init__(self, equations: Equations) -> None:
         import ufl
 
         from forward.fem.dolfinx import spaces
 
-        self._body = body
+        self._equations = equations
         # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
-        cauchy = body.stress_of(body.energy) * body.F.T / body.J
+        cauchy = equations.stress_of(equations.energy) * equations.F.T / equations.J
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
-        degree = body.spec.body.quadrature
-        self._values = body.at_points(stress)
-        self._selector = spaces.function(spaces.quadrature_space(body.mesh, degree))
+        degree = equations.spec.body.quadrature
+        self._values = equations.at_points(stress)
+        self._selector = spaces.function(spaces.quadrature_space(equations.mesh, degree))
         self._stress = stress
 
     def value(self) -> float:
         from forward.fem import ranks
 
-        return -ranks.smallest(self._body.comm, -self._values().max(initial=0.0))
+        return -ranks.smallest(self._equations.comm, -self._values().max(initial=0.0))
 
     def _at_place(self) -> Integral:
         """Return the stress at the point where it is largest now."""
-        body = self._body
+        equations = self._equations
         here = np.argwhere(self._values() >= self.value())
-        holders = body.comm.allgather(len(here) > 0)
+        holders = equations.comm.allgather(len(here) > 0)
         self._selector.x.array[:] = 0
-        if holders.index(True) == body.comm.rank:
+        if holders.index(True) == equations.comm.rank:
             cell, point = here[0]
             self._selector.x.array[self._selector.function_space.dofmap.cell_dofs(cell)[point]] = 1
         self._selector.x.scatter_forward()
@@ -69,11 +69,11 @@ class _MaxVonMises:
     def _selected(self) -> Integral:
         from forward.observables.functionals import Integral
 
-        return Integral(self._body, self._selector * self._stress)
+        return Integral(self._equations, self._selector * self._stress)
 
     @cached_property
     def _weight(self) -> Any:
-        return self._body.scalar(self._selector * self._body.dx)
+        return self._equations.scalar(self._selector * self._equations.dx)
 
     def gradient(self) -> FloatArray:
         return self._at_place().gradient()

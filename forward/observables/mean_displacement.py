@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from forward.bodies.geometry import AXES, Axis
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class MeanDisplacement(Observable):
@@ -17,13 +17,13 @@ class MeanDisplacement(Observable):
     on: str
     component: Axis
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         import ufl
 
         from forward.fem.dolfinx import spaces
         from forward.observables.functionals import Linear
 
-        axis = spaces.constant(body.mesh, np.eye(3)[AXES.index(self.component)])
-        weights = body.vector(ufl.inner(axis, body.test) * body.surface(self.on))()
-        return Linear(body, weights / body.dot(weights, np.ones_like(weights)))
+        axis = spaces.constant(equations.mesh, np.eye(3)[AXES.index(self.component)])
+        weights = equations.vector(ufl.inner(axis, equations.test) * equations.surface(self.on))()
+        return Linear(equations, weights / equations.dot(weights, np.ones_like(weights)))

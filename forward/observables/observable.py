@@ -8,10 +8,10 @@ An output is a class with one file, here or beside a study (``kind = "my_tissue.
         kind: str
         unit: ClassVar[str] = "1"
 
-        def functional(self, body: DiscreteBody) -> Functional:
+        def functional(self, equations: Equations) -> Functional:
             from forward.observables.functionals import Integral
 
-            return Integral(body, (body.F.T * body.F)[0, 0] - 1, body.volume)
+            return Integral(equations, (equations.F.T * equations.F)[0, 0] - 1, equations.volume)
 
 A field that is called `on` is the name of a boundary, one that is called `at` a point (m) of the undeformed body. UFL
 and FEniCSx are imported inside the methods, so that a study can be checked without them.
@@ -32,7 +32,7 @@ from forward.settings import Settings
 
 
 class Functional(Protocol):
-    """An output ψ(u, ω) of a discrete body, at the state and the parameters that this is set to.
+    """An output ψ(u, ω) of a discretised body, at the state and the parameters that its equations are set to.
 
     Every method is collective over its ranks.
     """
@@ -47,8 +47,8 @@ class Functional(Protocol):
         """Return the explicit derivative ∂ψ/∂ω (d,)."""
 
 
-class DiscreteBody(Protocol):
-    """What outputs ask of a discrete body (`forward.fem.equations`); what is written in UFL or of DOLFINx is `Any`.
+class Equations(Protocol):
+    """What outputs ask of the discrete equations of a body (`forward.fem.equations`); UFL and DOLFINx are `Any`.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class Observable(Settings):
     unit: ClassVar[str] = "m"  # SI unit of the value
     of_held: ClassVar[bool] = False  # whether its boundary has to be clamped or moved
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation; collective.
 
         Raises

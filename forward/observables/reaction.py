@@ -8,7 +8,7 @@ import numpy as np
 
 from forward.bodies.geometry import AXES, Axis
 from forward.model import FloatArray
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class Reaction(Observable):
@@ -20,31 +20,31 @@ class Reaction(Observable):
     on: str
     component: Axis
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
-        return _Reaction(body, self)
+        return _Reaction(equations, self)
 
 
 class _Reaction:
     """ψ = wᵀ r(u, ω), with r the imbalance of all unknowns and w = 1 on a component of a boundary's nodes."""
 
-    def __init__(self, body: DiscreteBody, output: Reaction) -> None:
+    def __init__(self, equations: Equations, output: Reaction) -> None:
         from forward.fem.dolfinx import spaces
 
-        self._body = body
-        nodes = spaces.boundary_nodes(body.space, body.facets[output.on])
-        owned = nodes[nodes < body.nodes_owned]
-        self._w = np.zeros(body.size)
+        self._equations = equations
+        nodes = spaces.boundary_nodes(equations.space, equations.facets[output.on])
+        owned = nodes[nodes < equations.nodes_owned]
+        self._w = np.zeros(equations.size)
         self._w[3 * owned + AXES.index(output.component)] = 1
 
     def value(self) -> float:
-        return self._body.dot(self._w, self._body.imbalance())
+        return self._equations.dot(self._w, self._equations.imbalance())
 
     def gradient(self) -> FloatArray:
-        return self._body.stiffness_times(self._w, transpose=True)
+        return self._equations.stiffness_times(self._w, transpose=True)
 
     def partial(self) -> FloatArray:
-        body = self._body
-        slopes = body.field_products(self._w)
-        slopes[body.scalars] = [body.dot(self._w, force) for force in body.parameter_forces()]
+        equations = self._equations
+        slopes = equations.field_products(self._w)
+        slopes[equations.scalars] = [equations.dot(self._w, force) for force in equations.parameter_forces()]
         return slopes

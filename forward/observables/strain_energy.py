@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class StrainEnergy(Observable):
@@ -13,8 +13,8 @@ class StrainEnergy(Observable):
     kind: Literal["strain-energy"] = "strain-energy"
     unit: ClassVar[str] = "J"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         from forward.observables.functionals import Integral
 
-        return Integral(body, body.stored_energy)
+        return Integral(equations, equations.stored_energy)

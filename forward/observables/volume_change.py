@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class VolumeChange(Observable):
@@ -13,8 +13,8 @@ class VolumeChange(Observable):
     kind: Literal["volume-change"] = "volume-change"
     unit: ClassVar[str] = "1"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
         from forward.observables.functionals import Integral
 
-        return Integral(body, body.dilation, body.volume)
+        return Integral(equations, equations.dilation, equations.volume)

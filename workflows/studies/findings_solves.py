@@ -29,7 +29,7 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     mean = study.inputs.mean
     try:
         found = model.solve(mean).outputs
-        right = better.build(model.body.comm, model.parameters).solve(mean).outputs
+        right = better.build(model.equations.comm, model.parameters).solve(mean).outputs
     except SolveError:
         return []
     units = {output.name: output.unit for output in spec.outputs}

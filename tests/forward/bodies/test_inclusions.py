@@ -55,8 +55,8 @@ def test_without_contrast_the_body_is_homogeneous(model, homogeneous):
 @pytest.mark.parametrize("contrast", [1e-4, 0.5, 1e4])
 def test_an_inclusion_that_covers_the_body_multiplies_its_energy(model, homogeneous, contrast):
     plain = homogeneous.solve(np.array([1e4]))
-    model.body.set_parameters(changed({"tumour.contrast": contrast, "tumour.radius": 30.0, "gap.contrast": 1.0}))
-    model.body.set_state(plain.state)
+    model.equations.set_parameters(changed({"tumour.contrast": contrast, "tumour.radius": 30.0, "gap.contrast": 1.0}))
+    model.equations.set_state(plain.state)
     names = model.outputs
     for name in ("energy", "stress"):
         found = model._functionals[names.index(name)].value()
@@ -64,9 +64,9 @@ def test_an_inclusion_that_covers_the_body_multiplies_its_energy(model, homogene
 
 
 def test_factors_of_inclusions_that_overlap_multiply(model):
-    body = model.body
-    density = assembly.ScalarAssembler(body.stiffness_factor * body.dx, body.comm)
-    body.set_parameters(changed({"tumour.radius": 30.0, "gap.radius": 30.0}))
+    equations = model.equations
+    density = assembly.ScalarAssembler(equations.stiffness_factor * equations.dx, equations.comm)
+    equations.set_parameters(changed({"tumour.radius": 30.0, "gap.radius": 30.0}))
     assert density() == pytest.approx(8.0 * 0.2 * np.prod(model.spec.body.size), rel=1e-12)
 
 
@@ -74,7 +74,7 @@ def test_the_factor_follows_its_formula():
     spec = loaded_body(
         "mooney-rivlin", body=BODY, inclusions=(TUMOUR,), outputs=({"kind": "strain-energy", "name": "W"},)
     )
-    body = spec.build(MPI.COMM_SELF, ()).body
+    equations = spec.build(MPI.COMM_SELF, ()).equations
     places = [(0.55, 0.3, 0.45), (0.85, 0.3, 0.45), (0.55, 0.3, 0.6), (1.0, 0.7, 0.8)]
     distances = np.linalg.norm(np.array(places) - [0.55, 0.3, 0.45], axis=1)
     expected = 8.0 ** ((1 - np.tanh((distances - 0.3) / 0.15)) / 2)
@@ -84,8 +84,8 @@ def test_the_factor_follows_its_formula():
         # The 2 × 2 × 2 cells are halves of the box: cells and reference points of the places.
         low = np.minimum(np.floor(np.array(place) / size * 2), 1)
         reference = np.array(place) / size * 2 - low
-        values = assembly.PointValues(body.stiffness_factor, reference[None], body.space, body.comm)
-        centres = body.mesh.geometry.x[body.mesh.geometry.dofmap.array.reshape(-1, 8)].mean(axis=1)
+        values = assembly.PointValues(equations.stiffness_factor, reference[None], equations.space, equations.comm)
+        centres = equations.mesh.geometry.x[equations.mesh.geometry.dofmap.array.reshape(-1, 8)].mean(axis=1)
         cell = np.argmin(np.abs(centres - (low + 0.5) * size / 2).sum(axis=1))
         found.append(float(values()[cell, 0]))
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # what is tiny at the centre
@@ -93,9 +93,9 @@ def test_the_factor_follows_its_formula():
 
 @pytest.mark.parametrize("material", MATERIALS)
 def test_without_inclusions_forms_stay_the_same(material):
-    body = loaded_body(material).build(MPI.COMM_SELF, ()).body
-    assert body.stiffness_factor == 1
-    assert "tanh" not in str(body.stored_energy)
+    equations = loaded_body(material).build(MPI.COMM_SELF, ()).equations
+    assert equations.stiffness_factor == 1
+    assert "tanh" not in str(equations.stored_energy)
 
 
 # --- ellipsoids ------------------------------------------------------------------------------------------------------

@@ -17,11 +17,11 @@ def test_outputs_that_are_made_and_dropped_never_get_forms_of_each_other():
     model = spec.build(MPI.COMM_SELF, ("material.C1",))
     model.visit(model.solve(np.array([1.1e4])))
     outputs = (StrainEnergy(name="energy"), VolumeChange(name="volume"))
-    kept = [output.functional(model.body) for output in outputs]
+    kept = [output.functional(model.equations) for output in outputs]
     expected = [(one.gradient(), one.partial()) for one in kept]
     for turn in range(40):
         which = turn % 2
-        made = outputs[which].functional(model.body)
+        made = outputs[which].functional(model.equations)
         np.testing.assert_array_equal(made.gradient(), expected[which][0])
         np.testing.assert_array_equal(made.partial(), expected[which][1])
         del made

@@ -129,17 +129,17 @@ def test_affine_deformations(material, deformation):
         displacements=(),
         outputs=outputs,
     )
-    body = MovedBoundary(spec, MPI.COMM_SELF, ())
-    body.deformation = F = np.array(deformation, dtype=float)
-    body.set_parameters(np.empty(0))
-    body.at_load(1.0)
-    u = solve(body, spec.solver, np.zeros(body.size)).state
-    body.at_load(1.0)
-    body.set_state(u)
-    places = np.asarray(body.space.tabulate_dof_coordinates())
-    np.testing.assert_allclose(body.displacements(), places @ (F - np.eye(3)).T, rtol=0, atol=1e-10)
+    equations = MovedBoundary(spec, MPI.COMM_SELF, ())
+    equations.deformation = F = np.array(deformation, dtype=float)
+    equations.set_parameters(np.empty(0))
+    equations.at_load(1.0)
+    u = solve(equations, spec.solver, np.zeros(equations.size)).state
+    equations.at_load(1.0)
+    equations.set_state(u)
+    places = np.asarray(equations.space.tabulate_dof_coordinates())
+    np.testing.assert_allclose(equations.displacements(), places @ (F - np.eye(3)).T, rtol=0, atol=1e-10)
 
-    found = [output.functional(body).value() for output in spec.outputs]
+    found = [output.functional(equations).value() for output in spec.outputs]
     W, P, stress, J = exact(material, F)
     if material in MIXED:
         pressure = 2 * MATERIALS[material.split()[0]]["D1"] * (J - 1)
@@ -180,18 +180,18 @@ def test_reactions_balance_the_loads(material):
     density, size = 700.0, 900.0
     reactions = model.solve(np.array([density, size])).outputs.reshape(2, 3)
     # They share an edge, whose nodes count for both boundaries: take them once.
-    body = model.body
-    edge = np.intersect1d(*(nodes_of(body, on) for on in ("x-min", "z-max")))
-    shared = body.imbalance()[: 3 * body.nodes_owned].reshape(-1, 3)[edge].sum(axis=0)
+    equations = model.equations
+    edge = np.intersect1d(*(nodes_of(equations, on) for on in ("x-min", "z-max")))
+    shared = equations.imbalance()[: 3 * equations.nodes_owned].reshape(-1, 3)[edge].sum(axis=0)
     weight = density * 9.81 * VOLUME * np.array([0, -1, 0.3]) / np.hypot(1, 0.3)
     traction = size * SIZE[1] * SIZE[2] * np.array([1, 0, 1]) / np.sqrt(2)
     total = reactions.sum(axis=0) - shared
     np.testing.assert_allclose(total, -weight - traction, rtol=1e-9, atol=1e-9 * np.linalg.norm(weight))
 
 
-def nodes_of(body, boundary):
+def nodes_of(equations, boundary):
     axis, end = "xyz".index(boundary[0]), boundary[2:]
-    places = np.asarray(body.space.tabulate_dof_coordinates())
+    places = np.asarray(equations.space.tabulate_dof_coordinates())
     return np.flatnonzero(np.isclose(places[:, axis], SIZE[axis] if end == "max" else 0.0))
 
 

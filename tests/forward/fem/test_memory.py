@@ -33,9 +33,9 @@ def test_without_symmetry_two_triangles_are_foreseen_and_a_factor_of_the_symmetr
     )
     whole, half = (factor(following.body, mixed=False, symmetric=symmetric) for symmetric in (False, True))
     assert following.cost().bytes - dead.cost().bytes == pytest.approx(2 * whole.bytes)
-    body = following.build(MPI.COMM_SELF, ()).body
+    equations = following.build(MPI.COMM_SELF, ()).equations
     found = {}
-    for solver, expected in ((body.new_solver(), whole), (body.new_symmetric_solver(), half)):
+    for solver, expected in ((equations.new_solver(), whole), (equations.new_symmetric_solver(), half)):
         assert solver._stiffness.expected == expected  # what is asked for before it is made
         solver.factorise()
         found[expected] = solver._ksp.pc.getFactorMatrix().getMumpsInfog(29)  # entries, by MUMPS

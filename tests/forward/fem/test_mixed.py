@@ -58,7 +58,7 @@ def test_a_bent_block_does_not_lock(cell, coarse, fine):
         assert solution.work.factorisations <= 6
         assert solution.outputs[1] == pytest.approx(LOAD * 0.02**2, rel=1e-8)
         model.linearise(solution)
-        assert model.body.inertia() == 0
+        assert model.equations.inertia() == 0
         tips.append(solution.outputs[0])
         volumes.append(solution.outputs[3])
     for i in (0, 4):
@@ -103,14 +103,14 @@ def test_instability_is_counted_alike():
     counts = []
     for formulation in ("displacement", "mixed"):
         model = cantilever("hexahedron", (6, 2, 2), formulation)
-        body = model.visit(bent(model, 1))
+        equations = model.visit(bent(model, 1))
         # Compressed by three times what buckles it (in two planes), and by half of what the next mode needs; ν = 1/8.
         strain = 0.03 * np.array([-1, 1 / 8, 1 / 8])
-        u = strain * (np.asarray(body.space.tabulate_dof_coordinates()) - [0, 0.01, 0.01])
-        state = body.with_pressures(u.ravel())
+        u = strain * (np.asarray(equations.space.tabulate_dof_coordinates()) - [0, 0.01, 0.01])
+        state = equations.with_pressures(u.ravel())
         state[u.size :] = SHEAR * (np.prod(1 + strain) - 1)
-        body.factorise(state)
-        counts.append(body.inertia())
+        equations.factorise(state)
+        counts.append(equations.inertia())
     assert counts == [2, 2]
 
 
@@ -118,8 +118,8 @@ def test_instability_is_counted_alike():
 def test_a_state_has_a_canonical_order(form):
     spec = unloaded_body(form, body={"cells": (3, 2, 4)}, outputs=({"kind": "strain-energy", "name": "energy"},))
     model = spec.build(MPI.COMM_SELF, ())
-    body = model.body
-    places = [np.asarray(space.tabulate_dof_coordinates()) for space in (body.space, body.unknowns.pressure)]
+    equations = model.equations
+    places = [np.asarray(space.tabulate_dof_coordinates()) for space in (equations.space, equations.unknowns.pressure)]
     state = np.concatenate([places[0].ravel(), places[1] @ [100.0, 10.0, 1.0]])
     whole = model.space.gather(state[None])
     assert whole.shape == (1, spec.unknowns)
@@ -131,10 +131,10 @@ def test_a_state_has_a_canonical_order(form):
     expected = model.space.coordinates[at_vertex] @ [100.0, 10.0, 1.0]
     np.testing.assert_allclose(whole[0, model.space.displacements :], expected, rtol=1e-12)
     np.testing.assert_array_equal(model.space.scatter(whole)[0], state)
-    body.set_state(state)
-    np.testing.assert_array_equal(body.state(), state)
-    body.set_state(0 * state)
-    np.testing.assert_array_equal(body.unknowns.take(body._state.x.array), 0)
+    equations.set_state(state)
+    np.testing.assert_array_equal(equations.state(), state)
+    equations.set_state(0 * state)
+    np.testing.assert_array_equal(equations.unknowns.take(equations._state.x.array), 0)
 
 
 def test_fields_are_those_of_displacements_and_predictions_hold_pressures():

@@ -118,4 +118,5 @@ def test_small_loads_are_linear_elasticity(material):
         assert solution.residual <= 1e-8
     # What rounding leaves is a part of the load, however small that is: a residual of 3 % never is.
     state = solution.state
-    assert model.body.rounding(state, model.body.residual(state).scale) <= 1e-4 * model.body.residual(state).scale
+    scale = model.equations.residual(state).scale
+    assert model.equations.rounding(state, scale) <= 1e-4 * scale

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.fem
 OUTSIDE = '''
 from typing import ClassVar
 
-from forward.observables.observable import DiscreteBody, Functional, Observable
+from forward.observables.observable import Equations, Functional, Observable
 
 
 class Flux(Observable):
@@ -28,12 +28,13 @@ class Flux(Observable):
     on: str
     unit: ClassVar[str] = "m³"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         import ufl
 
         from forward.observables.functionals import Integral
 
-        return Integral(body, ufl.dot(body.u, ufl.FacetNormal(body.mesh)), measure=body.surface(self.on))
+        normal = ufl.FacetNormal(equations.mesh)
+        return Integral(equations, ufl.dot(equations.u, normal), measure=equations.surface(self.on))
 
 
 class Density(Observable):
@@ -42,10 +43,10 @@ class Density(Observable):
     kind: str
     unit: ClassVar[str] = "Pa²"
 
-    def functional(self, body: DiscreteBody) -> Functional:
+    def functional(self, equations: Equations) -> Functional:
         from forward.observables.functionals import Integral
 
-        return Integral(body, body.stored_energy**2, body.volume)
+        return Integral(equations, equations.stored_energy**2, equations.volume)
 
 
 class Held(Observable):

@@ -204,25 +204,25 @@ def test_changes_of_the_stiffness_are_those_of_assembled_ones(column):
     problem, centre = column
     model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
     reference = centre.prediction.on(model)(np.array([115.0])).reference
-    factor, body = model.take_reference(reference), model.body
+    factor, equations = model.take_reference(reference), model.equations
     spread, step = float(reference.spread[0]), 1e-3
-    rows = np.random.default_rng(0).standard_normal((3, body.size)) * body.free_displacements
+    rows = np.random.default_rng(0).standard_normal((3, equations.size)) * equations.free_displacements
     slope = spread * factor.slopes()[0]
     assembled = np.zeros_like(rows)
     for h in (step, -step):
         state = reference.state + h * slope
-        body.set_parameters(reference.parameters + h * spread)
-        body.at_load(1.0)
-        body.set_state(state)
-        matrix = body.assembled_stiffness()
+        equations.set_parameters(reference.parameters + h * spread)
+        equations.at_load(1.0)
+        equations.set_state(state)
+        matrix = equations.assembled_stiffness()
         R = factor.rotation(state)
-        along = turn(rows, R) * body.free_displacements
+        along = turn(rows, R) * equations.free_displacements
         for i, row in enumerate(along):
             x, y = matrix.createVecs()
-            x.array[:] = body.unknowns.reorder(row)
+            x.array[:] = equations.unknowns.reorder(row)
             matrix.mult(x, y)
-            assembled[i] += turn(body.unknowns.take(y.array_r), R.swapaxes(0, 1)) / (2 * h)
-    assembled *= body.free_displacements
+            assembled[i] += turn(equations.unknowns.take(y.array_r), R.swapaxes(0, 1)) / (2 * h)
+    assembled *= equations.free_displacements
     (change,) = factor._changes(reference, np.random.default_rng(0))
     np.testing.assert_allclose(change(rows), assembled, rtol=0, atol=1e-3 * np.abs(assembled).max())
 

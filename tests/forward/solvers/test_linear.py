@@ -36,16 +36,16 @@ SPECS = {
 def test_a_direct_solver_agrees_with_dense_algebra(kind):
     model = SPECS[kind].build(MPI.COMM_SELF, ())
     state = np.array(model.solve(np.empty(0)).state)
-    body = model.body
-    body.set_state(state)
-    solver = body.new_solver()
+    equations = model.equations
+    equations.set_state(state)
+    solver = equations.new_solver()
     assert solver.memory() == 0
     solver.factorise()
-    K = body.free_stiffness_times(np.eye(body.size)).T
-    K[body.fixed] = 0  # columns are zero already; rows of prescribed unknowns are identities
-    K[body.fixed, body.fixed] = 1
-    rows = np.random.default_rng(0).standard_normal((3, body.size))
-    rows[:, body.fixed] = 0
+    K = equations.free_stiffness_times(np.eye(equations.size)).T
+    K[equations.fixed] = 0  # columns are zero already; rows of prescribed unknowns are identities
+    K[equations.fixed, equations.fixed] = 1
+    rows = np.random.default_rng(0).standard_normal((3, equations.size))
+    rows[:, equations.fixed] = 0
     for transpose in (False, True):
         expected = np.linalg.solve(K.T if transpose else K, rows.T).T
         found = solver.solve(rows, transpose=transpose)
@@ -56,8 +56,8 @@ def test_a_direct_solver_agrees_with_dense_algebra(kind):
     if kind == "not symmetric":
         assert negative is None
     else:
-        assert negative == (np.linalg.eigvalsh((K + K.T) / 2) < 0).sum() == body.unknowns.pressures
-    assert (10**6 if body.size > 100 else 0) <= solver.memory() < 10**9
+        assert negative == (np.linalg.eigvalsh((K + K.T) / 2) < 0).sum() == equations.unknowns.pressures
+    assert (10**6 if equations.size > 100 else 0) <= solver.memory() < 10**9
 
 
 class ConjugateGradients:
