@@ -104,7 +104,7 @@ def main(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:
     print(
         f"\n{specimens} specimens, {len(found.failures)} without a posterior; all parameters together: "
         f"p = {found.probability('laplace'):.2g} by Laplace, {found.probability('corrected'):.2g} corrected. "
-        f"Weights of {samples} solves are worth {np.median(found.effective):.0f} (median), "
+        f"Weights of {samples} solves are worth {np.median(found.ess):.0f} (median), "
         f"{100 * good.mean():.0f} % of them trusted. {seconds:.0f} s of CPU; {FILE} holds the ranks."
     )
 

@@ -39,7 +39,7 @@ class Calibration:
         Physical parameters (n, c), and the noise where it is unknown.
     laplace, corrected
         Probabilities (n, c) of what lies below the truth, by Laplace's Gaussian and by weighted points.
-    effective, tail
+    ess, pareto_k
         Effective number (n,) of the points, and k̂ (n,) of their weights.
     trusted
         Whether (n,) the weights are worth what they say.
@@ -51,8 +51,8 @@ class Calibration:
     truths: FloatArray
     laplace: FloatArray
     corrected: FloatArray
-    effective: FloatArray
-    tail: FloatArray
+    ess: FloatArray
+    pareto_k: FloatArray
     trusted: NDArray[np.bool_]
     failures: dict[int, str]
 
@@ -92,8 +92,8 @@ class Calibration:
                 "rank": (("posterior", *specimen), np.array([self.laplace, self.corrected])),
                 "count": (("posterior", "parameter", "bin"), np.array([self.counts(kind, bins) for kind in kinds])),
                 "probability": (("posterior", "parameter"), np.array([self.probabilities(kind) for kind in kinds])),
-                "effective": ("specimen", self.effective),
-                "tail": ("specimen", self.tail),
+                "effective": ("specimen", self.ess),
+                "tail": ("specimen", self.pareto_k),
                 "trusted": ("specimen", self.trusted),
             },
             {"posterior": list(kinds), "parameter": list(self.names), "bin": (np.arange(bins) + 0.5) / bins},
@@ -136,7 +136,7 @@ def calibrate(
     scale = posterior.sigma * (1.0 if posterior.noise is None else physical[:, -1:])
     data = measured.outputs + scale * errors
     by_laplace, corrected = np.full((2, specimens, c), np.nan)
-    effective, tail = np.zeros(specimens), np.full(specimens, np.inf)
+    ess, pareto_k = np.zeros(specimens), np.full(specimens, np.inf)
     trusted = np.zeros(specimens, dtype=bool)
     failures: dict[int, str] = {}
     for k in range(specimens):
@@ -149,11 +149,11 @@ def calibrate(
             by_laplace[k] = rank_by_laplace(gaussian, x[k])
             found = evidence(one, gaussian, samples, seed=seed + k)
             corrected[k] = rank_by_weights(found, x[k], ties[k])
-            effective[k], tail[k], trusted[k] = found.effective, found.tail, found.trusted
+            ess[k], pareto_k[k], trusted[k] = found.ess, found.pareto_k, found.trusted
         except SolveError as error:
             failures[k] = error.reason
         progress(k + 1)
-    return Calibration(posterior.names, physical, by_laplace, corrected, effective, tail, trusted, failures)
+    return Calibration(posterior.names, physical, by_laplace, corrected, ess, pareto_k, trusted, failures)
 
 
 def rank_by_laplace(gaussian: Laplace, x: FloatArray) -> FloatArray:
@@ -170,4 +170,4 @@ def rank_by_weights(found: Evidence, x: FloatArray, tie: FloatArray) -> FloatArr
     [0, 1] is (m P + u)/(m + 1), with m the effective number of points and uniform numbers u (c,).
     """
     share = found.weights @ (found.density.x < x)
-    return np.asarray((found.effective * share + tie) / (found.effective + 1))
+    return np.asarray((found.ess * share + tie) / (found.ess + 1))

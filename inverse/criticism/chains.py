@@ -35,7 +35,7 @@ import numpy as np
 
 from forward.model import FloatArray, Guess, Reference, SolveError
 from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.weights import effective_number, normalised, tail_shape, trustworthy, worth
+from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy, worth
 from inverse.fields.field_posterior import Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode
@@ -119,12 +119,12 @@ class Chains:
         return self._diagnosed(_arviz().rhat)
 
     @cached_property
-    def effective(self) -> FloatArray:
+    def ess_bulk(self) -> FloatArray:
         """Effective number (k,) of draws, for the bulk."""
         return self._diagnosed(_arviz().ess)
 
     @cached_property
-    def effective_tail(self) -> FloatArray:
+    def ess_tail(self) -> FloatArray:
         """Effective number (k,) of draws, for the quantiles of 5 and 95 %."""
         return self._diagnosed(lambda dataset: _arviz().ess(dataset, method="tail"))
 
@@ -137,20 +137,20 @@ class Chains:
     @property
     def mixed(self) -> bool:
         """Whether all chains say the same, of enough draws."""
-        return bool(self.rhat.max() <= MIXED and self.worth >= INDEPENDENT)
+        return bool(self.rhat.max() <= MIXED and self.ess >= INDEPENDENT)
 
     @property
-    def worth(self) -> float:
+    def ess(self) -> float:
         """Smallest effective number of draws of all quantities, for bulk and tails."""
-        return float(min(self.effective.min(), self.effective_tail.min()))
+        return float(min(self.ess_bulk.min(), self.ess_tail.min()))
 
     @property
     def flat(self) -> FloatArray:
         """All draws (n, k), chain after chain."""
         return self.draws.reshape(-1, self.draws.shape[2])
 
-    def groups(self) -> dict[str, xr.Dataset]:
-        """Return ArviZ's groups: `arviz.InferenceData(**chains.groups())`."""
+    def arviz_groups(self) -> dict[str, xr.Dataset]:
+        """Return ArviZ's groups: `arviz.InferenceData(**chains.arviz_groups())`."""
         import xarray as xr
 
         posterior = {name: (("chain", "draw"), self.draws[:, :, i]) for i, name in enumerate(self.names)}
@@ -404,24 +404,24 @@ class FieldWeights:
         return np.asarray(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
 
     @property
-    def effective(self) -> float:
+    def ess(self) -> float:
         """Effective number of samples."""
-        return effective_number(self.weights)
+        return effective_sample_size(self.weights)
 
     @property
     def share(self) -> float:
         """That, of the number of samples."""
-        return self.effective / len(self.log_weights)
+        return self.ess / len(self.log_weights)
 
     @property
-    def tail(self) -> float:
+    def pareto_k(self) -> float:
         """Shape k̂ of the largest weights; infinite where there are too few to say."""
-        return tail_shape(self.weights)
+        return pareto_shape(self.weights)
 
     @property
     def trusted(self) -> bool:
         """Whether the weights are worth what they say."""
-        return trustworthy(self.tail, self.effective, len(self.log_weights))
+        return trustworthy(self.pareto_k, self.ess, len(self.log_weights))
 
     @property
     def log_evidence(self) -> float:
@@ -492,14 +492,14 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
         return objection
     if found.route == "closed form":
         return Verdict("laplace", found.why)
-    said = worth(found.tail, found.effective, len(found.log_weights))
+    said = worth(found.pareto_k, found.ess, len(found.log_weights))
     if not found.trusted:
         return _by_chains(said, chains)
     w, x = found.weights, found.density.x
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())
     ratio = np.log(np.sqrt(w @ (x - mean) ** 2) / width)
-    chance = 2 / np.sqrt(found.effective)
+    chance = 2 / np.sqrt(found.ess)
     worst = float(np.exp(ratio[np.abs(ratio).argmax()]))
     far = f"means are {shift:.2f} standard deviations from the mode, widths {worst:.2f} of the Gaussian's; {said}"
     if shift <= SHIFT + chance and np.abs(ratio).max() <= WIDTH + chance / np.sqrt(2):
@@ -541,17 +541,17 @@ def verdict_on_field(
         assert chains is not None
         if not chains.mixed or values is None:
             return _by_chains("no weighted samples", chains)
-        return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.worth, _said(chains))
-    said = worth(found.tail, found.effective, len(found.log_weights))
+        return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.ess, _said(chains))
+    said = worth(found.pareto_k, found.ess, len(found.log_weights))
     if not found.trusted:
         return _by_chains(said, chains)
-    return _compared(gaussian, found.mean, found.std, found.effective, said)
+    return _compared(gaussian, found.mean, found.std, found.ess, said)
 
 
-def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, effective: float, worth: str) -> Verdict:
+def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, ess: float, worth: str) -> Verdict:
     """Compare the Gaussian with means and standard deviations (N,) by so many effective samples."""
     # Root mean squares over the vertices, less what as few samples would give by chance.
-    chance = 1 / effective
+    chance = 1 / ess
     shift = np.sqrt(max(float((((mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
     width = float(np.sqrt((std**2).mean() / (gaussian.std**2).mean()))
     far = f"means are {shift:.2f} standard deviations from the mode, widths {width:.2f} of the Gaussian's; {worth}"
@@ -581,4 +581,4 @@ def _by_chains(worth: str, chains: Chains | None) -> Verdict:
 
 
 def _said(chains: Chains) -> str:
-    return f"R̂ up to {chains.rhat.max():.3f}, effective draws from {chains.worth:.0f}"
+    return f"R̂ up to {chains.rhat.max():.3f}, effective draws from {chains.ess:.0f}"

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.weights import effective_number, normalised, tail_shape, trustworthy
+from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.low_dimensional.evidence import Evidence
 from inverse.low_dimensional.laplace import Laplace
@@ -109,7 +109,7 @@ class Criticism:
     Attributes
     ----------
     scores
-        ln p(y_j | other data) (m,), with `tails`, the k̂ (m,) of the weights, and `trusted` (m,), what they are worth.
+        ln p(y_j | other data) (m,), with k̂ (m,) of the weights (`pareto_k`), and whether they can be trusted (m,).
     pointwise
         ln p(y_j | x_i) (n, m) at the points.
     misfit
@@ -119,7 +119,7 @@ class Criticism:
     """
 
     scores: FloatArray
-    tails: FloatArray
+    pareto_k: FloatArray
     trusted: NDArray[np.bool_]
     pointwise: FloatArray
     misfit: float
@@ -142,9 +142,10 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     top = log_ratio.max(axis=0)
     scores = -(top + np.log(np.exp(log_ratio - top).sum(axis=0)))
     left_out = [normalised(column) for column in log_ratio.T]
-    tails = [tail_shape(column) for column in left_out]
+    pareto_k = [pareto_shape(column) for column in left_out]
     trusted = [
-        trustworthy(k, effective_number(column), found.weights.size) for k, column in zip(tails, left_out, strict=True)
+        trustworthy(k, effective_sample_size(column), found.weights.size)
+        for k, column in zip(pareto_k, left_out, strict=True)
     ]
     whole = np.full((found.weights.size, posterior.data.size), -np.inf)
     whole[used] = pointwise
@@ -155,7 +156,7 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     errors = np.random.default_rng(0).standard_normal((DRAWS, m))
     drawn = np.sort(agreement(errors, beside))
     larger = 1 - np.searchsorted(drawn, agreement(r[:, order], beside)) / DRAWS
-    return Criticism(scores, np.array(tails), np.array(trusted), whole, misfit, float(w @ larger))
+    return Criticism(scores, np.array(pareto_k), np.array(trusted), whole, misfit, float(w @ larger))
 
 
 def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
@@ -229,8 +230,8 @@ def comparison(
         "converged": table({pair: a.gaussian.converged for pair, a in stated.items()}),
         "route": table({pair: e.route for pair, e in found.items()}),
         "why": table({pair: e.why for pair, e in found.items()}),
-        "effective": table({pair: e.effective for pair, e in found.items()}),
-        "tail": table({pair: e.tail for pair, e in found.items()}),
+        "effective": table({pair: e.ess for pair, e in found.items()}),
+        "tail": table({pair: e.pareto_k for pair, e in found.items()}),
         "trusted": table({pair: e.trusted for pair, e in found.items()}),
         "misfit_probability": table({pair: c.misfit for pair, c in critics.items()}),
         "correlation_probability": table({pair: c.correlation for pair, c in critics.items()}),
@@ -238,7 +239,7 @@ def comparison(
         "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
         "score_behind": ("model", behind.sum(axis=1)),
         "score_behind_error": ("model", np.sqrt(count) * behind.std(axis=1)),
-        "score_tail": ("model", [max(critics[name, group].tails.max() for group in groups) for name in names]),
+        "score_tail": ("model", [max(critics[name, group].pareto_k.max() for group in groups) for name in names]),
         "score_trusted": ("model", [all(critics[name, group].trusted.all() for group in groups) for name in names]),
     }
     if checks:

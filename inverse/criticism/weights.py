@@ -27,21 +27,21 @@ def normalised(log_weights: FloatArray) -> FloatArray:
     return np.asarray(w / w.sum())
 
 
-def effective_number(weights: FloatArray) -> float:
+def effective_sample_size(weights: FloatArray) -> float:
     """Return the number of points of equal weight that points with weights (n,) of sum 1 are worth."""
     return float(1 / (weights**2).sum())
 
 
-def trustworthy(tail: float, effective: float, count: int) -> bool:
+def trustworthy(pareto_k: float, ess: float, count: int) -> bool:
     """Whether weights of `count` points are worth what they say."""
     # The tail of weights that are all but equal says nothing.
-    return effective >= FEWEST and (tail <= TRUSTED or effective > ALIKE * count)
+    return ess >= FEWEST and (pareto_k <= TRUSTED or ess > ALIKE * count)
 
 
-def worth(tail: float, effective: float, count: int) -> str:
+def worth(pareto_k: float, ess: float, count: int) -> str:
     """Say what weights of `count` points are worth."""
-    shape = "∞" if np.isinf(tail) else f"{tail:.2f}"
-    return f"weights worth {effective:.0f} of {count} points, k̂ = {shape}"
+    shape = "∞" if np.isinf(pareto_k) else f"{pareto_k:.2f}"
+    return f"weights worth {ess:.0f} of {count} points, k̂ = {shape}"
 
 
 def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
@@ -51,7 +51,7 @@ def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
     return np.random.default_rng(seed + 1).permutation(chosen)
 
 
-def tail_shape(weights: FloatArray) -> float:
+def pareto_shape(weights: FloatArray) -> float:
     """Shape k̂ of the generalised Pareto distribution of the largest weights; infinite where they are fewer than 5.
 
     The fit is the empirical Bayes estimate of J. Zhang, M. A. Stephens, Technometrics 51 (2009) 316–325, drawn a little

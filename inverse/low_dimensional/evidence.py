@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 
 from forward.model import FloatArray, SolveError
-from inverse.criticism.weights import TRUSTED, normalised, tail_shape, trustworthy
+from inverse.criticism.weights import TRUSTED, normalised, pareto_shape, trustworthy
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.surrogate import SCRAMBLES, Mixture, fit, sample
@@ -51,9 +51,9 @@ class Evidence:
         ln Z, and its standard error: from the scatter of eight independent replicates.
     route
         How it was found, and `why`.
-    effective
+    ess
         Effective number of points.
-    tail
+    pareto_k
         k̂ of the largest weights; infinite where there are too few points to say.
     density
         The posterior at the points.
@@ -65,15 +65,15 @@ class Evidence:
     error: float
     route: Route
     why: str
-    effective: float
-    tail: float
+    ess: float
+    pareto_k: float
     density: Density
     log_weights: FloatArray
 
     @property
     def trusted(self) -> bool:
         """Whether the estimate is worth what it says."""
-        return self.route == "closed form" or trustworthy(self.tail, self.effective, len(self.log_weights))
+        return self.route == "closed form" or trustworthy(self.pareto_k, self.ess, len(self.log_weights))
 
     @property
     def weights(self) -> FloatArray:
@@ -116,8 +116,8 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     first = _drawn(posterior, mixture, seed, 0, quarter, derivatives=True)
     pilot = weighed(*first, "importance", "")
     misfit = np.abs(_from_gaussian(gaussian, pilot.density))
-    even = pilot.effective / quarter
-    share = f"the first {quarter} points are worth {pilot.effective:.0f}"
+    even = pilot.ess / quarter
+    share = f"the first {quarter} points are worth {pilot.ess:.0f}"
     # Where there is no model there is no likelihood, and so no Gaussian; ∞ is not below ∞ by rounding.
     everywhere = np.isfinite(pilot.density.log_posterior).all()
     if everywhere and (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
@@ -125,7 +125,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         whole = _continued(posterior, mixture, first, seed, quarter)
         why = "the posterior is a Gaussian at every point that was tried"
         return replace(whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why)
-    if even >= EVEN and pilot.tail <= TRUSTED:
+    if even >= EVEN and pilot.pareto_k <= TRUSTED:
         whole = _continued(posterior, mixture, first, seed, quarter)
         return weighed(whole.density, whole.log_weights, "importance", f"{share}: even weights")
     try:
@@ -145,9 +145,9 @@ def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -
     means = w.reshape(SCRAMBLES, -1).mean(axis=1)
     total = float(means.mean())
     error = float(means.std(ddof=1) / np.sqrt(SCRAMBLES) / total)
-    effective = float(w.sum() ** 2 / (w**2).sum())
+    ess = float(w.sum() ** 2 / (w**2).sum())
     log_evidence = float(shift + np.log(total))
-    return Evidence(log_evidence, error, route, why, effective, tail_shape(w), density, log_weights)
+    return Evidence(log_evidence, error, route, why, ess, pareto_shape(w), density, log_weights)
 
 
 def _drawn(
@@ -199,5 +199,5 @@ def _by_surrogate(
     found = weighed(density, density.log_likelihood - log_over, "surrogate", why)
     # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density that is
     # wrong by a factor makes its share of the mixture wrong by that.
-    scatter = max(found.error, np.sqrt(1 / found.effective - 1 / len(density.x)))
+    scatter = max(found.error, np.sqrt(1 / found.ess - 1 / len(density.x)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))

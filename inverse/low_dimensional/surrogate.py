@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
-from inverse.criticism.weights import effective_number, normalised
+from inverse.criticism.weights import effective_sample_size, normalised
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.evaluate import Evaluations, Failure, Request
@@ -261,9 +261,9 @@ class Cloud:
         return normalised(self.log_weights)
 
     @property
-    def effective(self) -> float:
+    def ess(self) -> float:
         """Effective number of points."""
-        return effective_number(self.weights)
+        return effective_sample_size(self.weights)
 
     @property
     def error(self) -> float:
@@ -304,11 +304,11 @@ def sample(surrogate: Posterior, gaussian: Laplace, seed: int) -> Cloud:
     mixture = Mixture.of(gaussian)
     cloud = _cloud(surrogate, mixture, seed, FIRST)
     for k in range(ROUNDS):
-        if cloud.effective > ENOUGH * len(cloud.x):
+        if cloud.ess > ENOUGH * len(cloud.x):
             break
         better = _mixture(surrogate, cloud, seed + k)
         after = _cloud(surrogate, better, seed + 1 + k, FIRST)
-        if k and after.effective < 1.1 * cloud.effective:
+        if k and after.ess < 1.1 * cloud.ess:
             break
         mixture, cloud = better, after
     return _cloud(surrogate, mixture, seed + ROUNDS + 1, LAST)

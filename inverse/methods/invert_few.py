@@ -195,8 +195,8 @@ def _invert(
         "log_evidence": np.array(found.log_evidence),
         "log_evidence_error": np.array(found.error),
         "laplace_log_evidence": np.array(gaussian.log_evidence),
-        "effective": np.array(found.effective),
-        "tail": np.array(found.tail),
+        "effective": np.array(found.ess),
+        "tail": np.array(found.pareto_k),
         "converged": np.array(gaussian.converged),
         "trust": np.array(TRUST.index(verdict.trust)),
         "why": str(verdict),
@@ -218,7 +218,7 @@ def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: In
             return ensemble(posterior, gaussian, seed=method.seed)
         case "pcn":
             # Fewer points than that say little of a covariance.
-            enough = found.effective >= max(FEWEST, 4 * len(gaussian.mode))
+            enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
             return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
         case _:
             assert_never(method.chains)

@@ -248,5 +248,5 @@ def of_chains(chains: Chains | None) -> Record:
     return {
         "chains": np.array(float(len(chains.draws) if chains.mixed else 0)),
         "chain_rhat": np.array(chains.rhat.max()),
-        "chain_effective": np.array(chains.worth),
+        "chain_effective": np.array(chains.ess),
     }

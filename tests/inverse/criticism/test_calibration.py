@@ -98,7 +98,7 @@ def test_ranks_are_the_probabilities_of_what_lies_below():
     found = evidence(posterior, gaussian, 512)
     ranks = [rank_by_weights(found, at, np.array([tie]))[0] for tie in (0.0, 1.0)]
     assert np.mean(ranks) == pytest.approx(expected, abs=0.02)
-    assert ranks[1] - ranks[0] == pytest.approx(1 / (found.effective + 1))
+    assert ranks[1] - ranks[0] == pytest.approx(1 / (found.ess + 1))
     normal = stats.norm(gaussian.mode[0], np.sqrt(gaussian.covariance[0, 0]))
     assert rank_by_laplace(gaussian, at)[0] == pytest.approx(normal.cdf(at[0]))
     assert abs(normal.cdf(at[0]) - expected) > 0.05

@@ -33,11 +33,9 @@ from uq.evaluation.evaluate import SerialEvaluate
 def agrees(chains, mean, std, *, z=4.5):
     """Means and standard deviations within their Monte-Carlo errors."""
     found = chains.flat
-    error = std / np.sqrt(chains.effective)
+    error = std / np.sqrt(chains.ess_bulk)
     assert (np.abs(found.mean(axis=0) - mean) < z * error).all()
-    assert (
-        np.abs(found.std(axis=0) / std - 1) < z / np.sqrt(2 * np.minimum(chains.effective, chains.effective_tail))
-    ).all()
+    assert (np.abs(found.std(axis=0) / std - 1) < z / np.sqrt(2 * np.minimum(chains.ess_bulk, chains.ess_tail))).all()
 
 
 def quick(posterior):
@@ -85,7 +83,7 @@ def test_a_curved_ridge_has_the_moments_of_weighted_points(run):
         assert not chains_of_few(posterior, gaussian, lengths=replace(FEW, chains=8, draws=600)).mixed
     assert found.rhat.max() < 1.06
     got = summary(found.flat)
-    error = expected.std * np.sqrt(1 / found.effective + 1 / points.effective)
+    error = expected.std * np.sqrt(1 / found.ess_bulk + 1 / points.ess)
     assert (np.abs(got.mean - expected.mean) < 4 * error).all()
     np.testing.assert_allclose(got.std, expected.std, rtol=0.15)
 
@@ -94,12 +92,12 @@ def test_the_layout_is_that_of_arviz():
     arviz = pytest.importorskip("arviz")
     posterior = few()
     found = chains_of_few(posterior, laplace(posterior), lengths=replace(FEW, draws=100, burn=50))
-    groups = arviz.InferenceData(**found.groups())
+    groups = arviz.InferenceData(**found.arviz_groups())
     table = arviz.summary(groups, round_to="none")
     assert list(table.index) == ["a", "b", "c"]
     np.testing.assert_allclose(table["r_hat"], found.rhat)
-    np.testing.assert_allclose(table["ess_bulk"], found.effective)
-    np.testing.assert_allclose(table["ess_tail"], found.effective_tail)
+    np.testing.assert_allclose(table["ess_bulk"], found.ess_bulk)
+    np.testing.assert_allclose(table["ess_tail"], found.ess_tail)
     assert groups.sample_stats["lp"].shape == (4, 100)
 
 
@@ -151,14 +149,14 @@ def test_weights_of_linear_models_are_equal_and_their_mean_is_the_evidence():
     mode, exact = solved(problem, cutoff=1e-12)
     found = weigh_field(mode.point, exact, 32)
     np.testing.assert_allclose(found.log_weights, exact.log_evidence, rtol=1e-9)
-    assert found.effective == pytest.approx(32)
+    assert found.ess == pytest.approx(32)
     assert found.trusted
     _, truncated = solved(problem, rank=25)
     found = weigh_field(mode.point, truncated, 1500)
     assert abs(found.log_evidence - exact.log_evidence) < 4 * found.error
     assert 0.01 < found.error < 0.3
     got = summary(found.values, found.weights)
-    error = np.sqrt(np.diag(problem.covariance) / found.effective)
+    error = np.sqrt(np.diag(problem.covariance) / found.ess)
     assert (np.abs(got.mean - problem.mean) < 4.5 * error).all()
 
 
@@ -171,7 +169,7 @@ def test_curved_fields_by_weights_and_by_chains():
     chains = chains_of_field(mode, gaussian, lengths=replace(FIELD, chains=4, draws=600))
     assert chains.rhat.max() < 1.03
     got = summary(chains.flat)
-    error = expected.std * np.sqrt(1 / chains.effective + 1 / weighted.effective)
+    error = expected.std * np.sqrt(1 / chains.ess_bulk + 1 / weighted.ess)
     assert (np.abs(got.mean - expected.mean) < 4.5 * error).all()
     np.testing.assert_allclose(got.std, expected.std, rtol=0.15)
 
@@ -183,7 +181,7 @@ def test_samples_without_an_answer_have_no_weight():
     found = weigh_field(mode, LowRankPosterior.at(mode), 200)
     lost = ~np.isfinite(found.log_weights)
     assert 0 < lost.sum() < 200
-    assert found.effective > 1
+    assert found.ess > 1
     assert bent(mode, LowRankPosterior.at(mode))(np.full((1, 12), 1e3))[1][0] == -np.inf
 
 
@@ -196,7 +194,7 @@ def test_the_strong_directions_follow_the_weak_ones():
     mode = find_mode(posterior, tolerance=1e-8).point
     gaussian = LowRankPosterior.at(mode)
     found = weigh_field(mode, gaussian, 400)
-    assert found.effective > 300
+    assert found.ess > 300
     straight = gaussian.samples(np.random.default_rng(0).standard_normal((400, size)))
     misfits = [(np.exp(m).mean(axis=1) - 1) / 3e-3 for m in (found.values, straight)]
     assert np.abs(misfits[0]).mean() < 3
@@ -235,7 +233,7 @@ def test_verdicts_on_few_parameters():
     found, test = evidence(posterior, gaussian, 256), examine_few(posterior, gaussian)
     lost = verdict_on_few(replace(gaussian, converged=False), found, test)
     assert (lost.trust, lost.why) == ("neither", "the search for the mode did not converge")
-    uneven = replace(found, tail=0.9, effective=30.0)
+    uneven = replace(found, pareto_k=0.9, ess=30.0)
     assert "run chains" in verdict_on_few(gaussian, uneven, test).why
     short = chains_of_few(posterior, gaussian, lengths=replace(FEW, draws=10, burn=5))
     assert "have not mixed" in verdict_on_few(gaussian, uneven, test, short).why

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from forward.materials.admissible import Materials
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.weights import tail_shape
+from inverse.criticism.weights import pareto_shape
 from inverse.low_dimensional.evidence import evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
@@ -99,7 +99,7 @@ def test_wider_priors_by_the_same_points():
         assert error < 0.1
 
 
-def test_tail_shapes_are_those_of_arviz():
+def test_pareto_shapes_are_those_of_arviz():
     """Values of psislw of ArviZ 0.21 for the same weights."""
     for n, k, expected in (
         (1000, 0.3, 0.4814277852303459),
@@ -108,8 +108,8 @@ def test_tail_shapes_are_those_of_arviz():
         (128, -0.2, -0.14748732811851475),
     ):
         u = np.random.default_rng([n]).random(n)
-        assert tail_shape(((1 - u) ** -k - 1) / k + 0.1) == pytest.approx(expected, abs=1e-10)
-    assert tail_shape(np.ones(20)) == np.inf
+        assert pareto_shape(((1 - u) ** -k - 1) / k + 0.1) == pytest.approx(expected, abs=1e-10)
+    assert pareto_shape(np.ones(20)) == np.inf
 
 
 def test_where_there_is_no_answer():
