@@ -1,5 +1,7 @@
 """Bodies meshed by other programs: gmsh's .msh, XDMF, VTK and VTU files with named boundaries and regions.
 
+Meshes that are refined here are files of NumPy's (.npz), written by `forward.bodies.tetrahedra`.
+
 A study keeps, beside the name of the file, what it needs to know of it (`Contents`), so that results can be read where
 the file is not; a hash says whether it is the same file.
 
@@ -39,6 +41,7 @@ FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
+BOUNDARY = "boundary "  # before the name of a boundary, in a mesh of our own
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
 _MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write
@@ -354,10 +357,13 @@ def _digest(file: str) -> str:
 @lru_cache(maxsize=1)
 def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...], tags: str | None) -> Loaded:
     """Read a file of known hash."""
-    import meshio
 
     def refuse(problem: str) -> NoReturn:
         raise ModelError(one_line(f"file: {file}: {problem}"))
+
+    if file.endswith(".npz"):
+        return _of_ours(file, unit, refuse)
+    import meshio
 
     printed = StringIO()
     try:
@@ -405,6 +411,25 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     present = np.unique(region_numbers)
     regions = tuple(words.get((3, int(n)), ALL if len(present) == 1 and not n else f"{n}") for n in present)
     return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers))
+
+
+def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
+    """Read a mesh that was refined here."""
+    try:
+        with np.load(file) as arrays:
+            points, cells, region = unit * arrays["points"], arrays["cells"], arrays["region"]
+            regions = tuple(map(str, arrays["regions"]))
+            boundaries = {
+                name.removeprefix(BOUNDARY): arrays[name] for name in arrays.files if name.startswith(BOUNDARY)
+            }
+            _check_geometry(points, cells, "tetrahedron", refuse)
+    except ModelError:
+        raise
+    except Exception as error:  # a file may be anything
+        if out_of_memory(error):
+            raise
+        refuse(f"cannot be read as a mesh: {(str(error).splitlines() or [type(error).__name__])[0]}")
+    return Loaded(points, cells, "tetrahedron", boundaries, regions, region)
 
 
 def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]:

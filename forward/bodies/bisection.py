@@ -1,0 +1,184 @@
+"""Local refinement of tetrahedra by bisection, on arrays alone: the same on any number of ranks and with any library.
+
+D. N. Arnold, A. Mukherjee, L. Pouly, Locally adapted tetrahedral meshes using bisection, SIAM J. Sci. Comput. 22 (2000)
+431–448. Every face has a marked edge, the same for both of its cells, and one of them is the edge at which its cell is
+cut next. Meshes conform, closing them ends, and the descendants of a cell have at most 72 shapes, however often they are
+divided: angles stay away from 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies.mesh_file import IntArray, Loaded
+from forward.model import FloatArray, ModelError
+
+BoolArray = NDArray[np.bool_]
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # each is opposite the vertex of its row
+# What stands in `marks` for a face (a, 2, 3), where a is 0 or 1: its marked edge is (2, 3), (a, 2) or (a, 3).
+OPPOSITE, TO_THIRD, TO_FOURTH = 0, 1, 2
+# Vertices of a half, of those of its parent that it keeps (a, 2, 3), by the mark of that face: its own marked edge first.
+_ORDER = np.array([[1, 2, 0], [0, 1, 2], [0, 2, 1]])
+_SHIFT = 32  # bits of a vertex in the key of an edge
+
+
+@dataclass(frozen=True, eq=False)
+class Bisected:
+    """Tetrahedra that can be bisected.
+
+    Attributes
+    ----------
+    points
+        Vertices (n, 3).
+    cells
+        Vertices (c, 4) of each cell; its next cut is between the first two.
+    marks
+        Marked edges (c, 2) of the faces opposite the first and the second vertex; those of the others are the cut.
+    flags
+        Whether each cell (c,), if all of its marked edges lie in one face, has a parent that was so too.
+    labels
+        For each cell (c, 4) the label of the face opposite each vertex, 0 for none.
+    groups
+        Which labels belong to each boundary, by its name.
+    regions, region
+        Names of the regions, and the number of each cell's (c,).
+    origin
+        The cell (c,) that each one was in, before the mesh was last refined.
+    """
+
+    points: FloatArray
+    cells: IntArray
+    marks: NDArray[np.int8]
+    flags: BoolArray
+    labels: IntArray
+    groups: dict[str, IntArray]
+    regions: tuple[str, ...]
+    region: IntArray
+    origin: IntArray
+
+    @classmethod
+    def of(cls, mesh: Loaded) -> Bisected:
+        """Mark the longest edge of each face and of each cell, of equal ones that with the lowest vertices.
+
+        Raises
+        ------
+        ModelError
+            If the cells are no tetrahedra.
+        """
+        if mesh.cell != "tetrahedron":
+            message = "hexahedra cannot be refined locally, expected tetrahedra"
+            raise ModelError(message)
+        rank = _rank_of_edges(mesh.points, mesh.cells)
+        longest = rank.argmax(axis=1)
+        ends = EDGES[longest]
+        others = np.array([[k for k in range(4) if k not in edge] for edge in EDGES.tolist()])[longest]
+        order = np.hstack([ends, others])
+        cells = np.take_along_axis(mesh.cells, order, axis=1)
+        rank = _rank_of_edges(mesh.points, cells)
+        # Edges of the faces (1, 2, 3) and (0, 2, 3), in the order of the marks.
+        marks = np.stack([rank[:, [5, 3, 4]].argmax(axis=1), rank[:, [5, 1, 2]].argmax(axis=1)], axis=1)
+        labels, groups = _labelled(mesh.boundaries, cells)
+        return cls(
+            mesh.points,
+            cells,
+            marks.astype(np.int8),
+            np.zeros(len(cells), dtype=bool),
+            labels,
+            groups,
+            mesh.regions,
+            mesh.region,
+            np.arange(len(cells)),
+        )
+
+    def loaded(self) -> Loaded:
+        """Return the mesh, with the facets of its boundaries."""
+        faces = self.cells[:, FACES]
+        boundaries = {name: faces[np.isin(self.labels, numbers)] for name, numbers in self.groups.items()}
+        return Loaded(self.points, self.cells, "tetrahedron", boundaries, self.regions, self.region)
+
+    def refined(self, chosen: IntArray, times: int = 1) -> Bisected:
+        """Bisect the chosen cells (k,) so many times, and others as far as that cuts their edges."""
+        mesh = replace(self, origin=np.arange(len(self.cells)))
+        for _ in range(times):
+            mesh = mesh._closed(np.isin(mesh.origin, chosen))
+        return mesh
+
+    def _closed(self, cut: BoolArray) -> Bisected:
+        """Bisect cells, and others for as long as an edge that was cut is whole in some cell."""
+        mesh = self
+        split: IntArray = np.zeros(0, dtype=np.int64)  # keys of the edges that were cut, sorted
+        middles: IntArray = np.zeros(0, dtype=np.int64)  # the vertices in their middles
+        while cut.any():
+            new = np.setdiff1d(np.unique(_keys(mesh.cells[cut][:, :2])), split)
+            added = len(mesh.points) + np.arange(len(new))
+            places = (mesh.points[new >> _SHIFT] + mesh.points[new & (1 << _SHIFT) - 1]) / 2
+            order = np.argsort(np.concatenate([split, new]))
+            split, middles = np.concatenate([split, new])[order], np.concatenate([middles, added])[order]
+            middle = middles[np.searchsorted(split, _keys(mesh.cells[cut][:, :2]))]
+            mesh = replace(mesh, points=np.concatenate([mesh.points, places]))._halved(cut, middle)
+            cut = np.isin(_keys(mesh.cells[:, EDGES]), split).any(axis=1)
+        return mesh
+
+    def _halved(self, cut: BoolArray, middle: IntArray) -> Bisected:
+        """Put the halves of the cells to be cut, each at its middle (k,), behind the cells that stay."""
+        cells, marks, labels = self.cells[cut], self.marks[cut], self.labels[cut]
+        planar = (marks[:, 0] == marks[:, 1]) & (marks[:, 0] != OPPOSITE)
+        again = planar & self.flags[cut]
+        found_cells, found_marks, found_labels = [self.cells[~cut]], [self.marks[~cut]], [self.labels[~cut]]
+        for kept, left in ((0, 1), (1, 0)):
+            inherited = marks[:, left]  # the mark of the face without the vertex that is left
+            own = np.array([kept, 2, 3])[_ORDER[inherited]]
+            found_cells.append(np.column_stack([np.take_along_axis(cells, own, axis=1), middle]))
+            # The marked edge of every face at the middle is opposite it, but for that between the halves of a cell
+            # that was planar for the second time: there it goes from the middle to the cut that comes next.
+            of_first = np.where(again, TO_FOURTH, TO_THIRD)
+            found_marks.append(np.stack([of_first, np.full(len(cells), TO_THIRD)], axis=1).astype(np.int8))
+            inner = labels.copy()
+            inner[:, kept] = 0  # between the halves
+            found_labels.append(np.column_stack([np.take_along_axis(inner, own, axis=1), labels[:, left]]))
+        return replace(
+            self,
+            cells=np.concatenate(found_cells),
+            marks=np.concatenate(found_marks),
+            labels=np.concatenate(found_labels),
+            flags=np.concatenate([self.flags[~cut], *[planar & ~self.flags[cut]] * 2]),
+            region=np.concatenate([self.region[~cut], *[self.region[cut]] * 2]),
+            origin=np.concatenate([self.origin[~cut], *[self.origin[cut]] * 2]),
+        )
+
+
+def _keys(edges: IntArray) -> IntArray:
+    """One number for each edge (..., 2)."""
+    low, high = edges.min(axis=-1), edges.max(axis=-1)
+    return np.asarray((low << _SHIFT) | high)
+
+
+def _rank_of_edges(points: FloatArray, cells: IntArray) -> IntArray:
+    """Rank the edges (c, 6) of cells by length, rounded so that equal ones are, and then by their vertices."""
+    keys, which = np.unique(_keys(cells[:, EDGES]), return_inverse=True)
+    lengths = np.linalg.norm(points[keys >> _SHIFT] - points[keys & (1 << _SHIFT) - 1], axis=1)
+    rounded = np.round(lengths / (1e-9 * lengths.max()))
+    rank = np.empty(len(keys), dtype=np.int64)
+    rank[np.lexsort([-keys, rounded])] = np.arange(len(keys))
+    return rank[which.reshape(len(cells), 6)]
+
+
+def _labelled(boundaries: dict[str, IntArray], cells: IntArray) -> tuple[IntArray, dict[str, IntArray]]:
+    """Label the faces (c, 4) of cells by the boundaries that they are on together; return the labels of each too."""
+    faces = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
+    sizes = [len(facets) for facets in boundaries.values()]
+    facets = np.sort(np.concatenate([np.zeros((0, 3), dtype=np.int64), *boundaries.values()]), axis=1)
+    unique, which = np.unique(np.concatenate([faces, facets]), axis=0, return_inverse=True)
+    which = which.ravel()
+    member = np.zeros((len(unique), len(boundaries)), dtype=bool)
+    member[which[len(faces) :], np.repeat(np.arange(len(sizes)), sizes)] = True
+    rows, label = np.unique(member, axis=0, return_inverse=True)  # the first has no boundary: inside, or unnamed
+    label = label.ravel()
+    if rows[0].any():
+        rows, label = np.concatenate([np.zeros((1, len(sizes)), dtype=bool), rows]), label + 1
+    groups = {name: np.flatnonzero(rows[:, k]) for k, name in enumerate(boundaries)}
+    return label[which[: len(faces)]].reshape(-1, 4), groups
