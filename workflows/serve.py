@@ -167,7 +167,7 @@ class Service:
             return refined.solved_to(options["tolerance"]) if "tolerance" in options else refined
         except ValidationError as error:
             message = f"config: {error.errors()[0]['msg']}"
-        except ModelError as error:  # a mesh from a file has no finer ones
+        except ModelError as error:  # hexahedra of a file have no finer meshes
             message = f"config.level: {error}"
         raise RefusalError("InvalidInput", message)
 

@@ -2,8 +2,8 @@
 
 D. N. Arnold, A. Mukherjee, L. Pouly, Locally adapted tetrahedral meshes using bisection, SIAM J. Sci. Comput. 22 (2000)
 431–448. Every face has a marked edge, the same for both of its cells, and one of them is the edge at which its cell is
-cut next. Meshes conform, closing them ends, and the descendants of a cell have at most 72 shapes, however often they are
-divided: angles stay away from 0.
+cut next. Meshes conform, closing them ends, and the descendants of a cell have at most 72 shapes, however often they
+are divided: angles stay away from 0.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # each is opposite the vertex of its row
 # What stands in `marks` for a face (a, 2, 3), where a is 0 or 1: its marked edge is (2, 3), (a, 2) or (a, 3).
 OPPOSITE, TO_THIRD, TO_FOURTH = 0, 1, 2
-# Vertices of a half, of those of its parent that it keeps (a, 2, 3), by the mark of that face: its own marked edge first.
+# Of the vertices of its parent (a, 2, 3) that a half keeps, the order, by the mark of that face: the next cut is first.
 _ORDER = np.array([[1, 2, 0], [0, 1, 2], [0, 2, 1]])
 _SHIFT = 32  # bits of a vertex in the key of an edge
 
@@ -164,7 +164,7 @@ def _rank_of_edges(points: FloatArray, cells: IntArray) -> IntArray:
     rounded = np.round(lengths / (1e-9 * lengths.max()))
     rank = np.empty(len(keys), dtype=np.int64)
     rank[np.lexsort([-keys, rounded])] = np.arange(len(keys))
-    return rank[which.reshape(len(cells), 6)]
+    return np.asarray(rank[which.reshape(len(cells), 6)])
 
 
 def _labelled(boundaries: dict[str, IntArray], cells: IntArray) -> tuple[IntArray, dict[str, IntArray]]:

@@ -38,6 +38,8 @@ Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
 LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
 FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
+MOST_LEVELS = 6  # 262 144 cells for each of the file
+MOST_NODES = 20_000_000
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
@@ -112,7 +114,7 @@ class Contents(Settings):
     bounds
         Smallest and largest coordinate (m) along each axis.
     longest_edge
-        Of all cells (m).
+        Of all cells (m); of those that a study divides, what it is at most.
     boundaries
         Names of the boundaries, each with up to four points (m) that span it.
     areas
@@ -155,8 +157,11 @@ class MeshFile(Settings):
         Names for numbers of boundaries and regions: ``{ vessel = 3 }``.
     tags
         Name of the array with the numbers, where it is not a usual one and not the only one.
+    levels
+        Divide every tetrahedron into eight so many times. Faces that are plane in the file stay so: of a curved body
+        this is no finer surface.
     divide
-        Divide every tetrahedron into eight, with thinner ones at these boundaries (``[]``: equally everywhere).
+        Then divide every tetrahedron into eight, with thinner ones at these boundaries (``[]``: equally everywhere).
     contents
         What the file holds; it need not be given.
     """
@@ -168,6 +173,7 @@ class MeshFile(Settings):
     quadrature_degree: Annotated[int, Field(ge=1, le=12)] | None = None
     names: dict[Annotated[str, Field(pattern=r"^[^.\s]+$")], int] = Field(default={})
     tags: str | None = None
+    levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0
     divide: tuple[str, ...] | None = None
     contents: Contents | None = None
 
@@ -179,6 +185,9 @@ class MeshFile(Settings):
         needed = lowest[self.cell, self.degree]
         if self.quadrature < needed:
             message = f"quadrature_degree = {self.quadrature} leaves deformations without energy, expected {needed}"
+            raise ValueError(message)
+        if self.nodes > MOST_NODES:
+            message = f"{self.cell_count:,} cells have {3 * self.nodes:,} unknowns, expected at most {3 * MOST_NODES:,}"
             raise ValueError(message)
         return self
 
@@ -195,6 +204,8 @@ class MeshFile(Settings):
             message = f"model.body.file: {self.file} is not the file that the study was made for: it has changed"
             raise ModelError(message)
         loaded = _load(self.file, digest, self.unit, tuple(self.names.items()), self.tags)
+        for _ in range(self.levels):
+            loaded = divided(loaded, ())
         return loaded if self.divide is None else divided(loaded, self.divide)
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
@@ -333,11 +344,26 @@ class MeshFile(Settings):
         return list(self.found.boundaries[boundary])
 
     def refined(self, level: int) -> Self:
-        """Return the body itself for level 0; there are no finer meshes of it."""
-        if level:
-            message = "a mesh from a file has no finer ones, expected a body of kind 'box' or 'block'"
+        """Return the same body with every tetrahedron divided into eight `level` times, when it is meshed.
+
+        Raises
+        ------
+        ModelError
+            If it has hexahedra, or is divided towards boundaries.
+        ValidationError
+            If the mesh is too large.
+        """
+        if not level:
+            return self
+        if self.cell != "tetrahedron" or self.divide is not None:
+            reason = "hexahedra of a file are not divided" if self.divide is None else "its mesh is divided already"
+            message = f"{reason}: expected tetrahedra, or a body of kind 'box' or 'block'"
             raise ModelError(message)
-        return self
+        found = self.found
+        for _ in range(level):
+            found = _divided_contents(found)
+        blocks = self.model_dump() | {"levels": self.levels + level, "contents": found}
+        return self.model_validate(blocks)
 
 
 def _digest(file: str) -> str:
@@ -575,7 +601,9 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
 
     Edges that leave these boundaries are divided at a quarter, nearer to the boundary, others in the middle (graded
     meshes for singularities: H. Li, A. Mazzucato, V. Nistor, Electron. Trans. Numer. Anal. 37 (2010) 41–69). The
-    octahedron inside is cut along the diagonal that leaves its smallest part largest.
+    octahedron inside is cut along the diagonal that leaves its smallest part largest; of equal ones, as all are where
+    edges are divided in the middle, along the shortest (as J. Bey, Tetrahedral grid refinement, Computing 55 (1995)
+    355–378, keeps the shapes of cells).
 
     Raises
     ------
@@ -610,19 +638,39 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
     inner = np.array(cuts)  # (3, n, 4, 4)
     at = points[inner]
     volumes = np.abs(np.linalg.det(at[..., 1:, :] - at[..., :1, :])).min(axis=2)
-    best = inner[volumes.argmax(axis=0), np.arange(len(mesh.cells))]
+    lengths = np.linalg.norm(at[:, :, 0, 1] - at[:, :, 0, 0], axis=-1)
+    rounded = np.round(lengths / (CLOSE * lengths.max()))  # equal ones are, whatever rounding does to them
+    largest = volumes >= (1 - 1e-9) * volumes.max(axis=0)
+    best = inner[np.where(largest, rounded, np.inf).argmin(axis=0), np.arange(len(mesh.cells))]
     cells = np.concatenate([np.stack([np.stack(corner, axis=1) for corner in corners], axis=1), best], axis=1)
-    numbers = {(int(i), int(j)): len(mesh.points) + k for k, (i, j) in enumerate(ends)}
+    keys = ends[:, 0] << 32 | ends[:, 1]
 
     def quartered(facets: IntArray) -> IntArray:
-        found = []
-        for i, j, k in facets.tolist():
-            ij, jk, ik = (numbers[min(a, b), max(a, b)] for a, b in ((i, j), (j, k), (i, k)))
-            found += [(i, ij, ik), (j, ij, jk), (k, ik, jk), (ij, jk, ik)]
-        return np.array(found, dtype=np.int64)
+        pairs = np.sort(facets[:, [[0, 1], [1, 2], [0, 2]]], axis=2)
+        ij, jk, ik = (len(mesh.points) + np.searchsorted(keys, pairs[..., 0] << 32 | pairs[..., 1])).T
+        i, j, k = facets.T
+        parts = [(i, ij, ik), (j, ij, jk), (k, ik, jk), (ij, jk, ik)]
+        return np.asarray(np.stack([np.stack(part, axis=1) for part in parts], axis=1).reshape(-1, 3))
 
     boundaries = {name: quartered(facets) for name, facets in mesh.boundaries.items()}
     return Loaded(points, cells.reshape(-1, 4), mesh.cell, boundaries, mesh.regions, np.repeat(mesh.region, 8))
+
+
+def _divided_contents(found: Contents) -> Contents:
+    """Say what a mesh holds whose tetrahedra are divided into eight.
+
+    Every edge is halved, a face has three new ones and a cell one: the shortest of the three that join the middles of
+    opposite edges, the squares of which are a quarter of the sum of those of the six edges.
+    """
+    return found.model_copy(
+        update={
+            "vertices": found.vertices + found.edges,
+            "edges": 2 * found.edges + 3 * found.faces + found.cells,
+            "faces": 4 * found.faces + 8 * found.cells,
+            "cells": 8 * found.cells,
+            "longest_edge": found.longest_edge / 2**0.5,
+        }
+    )
 
 
 def contents(mesh: Loaded, digest: str) -> Contents:

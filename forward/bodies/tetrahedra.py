@@ -18,9 +18,8 @@ from forward.model import FloatArray
 def tetrahedra(body: Body) -> tuple[Loaded, Callable[[FloatArray], FloatArray]]:
     """Return the mesh of a body, and the map of its points (n, 3) into the body.
 
-    Boxes and blocks are meshed as in `forward.fem.dolfinx.meshes`: six tetrahedra around a diagonal of each cell, in the
-    box with equal cells, which `place` maps into the body. So what is put between vertices later follows faces that are
-    not plane.
+    Boxes and blocks have six tetrahedra around a diagonal of each cell, as DOLFINx makes them, in the box with equal
+    cells, which `place` maps into the body. So what is put between vertices later follows faces that are not plane.
     """
     if isinstance(body, MeshFile):
         return body.load(), lambda points: points

@@ -6,7 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
-from forward.bodies.mesh_file import MeshFile, divided
+from forward.bodies.mesh_file import MeshFile, contents, divided
 from forward.fem.finer import FinerMesh, finer
 from forward.model import ModelError
 from forward.specimen import Specimen
@@ -84,6 +84,36 @@ def test_tetrahedra_are_divided_into_eight(tmp_path):
     meshio.write(tmp_path / "hexahedra.vtu", numbered(box("hexahedron")))
     with pytest.raises(ModelError, match="hexahedra of a file are not divided"):
         MeshFile(file=str(tmp_path / "hexahedra.vtu")).finer(1.5, (), 8.0, 4.0)
+
+
+def quality(mesh):
+    """Volume over the cube of the longest edge of each cell."""
+    at = mesh.points[mesh.cells]
+    edges = [np.linalg.norm(at[:, i] - at[:, j], axis=1) for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))]
+    return volume(mesh) / np.max(edges, axis=0) ** 3
+
+
+def test_finer_meshes_of_a_file(tmp_path):
+    meshio.write(tmp_path / "box.msh", box("tetra"), file_format="gmsh22", binary=False)
+    body = MeshFile(file=str(tmp_path / "box.msh"))
+    assert body.refined(0) is body
+    fine = body.refined(1).refined(2)
+    assert fine == body.refined(3)
+    mesh, made = fine.load(), contents(fine.load(), fine.found.digest)
+    # What is said before anything is divided is so.
+    assert fine.found.model_dump(exclude={"longest_edge", "boundaries", "areas", "regions"}) == made.model_dump(
+        exclude={"longest_edge", "boundaries", "areas", "regions"}
+    )
+    assert body.longest_edge / 8 <= made.longest_edge <= fine.longest_edge
+    assert made.areas == pytest.approx(body.found.areas)
+    assert made.regions == pytest.approx(body.found.regions)
+    assert made.cells == 512 * body.cell_count
+    assert quality(mesh).min() > quality(body.load()).min() / 2
+    assert MeshFile.model_validate(fine.model_dump()) == fine
+    with pytest.raises(ValidationError, match="less than or equal to 6"):
+        body.refined(7)
+    with pytest.raises(ModelError, match="its mesh is divided already"):
+        body.finer(1.5, (), 8.0, 4.0).refined(1)
 
 
 CUBE = {
