@@ -112,7 +112,9 @@ def _parser() -> argparse.ArgumentParser:
             help="change one value, such as method.samples=512",
         )
     run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
-    run.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    run.add_argument(
+        "--quiet", action="store_true", help="print nothing but errors and, off the terminal, progress once a minute"
+    )
     run.add_argument("--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it")
     serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
     serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 takes requests of other machines too")

@@ -365,11 +365,14 @@ class Client:
         data = None if question is None else json.dumps({"name": self._model} | question).encode()
         request = Request(f"{self._url}/{what}", data, {"Content-Type": "application/json"})
         try:
-            with urlopen(request, timeout=timeout) as answer:
-                return json.loads(answer.read())
-        except HTTPError as error:
-            self._refuse(what, error.code, error.read())
-        except TimeoutError:
+            # The time of urlopen is that of silence: a server that goes on sending may take for ever.
+            with time_limit(timeout):
+                try:
+                    with urlopen(request, timeout=timeout) as answer:
+                        return json.loads(answer.read())
+                except HTTPError as error:
+                    self._refuse(what, error.code, error.read())
+        except (TimeoutError, TimeLimitError):
             self._refuse_slowness(what, timeout)
         except URLError as error:
             if isinstance(error.reason, TimeoutError):

@@ -45,12 +45,12 @@ def run(
     from mpi4py import MPI
 
     if directory is not None:
-        into(study, Path(directory).name, Path(directory), quiet=quiet, report=report)
+        into(study, Path(directory).name, Path(directory), quiet=quiet, silent=quiet, report=report)
         return _on_first_rank(Path(directory))
     world = MPI.COMM_WORLD
     with tempfile.TemporaryDirectory(prefix="tissuq-") as own:
         scratch = Path(world.bcast(own)) / "study"
-        into(study, "study", scratch, quiet=quiet, report=False)
+        into(study, "study", scratch, quiet=quiet, silent=quiet, report=False)
         found = _on_first_rank(scratch)
         world.barrier()  # the folder of the first rank goes with it
     return found

@@ -16,13 +16,15 @@ class Progress:
     planned
         Number of solves expected; it grows when a method asks for more.
     quiet
-        Show nothing.
+        Show nothing but a line a minute, and not even that on a terminal.
+    silent
+        Show nothing at all.
     failures
         Whether solves without an answer are failures, which are shown; where data are explained they may be parameters
         that explain nothing.
     """
 
-    def __init__(self, planned: int, *, quiet: bool = False, failures: bool = True) -> None:
+    def __init__(self, planned: int, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
         self.done = 0
         self.failed = 0
         self._planned = planned
@@ -30,8 +32,10 @@ class Progress:
         self._begin = time.monotonic()
         self._shown, self._before = self._begin, 0  # when the last line was printed, and what was done by then
         self._bar = None
-        self._quiet = quiet
-        if not quiet and sys.stderr.isatty():
+        terminal = sys.stderr.isatty()
+        self._quiet = quiet or silent
+        self._lines = not silent and not terminal
+        if terminal and not self._quiet:
             from tqdm import tqdm
 
             self._bar = tqdm(total=planned, unit="solve", smoothing=0.05, dynamic_ncols=True)
@@ -40,13 +44,11 @@ class Progress:
         """Count solves that were finished, and how many of them failed."""
         self.done += done
         self.failed += failed if self._failures else 0
-        if self._quiet:
-            return
         if self._bar is not None:
             self._bar.update(done)
             if self.failed:
                 self._bar.set_postfix(failed=self.failed)
-        elif time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
+        elif self._lines and time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
             self._print_line(self._shown, self._before)
             self._shown, self._before = time.monotonic(), self.done
 

@@ -45,7 +45,9 @@ if TYPE_CHECKING:
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
-def run(study: StudyKind, name: str, directory: Path, *, quiet: bool = False, report: bool = True) -> int:
+def run(
+    study: StudyKind, name: str, directory: Path, *, quiet: bool = False, silent: bool = False, report: bool = True
+) -> int:
     """Run a study, or continue it, and leave its results in a directory; collective over all ranks of the job.
 
     Parameters
@@ -57,7 +59,9 @@ def run(study: StudyKind, name: str, directory: Path, *, quiet: bool = False, re
     directory
         Where results go; made if it does not exist.
     quiet
-        Print nothing but errors.
+        Print nothing but errors and, off the terminal, a line of progress a minute.
+    silent
+        Not even that line.
     report
         Whether report.html is written.
 
@@ -83,7 +87,7 @@ def run(study: StudyKind, name: str, directory: Path, *, quiet: bool = False, re
     Where it fails before anything is solved, the directory is left as it was.
     """
     try:
-        return _run(study, name, directory, quiet=quiet, report=report)
+        return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report)
     except Exception as error:
         if isinstance(error, StopError) or not out_of_memory(error):
             raise
@@ -91,7 +95,7 @@ def run(study: StudyKind, name: str, directory: Path, *, quiet: bool = False, re
         raise StopError(reason) from error
 
 
-def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, report: bool) -> int:
+def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: bool, report: bool) -> int:
     from mpi4py import MPI
 
     world = MPI.COMM_WORLD
@@ -111,7 +115,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, report: b
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
-    progress = Progress(study.solves, quiet=quiet or world.rank > 0, failures=not study.explains)
+    progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
     checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
     try:
         job = ensemble.together(lambda: study.job(ensemble, name, directory, checkpoint))

@@ -7,7 +7,10 @@ import resource
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
 
 import pytest
 
@@ -161,6 +164,81 @@ def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
     assert 0 < summary["failed"] < 20
     assert {one["reason"] for one in summary["failures"]} == {"endless.value took longer than solve_seconds = 0.1"}
     assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
+
+
+class Hanging(BaseHTTPRequestHandler):
+    """A server of the UM-Bridge protocol that never ends its answers beyond 0.7: it is silent, or goes on sending."""
+
+    trickles = False
+
+    def do_GET(self):
+        self.send({"protocolVersion": 1.0, "models": ["forward"]})
+
+    def do_POST(self):
+        asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        if "input" in asked:
+            ((value,),) = asked["input"]
+            if value > 0.7:
+                self.hang()
+            else:
+                self.send({"output": [[value, value**2]]})
+        else:
+            self.send({"inputSizes": [1], "outputSizes": [2], "support": {"Evaluate": True}})
+
+    def send(self, answer):
+        body = json.dumps(answer).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def hang(self):
+        end = time.monotonic() + 20
+        with suppress(OSError):  # once the client has left
+            if self.trickles:
+                self.send_response(200)
+                self.end_headers()
+            while time.monotonic() < end:
+                time.sleep(0.02)
+                if self.trickles:
+                    self.wfile.write(b" ")
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+@pytest.mark.parametrize("trickles", [False, True])
+def test_a_server_that_never_ends_is_a_failed_solve(study, tmp_path, monkeypatch, ranks, trickles):
+    monkeypatch.setattr(Hanging, "trickles", trickles)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hanging) as server:
+        server.daemon_threads = True
+        Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        there = STUDY.replace('"python"', '"um-bridge"').replace('function = "endless.value"', f'url = "{url}"')
+        study.write_text(there)
+        limited = ("--set", "model.solve_seconds=0.2", "--set", "method.samples=20")
+        done = tissuq("run", study, "--out", tmp_path / "out", *limited, ranks=ranks)
+        server.shutdown()
+    assert done.returncode == 3, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert 0 < summary["failed"] < 20
+    assert {one["reason"] for one in summary["failures"]} == {f"{url} took longer than solve_seconds = 0.2"}
+    assert all(one["parameters"]["a"] > 0.7 for one in summary["failures"])
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
+    """No solve is so fast; the ranks that share a model agree."""
+    limited = ("--set", "model.solver.solve_seconds=1e-9", "--set", "method.kind=monte-carlo")
+    few = ("--set", "method.samples=6", "--set", f"parallel.ranks_per_model={ranks or 1}")
+    done = tissuq("run", "configs/tiny.toml", "--out", tmp_path / "out", *limited, *few, ranks=ranks)
+    assert done.returncode == 1, done.stderr
+    (reason,) = reasons(done)
+    assert "the solve took longer than solve_seconds = 1e-09" in reason
 
 
 @pytest.mark.mpi

@@ -1,0 +1,91 @@
+"""Progress: what is shown on a terminal and off it, quiet or not, as a clock goes on."""
+
+import re
+import sys
+
+import pytest
+
+from tests.launch import run_script
+from workflows.run import progress
+from workflows.run.progress import Progress
+
+MODEL = """
+import time
+
+def value(p):
+    time.sleep(0.02)
+    return [p[0]]
+"""
+STUDY = """
+model = { kind = "python", function = "waiting.value", parameters = { a = 0.5 }, outputs = ["y"] }
+parameters = { a = { kind = "uniform", lower = 0.0, upper = 1.0 } }
+method = { kind = "monte-carlo", samples = 100, seed = 1 }
+"""
+# A minute in a fifth of a second.
+HASTE = """
+import sys
+from workflows.run import progress
+from workflows.__main__ import main
+
+progress.SECONDS_BETWEEN_LINES = 0.2
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+class Clock:
+    """Seconds that go on when they are told to."""
+
+    now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    found = Clock()
+    monkeypatch.setattr(progress, "time", found)
+    return found
+
+
+def lines(capsys, clock, **settings):
+    """What a study of 100 solves shows that takes 3 s for each and fails once."""
+    shown = Progress(100, **settings)
+    for number in range(100):
+        clock.now += 3.0
+        shown(1, int(number == 50))
+    shown.close()
+    return capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.unit
+def test_a_line_a_minute_off_the_terminal(capsys, clock):
+    minutes = lines(capsys, clock)
+    assert minutes[0] == "20/100 solves, 0.333 per second, 4:00 left"
+    assert [line.split("/")[0] for line in minutes] == ["20", "40", "60", "80", "100", "100"]
+    assert minutes[-1] == "100/100 solves, 0.333 per second, 0:00 left, 1 failed"
+
+
+@pytest.mark.unit
+def test_quiet_runs_still_show_life(capsys, clock):
+    assert lines(capsys, clock, quiet=True) == lines(capsys, clock)[:-1]
+    assert lines(capsys, clock, silent=True) == []
+
+
+@pytest.mark.unit
+def test_quiet_runs_show_nothing_on_a_terminal(capsys, clock, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert lines(capsys, clock, quiet=True) == []
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("ranks", [None, 2])
+def test_the_command_shows_life_though_quiet(tmp_path, ranks):
+    """By the first rank, of the solves of all."""
+    (tmp_path / "waiting.py").write_text(MODEL)
+    (tmp_path / "study.toml").write_text(STUDY)
+    done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet")
+    assert (done.returncode, done.stdout) == (0, "")
+    counts = [re.fullmatch(r"(\d+)/10\d solves, .* per second, .* left", line) for line in done.stderr.splitlines()]
+    assert len(counts) >= 2
+    assert all(counts), done.stderr
