@@ -21,7 +21,7 @@ STATE = "state"
 
 FAULT = 1e-5  # relative error of a tangent that is not tolerated
 EXACT = 1e-10  # what linear algebra must fulfil
-ABOVE_NOISE = 100  # a remainder that is this much larger than the noise has an order
+ABOVE_ROUNDING = 100  # how much larger than rounding a remainder is that has an order
 WINDOW = 3  # steps from which the error of a tangent is extrapolated
 
 
@@ -39,10 +39,10 @@ class Conformance:
         Names of the k directions.
     orders
         Orders (k, columns) of the Taylor remainders, 2 for right tangents, at the smallest steps where the remainder is
-        no noise; NaN where it always is (an output that is linear in the parameters). A second derivative that
+        above rounding; NaN where it never is (an output that is linear in the parameters). A second derivative that
         vanishes, or nearly so, gives another order.
     faults
-        Relative errors (k, columns) of the tangents, extrapolated from Taylor remainders; 0 where they are noise.
+        Relative errors (k, columns) of the tangents, extrapolated from Taylor remainders; 0 where these are rounding.
     adjoint
         |⟨w, J v⟩ − ⟨Jᵀw, v⟩| (k, m) for the k directions v and the m unit weights w, relative to the largest change of
         the output along the directions plus 1 % of its size.
@@ -98,7 +98,7 @@ def check_derivatives(
     *,
     directions: ArrayLike | None = None,
     steps: tuple[float, ...] = STEPS,
-    noise: float = 1e-11,
+    accuracy: float = 1e-11,
     seed: int = 0,
 ) -> Conformance:
     """Check tangents and adjoints of a model; collective over its ranks, each of which checks its part of the state.
@@ -118,9 +118,9 @@ def check_derivatives(
         ones for a model of many parameters.
     steps
         Lengths of the steps, falling, at least 3.
-    noise
-        What outputs and state are exact to, relative to their size: about the tolerance of an iterative solver. An
-        output that is linear in the parameters leaves a remainder of this size, and passes.
+    accuracy
+        Relative accuracy of outputs and state: about the tolerance of an iterative solver. An output that is linear in
+        the parameters leaves a remainder of this size, and passes.
     seed
         Of the random directions.
 
@@ -157,7 +157,7 @@ def check_derivatives(
             near = model.solve(point + step * direction)
             changes[j, k] = np.append(near.outputs, near.state) - values
     size = _columns(np.abs(values) + np.abs(changes).max(axis=(0, 1)), outputs.size)
-    orders, faults = _taylor(np.array(steps), changes, slopes, outputs.size, noise * size)
+    orders, faults = _taylor(np.array(steps), changes, slopes, outputs.size, accuracy * size)
 
     typical = np.abs(tangents).max(axis=0) + 0.01 * size[: outputs.size]
     typical[typical == 0] = 1
@@ -188,21 +188,21 @@ def _columns(values: FloatArray, outputs: int) -> FloatArray:
 
 
 def _taylor(
-    steps: FloatArray, changes: FloatArray, slopes: FloatArray, outputs: int, noise: FloatArray
+    steps: FloatArray, changes: FloatArray, slopes: FloatArray, outputs: int, accuracy: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the orders and the faults (k, columns), from changes (s, k, values) along directions of given slopes."""
     scaled = changes / steps[:, None, None] - slopes
     remainders = _columns(scaled, outputs) * steps[:, None, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.log(remainders[:-1] / remainders[1:]) / np.log(steps[:-1] / steps[1:])[:, None, None]
-    count = np.logical_and.accumulate(remainders > ABOVE_NOISE * noise, axis=0).sum(axis=0)
+    count = np.logical_and.accumulate(remainders > ABOVE_ROUNDING * accuracy, axis=0).sum(axis=0)
     last = np.take_along_axis(orders, np.maximum(count - 2, 0)[None], axis=0)[0]
 
     windows = np.array([steps[j : j + WINDOW] for j in range(len(steps) - WINDOW + 1)])
     # Weights of the polynomial through the steps of a window at step zero.
     weights = np.array([[np.prod([b / (b - a) for b in w if b != a]) for a in w] for w in windows])
     limits = np.array([np.tensordot(w, scaled[j : j + WINDOW], axes=1) for j, w in enumerate(weights)])
-    allowed = 10 * np.abs(weights / windows).sum(axis=1)[:, None, None] * noise
+    allowed = 10 * np.abs(weights / windows).sum(axis=1)[:, None, None] * accuracy
     excess = _columns(limits, outputs) - allowed
     where = np.maximum(count - WINDOW, 0)
     defect = np.maximum(np.take_along_axis(excess, where[None], axis=0)[0], 0)

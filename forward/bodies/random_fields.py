@@ -105,7 +105,7 @@ class RandomField(Settings):
             case "nodes":
                 return Nodal(offset)
             case "noise":
-                return Noise(offset, Matern.on(body, self.length, self.smoothness), self.log_std)
+                return WhiteNoise(offset, Matern.on(body, self.length, self.smoothness), self.log_std)
             case "modes":
                 matern = Matern.on(body, self.length, self.smoothness)
                 modes = self.log_std * matern.modes(self.modes or 0)
@@ -129,7 +129,7 @@ class Expansion(Protocol):
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Return the linear part (N,) at coefficients (k,)."""
 
-    def pull(self, slopes: FloatArray) -> FloatArray:
+    def vjp(self, slopes: FloatArray) -> FloatArray:
         """Return derivatives (k,) by the coefficients from those (N,) by the values at the vertices."""
 
 
@@ -145,13 +145,13 @@ class Modes:
         """Return the sum (N,) of the modes."""
         return np.asarray(self.modes @ coefficients)
 
-    def pull(self, slopes: FloatArray) -> FloatArray:
+    def vjp(self, slopes: FloatArray) -> FloatArray:
         """Return the products (k,) with the modes."""
         return np.asarray(slopes @ self.modes)
 
 
 @dataclass(frozen=True)
-class Noise:
+class WhiteNoise:
     """The square root of the covariance: coefficients are independent and standard normal."""
 
     offset: FloatArray
@@ -160,11 +160,11 @@ class Noise:
     kept: float = 1.0
 
     def values(self, coefficients: FloatArray) -> FloatArray:
-        """Return the field (N,) of a white noise."""
+        """Return the field (N,) of independent standard normal numbers."""
         return self.std * self.matern.root(coefficients)
 
-    def pull(self, slopes: FloatArray) -> FloatArray:
-        """Return derivatives (N,) by the noise."""
+    def vjp(self, slopes: FloatArray) -> FloatArray:
+        """Return derivatives (N,) by these numbers."""
         return self.std * self.matern.root_transposed(slopes)
 
 
@@ -179,7 +179,7 @@ class Nodal:
         """Return the coefficients."""
         return coefficients
 
-    def pull(self, slopes: FloatArray) -> FloatArray:
+    def vjp(self, slopes: FloatArray) -> FloatArray:
         """Return the slopes."""
         return slopes
 
@@ -199,9 +199,9 @@ class NodalPrior:
         """Variance (N,) at the vertices."""
         return np.full(len(self.matern.mass), self.std**2)
 
-    def root(self, noise: FloatArray) -> FloatArray:
-        """Return the field (N,) of a standard normal noise (N,), or (k, N) for k of them."""
-        return self.std * self.matern.root(noise.T).T
+    def root(self, whitened: FloatArray) -> FloatArray:
+        """Return the field (N,) of independent standard normal numbers (N,), or (k, N) for k of them."""
+        return self.std * self.matern.root(whitened.T).T
 
     def root_transposed(self, g: FloatArray) -> FloatArray:
         """Apply the transpose of `root` to (N,) or (k, N)."""
@@ -260,8 +260,8 @@ class Matern:
         return _factorise(self._matrix)
 
     @cached_property
-    def _noise(self) -> csr_matrix:
-        """G (N, N) with GGᵀ = M: it makes white noise of independent numbers."""
+    def _white(self) -> csr_matrix:
+        """G (N, N) with GGᵀ = M, which turns independent numbers into white noise."""
         from scipy.sparse import diags
 
         # M = PᵀLUP with U = DLᵀ, since pivots stay on the diagonal.
@@ -291,13 +291,13 @@ class Matern:
         """Variance (N,) of the SPDE before it is set to one, over that in unbounded space."""
         return self._raw_std**2 / unbounded_variance(self._kappa, self._smoothness)
 
-    def root(self, noise: FloatArray) -> FloatArray:
-        """Return the field (N,) of a standard normal noise (N,), or (N, k) for k of them."""
-        return np.asarray((self._smooth(self._noise @ noise).T / self._raw_std).T)
+    def root(self, whitened: FloatArray) -> FloatArray:
+        """Return the field (N,) of independent standard normal numbers (N,), or (N, k) for k of them."""
+        return np.asarray((self._smooth(self._white @ whitened).T / self._raw_std).T)
 
     def root_transposed(self, g: FloatArray) -> FloatArray:
         """Apply the transpose of `root` to (N,) or (N, k)."""
-        return np.asarray(self._noise.T @ self._smooth((g.T / self._raw_std).T))
+        return np.asarray(self._white.T @ self._smooth((g.T / self._raw_std).T))
 
     def covariance(self, g: FloatArray) -> FloatArray:
         """Multiply the covariance (N, N) with (N,) or (N, k)."""

@@ -271,5 +271,5 @@ class Linearisation(Forms):
             self.unknowns.give(self._along, w)
         for field, assemble in self._field_forces:
             self.work.residuals += 1
-            products[field.positions] = field.pull(assemble())
+            products[field.positions] = field.vjp(assemble())
         return products

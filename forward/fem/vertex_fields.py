@@ -91,7 +91,7 @@ class VertexField:
         """Set the change of the field to that along a direction (d,) of the parameters; collective."""
         _give(self.direction, self._values(direction))
 
-    def pull(self, slopes: FloatArray) -> FloatArray:
+    def vjp(self, slopes: FloatArray) -> FloatArray:
         """Return derivatives (k,) by this field's parameters from this rank's part of those by the vertices."""
         if self._modes is not None:
             return ranks.total(self._comm, slopes @ self._modes)[self._numbers]
@@ -101,7 +101,7 @@ class VertexField:
             whole = np.empty(self._count)
             for vertices, part in parts:
                 whole[vertices] = part
-            pulled = self._expansion.pull(whole)[self._numbers]
+            pulled = self._expansion.vjp(whole)[self._numbers]
         return np.asarray(self._comm.bcast(pulled))
 
     def factors(self, points: FloatArray, space: Any) -> FloatArray | None:

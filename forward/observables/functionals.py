@@ -81,5 +81,5 @@ class Integral:
         if len(equations.scalars):
             slopes[equations.scalars] = [self._partial() for _ in equations.unit_directions()]
         for field, assemble in self._by_fields:
-            slopes[field.positions] = field.pull(assemble())
+            slopes[field.positions] = field.vjp(assemble())
         return slopes / self.size

@@ -7,9 +7,10 @@ A chain whose proposals are reversible with respect to Laplace's Gaussian N(x̂,
 accepts everything where the posterior exp ℓ is that Gaussian, whatever the dimension (preconditioned Crank–Nicolson:
 S. L. Cotter, G. O. Roberts, A. M. Stuart, D. White, Stat. Sci. 28 (2013) 424–446; with a Gaussian of the posterior: D.
 Rudolf, B. Sprungk, Found. Comput. Math. 18 (2018) 309–343). For fields L = (I + UΛUᵀ)^{−1/2} of the low-rank pairs, in
-the noise of the prior. For few parameters there is also the ensemble whose walkers stretch (J. Goodman, J. Weare, Comm.
-Appl. Math. Comp. Sci. 5 (2010) 65–80; emcee: D. Foreman-Mackey et al., Publ. Astron. Soc. Pac. 125 (2013) 306–312),
-which knows no Gaussian. R̂ and effective sizes are ArviZ's (A. Vehtari et al., Bayesian Anal. 16 (2021) 667–718).
+the whitened coordinates of the prior. For few parameters there is also the affine-invariant ensemble, which uses no
+Gaussian (J. Goodman, J. Weare, Comm. Appl. Math. Comp. Sci. 5 (2010) 65–80; emcee: D. Foreman-Mackey et al., Publ.
+Astron. Soc. Pac. 125 (2013) 306–312). R̂ and effective sample sizes are ArviZ's (A. Vehtari et al., Bayesian Anal. 16
+(2021) 667–718).
 
 For fields the Gaussian alone misses what is of second order in the many directions that the data hardly see: together
 they change what the data see well by more than the noise (a field that varies is softer in the mean than a constant
@@ -293,7 +294,7 @@ def chains_of_field(
     values = mode.posterior.values
     return crank_nicolson(
         bent(mode, found),
-        len(mode.noise),
+        len(mode.whitened),
         keep=values if keep is None else lambda x: keep(values(x)),
         names=names,
         lengths=lengths,
@@ -344,28 +345,28 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
     slopes = mode.solution.state_tangent(found.directions)
     state = np.array(mode.solution.state)
     # Where the samples go is what the screen of stability has to know.
-    draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.noise))))
+    draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.whitened))))
     reference = Reference(mode.values, state, mode.posterior.prior.root(draws))
     strong = pairs.values > STRONG
     vectors, images, stiffness = pairs.vectors[strong], pairs.images[strong], 1 + pairs.values[strong]
-    centre = vectors @ mode.noise
+    centre = vectors @ mode.whitened
 
-    def solved(noise: FloatArray) -> Point:
-        start = state + ((noise - mode.noise) @ pairs.vectors.T) @ slopes
-        return mode.posterior.at(noise, Guess(start, reference))
+    def solved(whitened: FloatArray) -> Point:
+        start = state + ((whitened - mode.whitened) @ pairs.vectors.T) @ slopes
+        return mode.posterior.at(whitened, Guess(start, reference))
 
     def place(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         along = z @ vectors.T
-        noise = mode.noise + pairs.root(z - along @ vectors)
+        whitened = mode.whitened + pairs.root(z - along @ vectors)
         values = np.full(len(z), -np.inf)
         for i in range(len(z)):
             try:
-                follows = -(images @ solved(noise[i]).residual + centre) / stiffness if strong.any() else 0.0
-                noise[i] += (follows + along[i] / np.sqrt(stiffness)) @ vectors
-                values[i] = -solved(noise[i]).cost
+                follows = -(images @ solved(whitened[i]).residual + centre) / stiffness if strong.any() else 0.0
+                whitened[i] += (follows + along[i] / np.sqrt(stiffness)) @ vectors
+                values[i] = -solved(whitened[i]).cost
             except SolveError:
                 continue
-        return noise, values
+        return whitened, values
 
     return place
 
@@ -444,14 +445,14 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
     SolveError
         If the model has no answer at any of them.
     """
-    z = np.random.default_rng(seed).standard_normal((samples, len(mode.noise)))
-    noise, log_density = bent(mode, found)(z)
+    z = np.random.default_rng(seed).standard_normal((samples, len(mode.whitened)))
+    whitened, log_density = bent(mode, found)(z)
     weights = mode.posterior.weights[mode.posterior.weights > 0]
     constant = float(np.log(weights).sum()) - len(weights) / 2 * float(np.log(2 * np.pi)) + found.log_determinant / 2
     log_weights = log_density + (z**2).sum(axis=1) / 2 + constant
     if not np.isfinite(log_weights.max()):
         raise SolveError("the model has no answer at any of the samples of the Gaussian")
-    return FieldWeights(mode.posterior.values(noise), log_weights)
+    return FieldWeights(mode.posterior.values(whitened), log_weights)
 
 
 # --- what they say ---------------------------------------------------------------------------------------------------

@@ -84,8 +84,8 @@ def derived_by_weights(posterior: Posterior, found: Evidence, function: Map) -> 
 
 def derived_of_field(found: LowRankPosterior, function: Map, *, draws: int = 512, seed: int = 0) -> Summary:
     """Summarise a function (n, N) → (n, k) of the values of a field, by samples; linear ones have `marginal`."""
-    noise = np.random.default_rng(seed).standard_normal((draws, len(found.mean)))
-    return summary(function(found.samples(noise)))
+    normal = np.random.default_rng(seed).standard_normal((draws, len(found.mean)))
+    return summary(function(found.samples(normal)))
 
 
 # --- predictions -----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The posterior density of a field of N values given many measured outputs, in the noise that its prior is made of.
+"""The posterior density of a field of N values given many measured outputs, in the whitened coordinates of its prior.
 
 With m = m_0 + Lξ and ξ ~ N(0, I) a priori, so that Γ_pr = LLᵀ, and data y = G(m) + e with independent e_i ~ N(0, σ_i²),
 
@@ -34,7 +34,7 @@ class Prior(Protocol):
     def variance(self) -> FloatArray:
         """Diagonal (N,) of LLᵀ."""
 
-    def root(self, noise: FloatArray) -> FloatArray:
+    def root(self, whitened: FloatArray) -> FloatArray:
         """Return Lξ (N,) for ξ (N,), or (k, N)."""
 
     def root_transposed(self, g: FloatArray) -> FloatArray:
@@ -112,11 +112,11 @@ class FieldPosterior:
         """Number of data."""
         return int(self.measured.sum())
 
-    def values(self, noise: FloatArray) -> FloatArray:
+    def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
-        return self.prior.root(noise) + (0.0 if self.mean is None else self.mean)
+        return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)
 
-    def at(self, noise: FloatArray, guess: Guess | None = None) -> Point:
+    def at(self, whitened: FloatArray, guess: Guess | None = None) -> Point:
         """Solve at ξ (N,), with the help of a guess.
 
         Raises
@@ -125,14 +125,14 @@ class FieldPosterior:
             Where the model has no answer.
         """
         self.counts.solves += 1
-        values = self.values(noise)
+        values = self.values(whitened)
         try:
             solution = self.model.solve(values, guess)
         except SolveError:
             self.progress(1, 1)
             raise
         self.progress(1, 0)
-        return Point(self, np.array(noise), values, solution)
+        return Point(self, np.array(whitened), values, solution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Point:
     ----------
     posterior
         Of which this is a point.
-    noise
+    whitened
         ξ (N,).
     values
         m (N,).
@@ -152,7 +152,7 @@ class Point:
     """
 
     posterior: FieldPosterior
-    noise: FloatArray
+    whitened: FloatArray
     values: FloatArray
     solution: Solution
 
@@ -188,7 +188,7 @@ class Point:
     @property
     def penalty(self) -> float:
         """½ ξ·ξ."""
-        return float(self.noise @ self.noise) / 2
+        return float(self.whitened @ self.whitened) / 2
 
     @property
     def cost(self) -> float:
@@ -198,23 +198,23 @@ class Point:
     @cached_property
     def gradient(self) -> FloatArray:
         """ξ + Aᵀr (N,), by one adjoint of the model."""
-        return np.asarray(self.noise + self.pull(self.residual))
+        return np.asarray(self.whitened + self.vjp(self.residual))
 
-    def image(self, noise: FloatArray) -> FloatArray:
-        """Return Aξ (n,), or (k, n) for k of them."""
+    def jvp(self, whitened: FloatArray) -> FloatArray:
+        """Return the Jacobian-vector product Aξ (n,), or (k, n) for k of them."""
         posterior = self.posterior
-        posterior.counts.tangents += len(np.atleast_2d(noise))
-        return self.root * posterior.weights * self.solution.tangent(posterior.prior.root(noise))
+        posterior.counts.tangents += len(np.atleast_2d(whitened))
+        return self.root * posterior.weights * self.solution.tangent(posterior.prior.root(whitened))
 
-    def pull(self, data: FloatArray) -> FloatArray:
-        """Return Aᵀr (N,), or (k, N) for k of them."""
+    def vjp(self, data: FloatArray) -> FloatArray:
+        """Return the vector-Jacobian product Aᵀr (N,), or (k, N) for k of them."""
         posterior = self.posterior
         posterior.counts.adjoints += len(np.atleast_2d(data))
         return posterior.prior.root_transposed(self.solution.adjoint(self.root * posterior.weights * data))
 
-    def product(self, noise: FloatArray) -> FloatArray:
+    def product(self, whitened: FloatArray) -> FloatArray:
         """Return AᵀAξ (N,), or (k, N) for k of them."""
-        return self.pull(self.image(noise))
+        return self.vjp(self.jvp(whitened))
 
     def predicted(self, step: FloatArray) -> FloatArray:
         """Return the change (U_local,) of the state along a step (N,) of ξ."""

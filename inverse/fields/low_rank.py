@@ -57,18 +57,18 @@ class Spectrum:
     neglected: float
     products: int
 
-    def solve(self, noise: FloatArray) -> FloatArray:
+    def solve(self, whitened: FloatArray) -> FloatArray:
         """Multiply (I + UΛUᵀ)⁻¹ with (N,), or (k, N)."""
-        return noise - (noise @ self.vectors.T * (self.values / (1 + self.values))) @ self.vectors
+        return whitened - (whitened @ self.vectors.T * (self.values / (1 + self.values))) @ self.vectors
 
-    def root(self, noise: FloatArray) -> FloatArray:
+    def root(self, whitened: FloatArray) -> FloatArray:
         """Multiply (I + UΛUᵀ)^{−1/2} with (N,), or (k, N)."""
-        return noise + (noise @ self.vectors.T * ((1 + self.values) ** -0.5 - 1)) @ self.vectors
+        return whitened + (whitened @ self.vectors.T * ((1 + self.values) ** -0.5 - 1)) @ self.vectors
 
 
 def leading_pairs(
-    image: Map,
-    pull: Map,
+    jvp: Map,
+    vjp: Map,
     size: int,
     *,
     cutoff: float = CUTOFF,
@@ -81,7 +81,7 @@ def leading_pairs(
 
     Parameters
     ----------
-    image, pull
+    jvp, vjp
         Products of A with rows (k, N), and of Aᵀ with rows (k, n).
     size
         N.
@@ -102,8 +102,8 @@ def leading_pairs(
     Q = np.zeros((0, size))
     new = _orthonormal(rng.standard_normal((min(block, size), size)), Q, 0.0)
     while True:
-        images = image(new)
-        products = pull(images)
+        images = jvp(new)
+        products = vjp(images)
         AQ = np.concatenate([AQ, images]) if len(Q) else images
         HQ = np.concatenate([HQ, products]) if len(Q) else products
         Q = np.concatenate([Q, new])
@@ -147,7 +147,7 @@ class LowRankPosterior:
     ----------
     mean
         m̂ (N,).
-    noise
+    whitened
         ξ̂ (N,).
     residual
         r (n,) there.
@@ -160,7 +160,7 @@ class LowRankPosterior:
     """
 
     mean: FloatArray
-    noise: FloatArray
+    whitened: FloatArray
     residual: FloatArray
     weights: FloatArray
     prior: Prior
@@ -181,8 +181,8 @@ class LowRankPosterior:
         """Find the directions at a mode that the data constrain, as `leading_pairs` does."""
         posterior = mode.posterior
         spectrum = leading_pairs(
-            mode.image,
-            mode.pull,
+            mode.jvp,
+            mode.vjp,
             posterior.size,
             cutoff=cutoff,
             rank=rank,
@@ -191,7 +191,7 @@ class LowRankPosterior:
             seed=seed,
         )
         weights, likelihood = mode.root * posterior.weights, mode.log_likelihood
-        return cls(mode.values, mode.noise, mode.residual, weights, posterior.prior, spectrum, likelihood)
+        return cls(mode.values, mode.whitened, mode.residual, weights, posterior.prior, spectrum, likelihood)
 
     # --- the field ---------------------------------------------------------------------------------------------------
 
@@ -227,9 +227,9 @@ class LowRankPosterior:
         """Multiply Γ_post with g (N,), or (k, N)."""
         return self.prior.root(self.spectrum.solve(self.prior.root_transposed(g)))
 
-    def samples(self, noise: FloatArray) -> FloatArray:
-        """Return samples (N,) of standard normal noises (N,), or (k, N)."""
-        return self.mean + self.prior.root(self.spectrum.root(noise))
+    def samples(self, whitened: FloatArray) -> FloatArray:
+        """Return samples (N,) for standard normal numbers (N,), or (k, N) for k of them."""
+        return self.mean + self.prior.root(self.spectrum.root(whitened))
 
     def marginal(self, g: FloatArray) -> tuple[float, float]:
         """Mean and standard deviation of the linear functional g·m (N,), for example the mean over a region."""
@@ -252,14 +252,14 @@ class LowRankPosterior:
     @property
     def log_evidence(self) -> float:
         """Ln p(y) = ln L(m̂) − ½|ξ̂|² − ½ Σ ln(1+λ); exact for linear models, but for the pairs left out."""
-        return self.log_likelihood - float(self.noise @ self.noise) / 2 + self.log_determinant / 2
+        return self.log_likelihood - float(self.whitened @ self.whitened) / 2 + self.log_determinant / 2
 
     @property
     def information(self) -> float:
         """Divergence (nat) of the posterior from the prior (S. Kullback, R. A. Leibler, 1951)."""
         values = self.spectrum.values
         spread = float((np.log1p(values) - values / (1 + values)).sum())
-        return (spread + float(self.noise @ self.noise)) / 2
+        return (spread + float(self.whitened @ self.whitened)) / 2
 
     @property
     def determined(self) -> float:
@@ -294,5 +294,5 @@ class LowRankPosterior:
         """
         from scipy.special import chdtrc
 
-        square = float(self.residual @ self.residual + self.noise @ self.noise)
+        square = float(self.residual @ self.residual + self.whitened @ self.whitened)
         return square, float(chdtrc((self.weights > 0).sum(), square))

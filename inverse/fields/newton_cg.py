@@ -126,7 +126,7 @@ def find_mode(
     for number in range(steps + 1):
         spent = 0
         if pairs is None and used == LONG:
-            pairs = leading_pairs(here.image, here.pull, posterior.size, cutoff=STRONG, accuracy=ROUGH)
+            pairs = leading_pairs(here.jvp, here.vjp, posterior.size, cutoff=STRONG, accuracy=ROUGH)
             largest, spent = 0.0, pairs.products  # the norm is another
         size = _norm(here.gradient, pairs)
         largest = max(largest, size)
@@ -177,7 +177,7 @@ def _search(here: Point, step: FloatArray) -> tuple[Point | None, float, int]:
     length = 1.0
     for solves in range(1, HALVINGS + 1):
         try:
-            there = here.posterior.at(here.noise + length * step, Guess(here.solution.state + length * change))
+            there = here.posterior.at(here.whitened + length * step, Guess(here.solution.state + length * change))
         except SolveError:
             pass
         else:

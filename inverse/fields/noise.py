@@ -107,7 +107,7 @@ def infer_noise(
         stands = abs(np.log(best / factor)) <= tolerance * log_std
         if stands:
             break
-        factor, start = best, mode.point.noise
+        factor, start = best, mode.point.whitened
     return InferredNoise(
         rounds[-1], log_std, scaled, mode, found, log_evidence, tuple(rounds), stands and mode.converged
     )
@@ -140,7 +140,7 @@ class Marginal:
     @classmethod
     def at(cls, mode: Point, spectrum: Spectrum) -> Marginal:
         """Linearise at a mode with the pairs there."""
-        gap = mode.residual - mode.image(mode.noise)
+        gap = mode.residual - mode.jvp(mode.whitened)
         values = spectrum.values
         along = (spectrum.images @ gap) ** 2 / np.where(values > 0, values, 1.0)
         weights = mode.posterior.weights[mode.posterior.weights > 0]

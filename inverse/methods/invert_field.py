@@ -119,7 +119,7 @@ def invert_field(
     record: Record = {
         **of_data(data, predicted, residual, scale / root, spectrum),
         **of_test(test),
-        **of_prior(mode.point.noise, spectrum),
+        **of_prior(mode.point.whitened, spectrum),
         **of_mesh(gap, why, scale, shift),
         **mean,
         **stiffness,
@@ -163,8 +163,8 @@ def _of_stiffness(
     """Mean, standard deviation and draws of ln stiffness."""
     count = -(-method.draws // 10)
     if values is None:
-        noise = np.random.default_rng(method.seed).standard_normal((count, len(found.mean)))
-        mean, std, draws = found.mean, found.std, found.samples(noise)
+        whitened = np.random.default_rng(method.seed).standard_normal((count, len(found.mean)))
+        mean, std, draws = found.mean, found.std, found.samples(whitened)
     else:
         mean = weights @ values
         std = np.sqrt(weights @ (values - mean) ** 2)

@@ -438,7 +438,7 @@ class _Found:
         differences = np.array([mesh.reference + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
-        # The differences at the mean parameters converge at the same rate, and have no noise.
+        # The differences at the mean parameters converge at the same rate, without sampling error.
         nominal = np.array([mesh.nominal for mesh in meshes])[1:]
         alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
         return cls(by_mesh, differences, bias(differences, alpha), bias(std_differences, alpha), consistency)

@@ -39,7 +39,7 @@ def changed(changes):
 def test_derivatives_in_every_number(model):
     point = np.array([1e4, *VALUES])
     scale = np.where([path.endswith(".contrast") for path in model.parameters], 0.3, 0.1) * point
-    found = check_derivatives(model, point, scale, noise=1e-13)
+    found = check_derivatives(model, point, scale, accuracy=1e-13)
     assert found.mistakes() == ()
     assert found.adjoint.max() <= EXACT
     assert found.directions[:-1] == tuple(f"'{path}'" for path in ("material.C1", *PATHS))
@@ -133,7 +133,7 @@ def test_derivatives_in_every_number_of_an_ellipsoid():
     scale = np.where(np.char.startswith(numbers, "turn"), 0.3, 0.1 * np.abs(point))
     model = spec.build(MPI.COMM_SELF, paths)
     for at in (point, np.where(np.char.startswith(numbers, "turn"), 0.0, point)):  # also where nothing is turned
-        found = check_derivatives(model, at, scale, steps=(1 / 32, 1 / 64, 1 / 128), noise=1e-13)
+        found = check_derivatives(model, at, scale, steps=(1 / 32, 1 / 64, 1 / 128), accuracy=1e-13)
         assert found.mistakes() == ()
         assert found.adjoint.max() <= EXACT
 

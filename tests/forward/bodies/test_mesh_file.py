@@ -117,7 +117,7 @@ def regional(file):
 @pytest.mark.fem
 def test_derivatives_by_the_numbers_of_regions(file):
     point = np.array([1e4, 2e4, 3e4, 1e5, 1.5])
-    check_derivatives(built(regional(file), *NUMBERS), point, 0.1 * point, noise=1e-10).require()
+    check_derivatives(built(regional(file), *NUMBERS), point, 0.1 * point, accuracy=1e-10).require()
 
 
 @pytest.mark.fem
@@ -182,7 +182,7 @@ def test_specimens_have_regions(file):
     expected = built(regional(file), *NUMBERS).solve(point)
     solution = found.solve(point)
     np.testing.assert_allclose(solution.solutions[0].state, expected.state, rtol=1e-9, atol=1e-12)
-    check_derivatives(found, point, 0.1 * point, noise=1e-10).require()
+    check_derivatives(found, point, 0.1 * point, accuracy=1e-10).require()
     with pytest.raises(ValidationError, match="unknown region; did you mean 'right'") as caught:
         specimen(file, regions={"rigth": {"contrast": 2.0}})
     assert [error["loc"] for error in caught.value.errors()] == [("regions", "rigth")]
@@ -215,7 +215,7 @@ def test_fields_on_a_mesh_of_tetrahedra(tmp_path):
     loads = ({"kind": "gravity", "direction": (0.0, -1.0, 0.3), "density": 600.0},)
     model = spec(tmp_path / "box.vtu", loads=loads, **blocks)
     names = ("fields.stiffness.0", "fields.stiffness.1")
-    check_derivatives(built(model, *names), np.array([0.3, -0.5]), np.ones(2), noise=1e-10).require()
+    check_derivatives(built(model, *names), np.array([0.3, -0.5]), np.ones(2), accuracy=1e-10).require()
 
 
 def test_groups_of_gmsh(tmp_path):
@@ -439,7 +439,7 @@ def test_the_organ(tmp_path):
 def test_derivatives_by_the_numbers_of_regions_in_the_mixed_form(file):
     model = spec(file, body={"degree": 2}, formulation="mixed", regions={"right": REGION}, outputs=FEW)
     point = np.array([1e4, 2e4, 3e4, 1e6, 1.5])
-    check_derivatives(built(model, *NUMBERS), point, 0.1 * point, noise=1e-10).require()
+    check_derivatives(built(model, *NUMBERS), point, 0.1 * point, accuracy=1e-10).require()
 
 
 @pytest.mark.parametrize("binary", [True, False])

@@ -125,7 +125,7 @@ def test_the_expected_factor_and_its_spread_are_as_asked(basis):
     np.testing.assert_allclose(np.exp(expansion.offset + variance / 2), 2.0, rtol=1e-12)  # the mean of a log-normal
     assert (variance <= field.log_std**2 * (1 + 1e-12)).all()
     slopes = np.random.default_rng(0).standard_normal(body.vertex_count)
-    np.testing.assert_allclose(expansion.pull(slopes), values @ slopes, atol=1e-12)
+    np.testing.assert_allclose(expansion.vjp(slopes), values @ slopes, atol=1e-12)
     if count == body.vertex_count:
         np.testing.assert_allclose(2.0 * np.sqrt(np.expm1(variance)), 0.5, rtol=1e-10)
         assert expansion.kept == 1
@@ -148,7 +148,7 @@ def build(fields=FIELDS, material="mooney-rivlin", numbers=NUMBERS, comm=MPI.COM
 def check(model, point, scale):
     directions = np.vstack([np.eye(len(point))[[0, 2, 3, -1]], np.random.default_rng(2).uniform(-1, 1, len(point))])
     check_derivatives(
-        model, point, scale, directions=directions, steps=(1 / 32, 1 / 64, 1 / 128), noise=1e-12
+        model, point, scale, directions=directions, steps=(1 / 32, 1 / 64, 1 / 128), accuracy=1e-12
     ).require()
     solution = model.solve(point)
     tangents, gradients = solution.tangent(np.eye(len(point))).T, solution.adjoint(np.eye(len(model.outputs)))

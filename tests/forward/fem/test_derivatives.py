@@ -10,7 +10,7 @@ from forward.conformance import EXACT, STATE, check_derivatives
 from tests.bodies import MATERIALS, OUTPUTS, loaded_body
 
 pytestmark = pytest.mark.fem
-NOISE = 1e-13  # Newton's last step goes to rounding
+ACCURACY = 1e-13  # Newton's last step goes to rounding
 LOADS = ("loads.gravity.density", "loads.traction.size", "loads.pressure.size", "displacements.y-max.y")
 
 
@@ -20,7 +20,7 @@ def conformance(request):
     parameters = tuple(spec.scalars)
     values = np.array([scalar.value for scalar in spec.scalars.values()])
     model = spec.build(MPI.COMM_SELF, parameters)
-    return model, values, check_derivatives(model, values, 0.3 * values, noise=NOISE)
+    return model, values, check_derivatives(model, values, 0.3 * values, accuracy=ACCURACY)
 
 
 def test_every_number_of_the_model_is_a_parameter(conformance):
@@ -83,7 +83,7 @@ class FaultySolution:
 
 def test_a_fault_of_a_thousandth_is_caught(conformance):
     model, values, _ = conformance
-    found = check_derivatives(Faulty(model, 1.001), values, 0.3 * values, noise=NOISE)
+    found = check_derivatives(Faulty(model, 1.001), values, 0.3 * values, accuracy=ACCURACY)
     lines = found.mistakes()
     for output in model.outputs:
         for direction in found.directions:

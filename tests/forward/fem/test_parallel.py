@@ -51,7 +51,7 @@ def solve(material):
 
     steps = 1 / 32, 1 / 64, 1 / 128
     directions = np.ones((1, len(values)))
-    check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, noise=1e-12).require()
+    check_derivatives(model, values, 0.3 * values, directions=directions, steps=steps, accuracy=1e-12).require()
     cells, _ = model.space.cells()
     return {
         "outputs": solution.outputs,

@@ -82,7 +82,7 @@ def test_derivatives_of_all_cases():
     scale = np.concatenate([[300.0, 0.01], np.full(len(point) - 2, 0.3)])
     directions = np.vstack([np.eye(len(point))[[0, 1, 5]], np.random.default_rng(2).uniform(-1, 1, len(point))])
     check_derivatives(
-        model, point, scale, directions=directions, steps=(1 / 32, 1 / 64, 1 / 128), noise=1e-12
+        model, point, scale, directions=directions, steps=(1 / 32, 1 / 64, 1 / 128), accuracy=1e-12
     ).require()
 
 
@@ -188,11 +188,11 @@ def part(posterior, measured):
 def test_gradient_and_product_are_derivatives_of_the_density():
     posterior, _, _ = coarse()
     rng = np.random.default_rng(0)
-    noise, direction = 0.3 * rng.standard_normal((2, posterior.size))
+    whitened, direction = 0.3 * rng.standard_normal((2, posterior.size))
     exact = FieldPosterior(
-        posterior.model, posterior.model.solve(posterior.values(noise)).outputs, posterior.sigma, posterior.prior
+        posterior.model, posterior.model.solve(posterior.values(whitened)).outputs, posterior.sigma, posterior.prior
     )
-    for which, about in ((posterior, noise + 0.1), (exact, noise)):
+    for which, about in ((posterior, whitened + 0.1), (exact, whitened)):
         point = which.at(about)
         gradient, curve = point.gradient, direction + point.product(direction)
         moved = {h: which.at(about + h * direction) for h in (1e-2, 5e-3)}
@@ -230,7 +230,7 @@ def test_samples_near_the_mode_are_screened_rather_than_counted():
             return solution
 
     watched = FieldPosterior(Watched(), posterior.data, posterior.sigma, posterior.prior)
-    point = Point(watched, mode.point.noise, mode.point.values, mode.point.solution)
+    point = Point(watched, mode.point.whitened, mode.point.values, mode.point.solution)
     found = LowRankPosterior.at(mode.point, cutoff=1.0)
     _, densities = bent(point, found)(np.random.default_rng(3).standard_normal((4, posterior.size)))
     assert np.isfinite(densities).all()
@@ -240,10 +240,10 @@ def test_samples_near_the_mode_are_screened_rather_than_counted():
 
 def test_three_load_cases_constrain_more_directions_than_any_one():
     posterior, _, mode = coarse()
-    noise = mode.point.noise
+    whitened = mode.point.whitened
 
     def spectrum(measured):
-        return LowRankPosterior.at(part(posterior, measured).at(noise), cutoff=1.0).spectrum.values
+        return LowRankPosterior.at(part(posterior, measured).at(whitened), cutoff=1.0).spectrum.values
 
     cases = posterior.model.cases
     together = spectrum(cases >= 0)

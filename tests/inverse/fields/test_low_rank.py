@@ -20,7 +20,7 @@ def test_everything_is_exact_with_all_pairs(holes):
     np.testing.assert_allclose(found.covariance(np.eye(N)), problem.covariance, atol=1e-8 * scale)
     np.testing.assert_allclose(found.variance, np.diag(problem.covariance), atol=1e-8 * scale)
     np.testing.assert_allclose(found.std**2, np.diag(problem.covariance), atol=1e-8 * scale)
-    root = found.samples(np.eye(N)) - found.mean  # samples are affine in their noise
+    root = found.samples(np.eye(N)) - found.mean  # samples are affine in the whitened coordinates
     np.testing.assert_allclose(root.T @ root, problem.covariance, atol=1e-8 * scale)
     np.testing.assert_allclose(found.spectrum.values, problem.values[: DATA - holes], rtol=1e-8, atol=1e-8)
     sign, determinant = np.linalg.slogdet(problem.covariance)
@@ -81,7 +81,7 @@ def test_the_rank_follows_the_spectrum():
     problem = Linear()
     point = find_mode(problem.posterior).point
     for cutoff in (100.0, 1.0, 0.01):
-        found = leading_pairs(point.image, point.pull, N, cutoff=cutoff, block=8)
+        found = leading_pairs(point.jvp, point.vjp, N, cutoff=cutoff, block=8)
         assert len(found.values) == (problem.values >= cutoff).sum()
         assert found.products <= len(found.values) + 32
         assert (found.residuals <= 1e-2 * found.values).all()
@@ -127,16 +127,16 @@ def test_calibration():
 def test_gradient_and_product_are_derivatives():
     posterior = curved()
     rng = np.random.default_rng(0)
-    noise, direction = rng.standard_normal((2, 12))
-    point = posterior.at(noise)
+    whitened, direction = rng.standard_normal((2, 12))
+    point = posterior.at(whitened)
     slope, steps = point.gradient @ direction, (1e-2, 1e-3)
-    errors = [abs(posterior.at(noise + h * direction).cost - point.cost - h * slope) for h in steps]
+    errors = [abs(posterior.at(whitened + h * direction).cost - point.cost - h * slope) for h in steps]
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
     # Where nothing is left of the residual, the product is that of all second derivatives.
     exact = FieldPosterior(posterior.model, point.solution.outputs, posterior.sigma, posterior.prior)
-    point = exact.at(noise)
+    point = exact.at(whitened)
     curve = direction + point.product(direction)
-    moved = [(h, exact.at(noise + h * direction).gradient - point.gradient) for h in (1e-3, 1e-4)]
+    moved = [(h, exact.at(whitened + h * direction).gradient - point.gradient) for h in (1e-3, 1e-4)]
     errors = [np.linalg.norm(change - h * curve) for h, change in moved]
     assert np.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
@@ -152,7 +152,7 @@ def test_the_mode_is_stationary_also_where_steps_leave_what_can_be_solved(limit)
     assert (np.diff(costs) <= 1e-9).all()
     for scale in (1e-3, 1e-2):
         moves = scale * np.random.default_rng(0).standard_normal((20, 12))
-        assert all(posterior.at(mode.point.noise + move).cost > mode.point.cost for move in moves)
+        assert all(posterior.at(mode.point.whitened + move).cost > mode.point.cost for move in moves)
     assert mode.solves == 1 + sum(row.solves for row in mode.iterations)
 
 

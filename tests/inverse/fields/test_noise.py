@@ -87,7 +87,7 @@ def test_models_that_are_not_linear():
     assert found.converged
     assert abs(np.log(found.factor * 0.01 / truth_sigma)) < 3 * found.log_std
     again = find_mode(found.posterior, tolerance=1e-8).point.noise
-    np.testing.assert_allclose(found.mode.point.noise, again, atol=0.02)
+    np.testing.assert_allclose(found.mode.point.whitened, again, atol=0.02)
 
 
 def test_noise_that_cannot_be_is_refused():
