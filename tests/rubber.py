@@ -41,7 +41,7 @@ def treloar() -> Selection:
 def on_treloar(kind: str, priors: dict[str, Distribution], noise: Distribution | None = None) -> Posterior:
     """The posterior of a material given all three tests, with errors of 5 %."""
     study = treloar()
-    data = study.groups["all"]
+    data = study.data_groups["all"]
     model = HomogeneousModel(kind, {}, study.data.tests, tuple(priors))
     sigma = np.maximum(0.05 * data.values, 5e3)
     return Posterior(Inputs(priors), SerialEvaluate(model), data.values, sigma, noise)

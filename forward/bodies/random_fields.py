@@ -345,11 +345,11 @@ def _settled(values: FloatArray, functions: FloatArray, mass: FloatArray) -> Flo
     for last in range(1, len(values) + 1):
         if last < len(values) and values[last - 1] - values[last] <= EQUAL * values[0]:
             continue
-        group = functions[:, first:last]
+        cluster = functions[:, first:last]
         if last - first > 1:
-            _, turn = np.linalg.eigh(group.T @ (weight[:, None] * group))
-            group = group @ turn
-        settled[:, first:last] = group
+            _, turn = np.linalg.eigh(cluster.T @ (weight[:, None] * cluster))
+            cluster = cluster @ turn
+        settled[:, first:last] = cluster
         first = last
     large = np.abs(settled) >= 0.5 * np.abs(settled).max(axis=0)
     signs = np.sign(settled[large.argmax(axis=0), np.arange(len(values))])

@@ -169,7 +169,7 @@ def agreement(r: FloatArray, neighbours: Neighbours) -> FloatArray:
 
 def comparison(
     candidates: Mapping[str, Candidate],
-    groups: Mapping[str, Data],
+    data_groups: Mapping[str, Data],
     posteriors: Mapping[Pair, Posterior],
     stated: Mapping[Pair, Assessment],
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
@@ -181,7 +181,7 @@ def comparison(
 
     Parameters
     ----------
-    candidates, groups
+    candidates, data_groups
         By name.
     posteriors, stated
         What was found, by candidate and group.
@@ -198,21 +198,21 @@ def comparison(
 
     names = list(candidates)
     found = {pair: assessment.evidence for pair, assessment in stated.items()}
-    critics = {pair: criticise(found[pair], posteriors[pair], groups[pair[1]]) for pair in stated}
+    critics = {pair: criticise(found[pair], posteriors[pair], data_groups[pair[1]]) for pair in stated}
     weights = np.array([candidate.weight for candidate in candidates.values()])
 
     def table(value: Mapping[Pair, Any]) -> Any:
-        return (("model", "group"), np.array([[value[name, group] for group in groups] for name in names]))
+        return (("model", "group"), np.array([[value[name, group] for group in data_groups] for name in names]))
 
     def totals(values: Mapping[Pair, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
-        parts = [[values[name, group] for group in groups if (name, group) in values] for name in names]
+        parts = [[values[name, group] for group in data_groups if (name, group) in values] for name in names]
         sums = np.array([sum(value for value, _ in part) for part in parts])
         return sums, np.array([np.sqrt(sum(error**2 for _, error in part)) for part in parts])
 
     sums, errors = zip(*(totals(values) for values in variants.values()), strict=True)
     chances = np.array([probabilities(total, weights) for total in sums])
     P = chances[0]
-    scores = np.array([np.concatenate([critics[name, group].scores for group in groups]) for name in names])
+    scores = np.array([np.concatenate([critics[name, group].scores for group in data_groups]) for name in names])
     behind = scores - scores[scores.sum(axis=1).argmax()]
     count = scores.shape[1]
     variables: dict[str, Any] = {
@@ -239,8 +239,11 @@ def comparison(
         "score_error": ("model", np.sqrt(count) * scores.std(axis=1)),
         "score_behind": ("model", behind.sum(axis=1)),
         "score_behind_error": ("model", np.sqrt(count) * behind.std(axis=1)),
-        "score_tail": ("model", [max(critics[name, group].pareto_k.max() for group in groups) for name in names]),
-        "score_trusted": ("model", [all(critics[name, group].trusted.all() for group in groups) for name in names]),
+        "score_tail": ("model", [max(critics[name, group].pareto_k.max() for group in data_groups) for name in names]),
+        "score_trusted": (
+            "model",
+            [all(critics[name, group].trusted.all() for group in data_groups) for name in names],
+        ),
     }
     if checks:
         variables["nested_log_evidence"] = table({pair: value for pair, (value, _) in checks.items()})
@@ -256,15 +259,15 @@ def comparison(
             dims,
             np.array([np.hypot(a[1], b[1]) for a, b in zip(ours, theirs, strict=True)]),
         )
-    columns = [_predictions(names, group, data, posteriors, stated, P) for group, data in groups.items()]
+    columns = [_predictions(names, group, data, posteriors, stated, P) for group, data in data_groups.items()]
     for name, (dims, _) in columns[0].items():
         variables[name] = (dims, np.concatenate([column[name][1] for column in columns], axis=-1))
     parameters = list(dict.fromkeys(p for posterior in posteriors.values() for p in posterior.names))
-    variables["point_log_likelihood"] = _pointwise(names, groups, critics)
-    variables |= _constants(names, list(groups), parameters, posteriors, stated)
+    variables["point_log_likelihood"] = _pointwise(names, data_groups, critics)
+    variables |= _constants(names, list(data_groups), parameters, posteriors, stated)
     if meshes:
-        variables |= _meshes(names, groups, parameters, posteriors, meshes, variables["constant_std"][1])
-    coordinates = {"model": names, "group": list(groups), "variant": list(variants), "parameter": parameters}
+        variables |= _meshes(names, data_groups, parameters, posteriors, meshes, variables["constant_std"][1])
+    coordinates = {"model": names, "group": list(data_groups), "variant": list(variants), "parameter": parameters}
     coordinates |= {"left_out": list(left_out)} if left_out else {}
     return xr.Dataset(variables, {**coordinates, "quantile": list(QUANTILES)})
 
@@ -320,17 +323,17 @@ def _predictions(
 
 def _constants(
     names: list[str],
-    groups: list[str],
+    data_groups: list[str],
     parameters: list[str],
     posteriors: Mapping[Pair, Posterior],
     stated: Mapping[Pair, Assessment],
 ) -> dict[str, tuple[Any, Any]]:
     """Mode, mean, standard deviation and quantiles of every constant; NaN where a model does not have it."""
-    shape = (len(names), len(groups), len(parameters))
+    shape = (len(names), len(data_groups), len(parameters))
     mode, mean, std = np.full((3, *shape), np.nan)
     bands = np.full((len(QUANTILES), *shape), np.nan)
     for k, name in enumerate(names):
-        for g, group in enumerate(groups):
+        for g, group in enumerate(data_groups):
             posterior, assessment = posteriors[name, group], stated[name, group]
             columns = [parameters.index(p) for p in posterior.names]
             w = assessment.evidence.weights
@@ -342,7 +345,7 @@ def _constants(
     count = max(assessment.evidence.weights.size for assessment in stated.values())
     places, shares = np.full((*shape[:2], count, shape[2]), np.nan), np.zeros((*shape[:2], count))
     for k, name in enumerate(names):
-        for g, group in enumerate(groups):
+        for g, group in enumerate(data_groups):
             posterior, found = posteriors[name, group], stated[name, group].evidence
             columns = [parameters.index(p) for p in posterior.names]
             places[k, g, : found.weights.size, columns] = posterior.physical(found.density.x).T
@@ -358,11 +361,11 @@ def _constants(
     }
 
 
-def _pointwise(names: list[str], groups: Mapping[str, Data], critics: Mapping[Pair, Criticism]) -> tuple[Any, Any]:
+def _pointwise(names: list[str], data_groups: Mapping[str, Data], critics: Mapping[Pair, Criticism]) -> tuple[Any, Any]:
     """Ln of the density of every datum at every point of its group; NaN where nothing was measured."""
     count = max(critic.pointwise.shape[0] for critic in critics.values())
     parts = []
-    for group, data in groups.items():
+    for group, data in data_groups.items():
         part = np.full((len(names), count, len(data.tests)), np.nan)
         for k, name in enumerate(names):
             found = critics[name, group].pointwise
@@ -373,17 +376,17 @@ def _pointwise(names: list[str], groups: Mapping[str, Data], critics: Mapping[Pa
 
 def _meshes(
     names: list[str],
-    groups: Mapping[str, Data],
+    data_groups: Mapping[str, Data],
     parameters: list[str],
     posteriors: Mapping[Pair, Posterior],
     meshes: Mapping[Pair, Moved],
     std: FloatArray,
 ) -> dict[str, tuple[Any, Any]]:
     """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations `std`."""
-    shape = (len(names), len(groups))
+    shape = (len(names), len(data_groups))
     whys, added = np.full(shape, "", dtype=object), np.full(shape, np.nan)
     shift, errors = np.full(std.shape, np.nan), []
-    for g, (group, data) in enumerate(groups.items()):
+    for g, (group, data) in enumerate(data_groups.items()):
         error = np.full((len(names), len(data.tests)), np.nan)
         for k, name in enumerate(names):
             found = meshes[name, group]

@@ -18,22 +18,22 @@ NEAREST = 16  # other places that are looked at from each
 SAME = 1e-9  # relative difference of distances that is rounding
 
 
-def neighbours(places: FloatArray, groups: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
+def neighbours(places: FloatArray, kinds: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
     """Pair the data that stand beside each other, each pair once.
 
     Parameters
     ----------
     places
         (n, k).
-    groups
+    kinds
         Numbers (n,) of what can be compared: of tests and stresses, or of load cases and components.
     measured
         Not zero (n,) where something was measured; by default everywhere.
     """
     seen = np.ones(len(places), dtype=bool) if measured is None else np.asarray(measured) != 0
     pairs: set[tuple[int, int]] = set()
-    for group in np.unique(groups[seen]):
-        members = np.flatnonzero(seen & (groups == group))
+    for kind in np.unique(kinds[seen]):
+        members = np.flatnonzero(seen & (kinds == kind))
         pairs |= {(int(members[i]), int(members[j])) for i, j in _related(places[members])}
     ordered = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return ordered[:, 0], ordered[:, 1]

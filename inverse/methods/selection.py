@@ -124,7 +124,7 @@ class Select(Settings):
     def run(
         self,
         candidates: Mapping[str, Candidate],
-        groups: Mapping[str, Data],
+        data_groups: Mapping[str, Data],
         evaluate: Callable[[str, str], Evaluate],
         free: Callable[[str, str], Evaluate] | None = None,
         finer: Callable[[str, str], Finer] | None = None,
@@ -135,7 +135,7 @@ class Select(Settings):
         ----------
         candidates
             By name.
-        groups
+        data_groups
             Data by the name of the group.
         evaluate
             The model of a candidate in a group; its first outputs are the data of the group, others are predicted.
@@ -154,10 +154,10 @@ class Select(Settings):
         SolveError
             If a model has no answer at any start or any point.
         """
-        pairs = [(name, group) for name in candidates for group in groups]
+        pairs = [(name, group) for name in candidates for group in data_groups]
         posteriors, stated = {}, {}
         for name, group in pairs:
-            one = started(posterior(candidates[name], groups[group], self.noise, evaluate(name, group)))
+            one = started(posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group)))
             posteriors[name, group], stated[name, group] = self._assess(one, (name, group))
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
@@ -169,36 +169,38 @@ class Select(Settings):
             }
         for label, noise in self.other_noises.items():
             variants[label] = {
-                pair: self._value(_with_noise(posteriors[pair], groups[pair[1]], noise), pair) for pair in pairs
+                pair: self._value(_with_noise(posteriors[pair], data_groups[pair[1]], noise), pair) for pair in pairs
             }
         for label, tests in self.subsets.items():
             variants[label] = {
-                pair: self._value(_only(posteriors[pair], groups[pair[1]], tests), pair)
+                pair: self._value(_only(posteriors[pair], data_groups[pair[1]], tests), pair)
                 for pair in pairs
-                if set(tests) & set(_tests(groups[pair[1]]))
+                if set(tests) & set(_tests(data_groups[pair[1]]))
             }
         checks = {}
         if self.check is not None:
             source = free or evaluate
             checks = {pair: nested(replace(posteriors[pair], evaluate=source(*pair)), seed=self.seed) for pair in pairs}
         left_out = (
-            {test: self._without(test, groups, posteriors) for test in _testnames(groups)} if self.held_out else {}
+            {test: self._without(test, data_groups, posteriors) for test in _testnames(data_groups)}
+            if self.held_out
+            else {}
         )
         meshes = {}
         if finer is not None:
             meshes = {pair: moved(posteriors[pair], stated[pair].gaussian, finer(*pair)) for pair in pairs}
-        return comparison(candidates, groups, posteriors, stated, variants, checks, left_out, meshes)
+        return comparison(candidates, data_groups, posteriors, stated, variants, checks, left_out, meshes)
 
     def _without(
-        self, test: str, groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
+        self, test: str, data_groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
     ) -> dict[tuple[str, str], tuple[float, float]]:
         """Return ln Z and its error without a test, in the groups that have it and others."""
         found = {}
         for pair, posterior in posteriors.items():
-            rest = _tests(groups[pair[1]])
+            rest = _tests(data_groups[pair[1]])
             if test in rest and len(rest) > 1:
                 others = tuple(other for other in rest if other != test)
-                found[pair] = self._value(_only(posterior, groups[pair[1]], others), pair)
+                found[pair] = self._value(_only(posterior, data_groups[pair[1]], others), pair)
         return found
 
     def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[Posterior, Assessment]:
@@ -257,8 +259,8 @@ def _tests(data: Data) -> tuple[str, ...]:
     return tuple(dict.fromkeys(data.tests[: data.values.size]))
 
 
-def _testnames(groups: Mapping[str, Data]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(test for data in groups.values() for test in _tests(data)))
+def _testnames(data_groups: Mapping[str, Data]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(test for data in data_groups.values() for test in _tests(data)))
 
 
 def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:

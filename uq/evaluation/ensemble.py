@@ -36,14 +36,14 @@ class Ensemble:
         All ranks (a duplicate of what was given).
     group
         This rank's group: the communicator of its model.
-    groups
+    rank_groups
         Number of groups.
     """
 
-    def __init__(self, world: Any, group: Any, groups: int, index: int) -> None:
+    def __init__(self, world: Any, group: Any, rank_groups: int, index: int) -> None:
         self.world = world
         self.group = group
-        self.groups = groups
+        self.rank_groups = rank_groups
         self.index = index
         self._turns: Turns | None = None
 

@@ -21,14 +21,14 @@ def memory(study: StudyKind) -> float:
     return sum(cost.bytes for cost in (spec.cost() for spec in study.specs) if cost is not None)
 
 
-def shortage(study: StudyKind, groups: int = 1) -> Finding | None:
+def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
     """Say that the memory of this machine may not do for a study, by so many groups of ranks on it."""
     need = memory(study)
     if not need:
         return None
     for limit in sorted(limits(), key=lambda one: one.size):
         wanted = need + of_program(limit)
-        wanted *= 1 if limit.of_each_process else groups
+        wanted *= 1 if limit.of_each_process else rank_groups
         if wanted > limit.size:
             text = f"memory may run out: about {wanted / MIB:,.0f} MiB are needed, {limit}"
             return Finding("warning", text)
@@ -40,8 +40,8 @@ def of_program(limit: Headroom) -> float:
     return ADDRESSES_OF_PROGRAM if limit.of_addresses else BYTES_OF_PROGRAM
 
 
-def plan(study: StudyKind, groups: int = 1) -> list[str]:
+def plan(study: StudyKind, rank_groups: int = 1) -> list[str]:
     """Describe a study in lines: unknowns, solves, memory and predicted time."""
-    short = shortage(study, groups)
+    short = shortage(study, rank_groups)
     found = [*study.findings, *([] if short is None else [short])]
-    return [*study.plan(groups), *own_code.listed(study), *(f"{one.severity:10}  {one.text}" for one in found)]
+    return [*study.plan(rank_groups), *own_code.listed(study), *(f"{one.severity:10}  {one.text}" for one in found)]

@@ -137,7 +137,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
     dataset = study.finished(dataset, evaluations)
     wall = time.monotonic() - begin
-    summary = summarised(study, name, dataset, job, world.size, ensemble.groups, wall)
+    summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
     _leave(directory, dataset, evaluations, summary, checkpoint, job)
     if report:
         _report(directory)
@@ -187,7 +187,7 @@ def _leave(
     job: Job,
 ) -> None:
     """Write all results, in an order that a kill cannot spoil."""
-    write_dataset(directory / "results.nc", dataset, job.groups(dataset))
+    write_dataset(directory / "results.nc", dataset, job.arviz_groups(dataset))
     write_fields(directory / "fields", dataset)
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
@@ -211,12 +211,14 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
     if ranks % share:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
-    groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
-    if groups > blocks and study.patient:
-        _note(f"{groups} groups of ranks were started for {blocks} tasks: {groups - blocks} have nothing to do")
-    elif groups > blocks:
+    rank_groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
+    if rank_groups > blocks and study.patient:
+        _note(
+            f"{rank_groups} groups of ranks were started for {blocks} tasks: {rank_groups - blocks} have nothing to do"
+        )
+    elif rank_groups > blocks:
         message = (
-            f"{ranks} ranks were started as {groups} groups, but the study has work for {blocks} only: "
+            f"{ranks} ranks were started as {rank_groups} groups, but the study has work for {blocks} only: "
             f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
         )
         raise StudyError(message)

@@ -32,7 +32,7 @@ def summarised(
     dataset: xr.Dataset,
     job: Job,
     ranks: int,
-    groups: int,
+    rank_groups: int,
     wall: float,
 ) -> dict[str, Any]:
     """Return what summary.json says: the study, what came of it, what that took, and by what it was made."""
@@ -61,7 +61,7 @@ def summarised(
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": getattr(study.method, "seed", None),
             "ranks": ranks,
-            "groups": groups,
+            "groups": rank_groups,
             "processor": platform.machine(),
             "commit": commit(),
             **({} if source is None else {"source": source}),

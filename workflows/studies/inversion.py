@@ -316,7 +316,7 @@ class Inversion(InversionStudy):
         """Read a file of displacements; errors as of every inversion."""
         return read_measurement(path, self.model, self.data)
 
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say what is inverted, and how long that will take."""
         found: list[str] = named("workflows.studies.inversion_plan:plan")(self)
         return found

@@ -22,7 +22,7 @@ from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_mesh, on_finer_mesh, solved_by
 from workflows.studies.inversion import Inversion, InversionStudy
-from workflows.studies.inversion_results import BATCH, Rows, Vertices, batch_table, dataset, groups
+from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.output_inversion import OutputInversion, derivable
 
@@ -192,7 +192,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         forget,
         results,
         lambda found: judged(found, study),
-        groups=partial(groups, study),
+        arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )
 
@@ -237,6 +237,6 @@ def _one(study: InversionStudy, made: _Made) -> MethodJob:
         task,
         recorders,
         lambda found: judged(found, study),
-        groups=partial(groups, study),
+        arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )

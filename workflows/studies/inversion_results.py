@@ -282,7 +282,7 @@ class Rows:
         self._write(_table([self._head, *(self._rows[number] for number in sorted(self._rows))]))
 
 
-def groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Dataset]:
+def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`."""
     import xarray as xr
 

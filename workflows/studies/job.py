@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.turns import Progress
 
-Groups = Callable[["xr.Dataset"], Mapping[str, "xr.Dataset"]]
+ArvizGroups = Callable[["xr.Dataset"], Mapping[str, "xr.Dataset"]]
 Texts = Callable[["xr.Dataset"], Mapping[str, str]]
 
 
@@ -31,7 +31,7 @@ class Job(Protocol):
         """Adds to the results what the method does not know."""
 
     @property
-    def groups(self) -> Groups:
+    def arviz_groups(self) -> ArvizGroups:
         """Groups of results.nc beside its own variables."""
 
     @property
@@ -62,7 +62,7 @@ class MethodJob:
         Runs the method on rank 0.
     recorders
         What was evaluated, by the name that it is kept under.
-    labelled, groups, texts
+    labelled, arviz_groups, texts
         As of `Job`.
     costly
         Whether solves are worth a file: where they are not, an interrupted study begins again.
@@ -76,7 +76,7 @@ class MethodJob:
     recorders: dict[str, Recorder]
     labelled: Callable[[xr.Dataset], xr.Dataset]
     costly: bool = True
-    groups: Groups = field(default=lambda _: {})
+    arviz_groups: ArvizGroups = field(default=lambda _: {})
     texts: Texts = field(default=lambda _: {})
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
 
@@ -115,7 +115,7 @@ class TasksJob:
         As of `uq.evaluation.tasks.run_tasks`.
     results
         The dataset of the study from the outcomes of all tasks.
-    labelled, groups, texts
+    labelled, arviz_groups, texts
         As of `Job`.
     outcomes
         Those of all tasks, once they are done.
@@ -127,7 +127,7 @@ class TasksJob:
     kept: Callable[[], None]
     results: Callable[[Sequence[Outcome]], xr.Dataset]
     labelled: Callable[[xr.Dataset], xr.Dataset]
-    groups: Groups = field(default=lambda _: {})
+    arviz_groups: ArvizGroups = field(default=lambda _: {})
     texts: Texts = field(default=lambda _: {})
     outcomes: list[Outcome] = field(default_factory=list)
 

@@ -213,7 +213,7 @@ class Measurements(Settings):
     source: tuple[str, ...] = ()
 
     @property
-    def groups(self) -> tuple[str, ...]:
+    def data_groups(self) -> tuple[str, ...]:
         """Names of the groups."""
         return tuple(dict.fromkeys(test.group for test in self.tests))
 

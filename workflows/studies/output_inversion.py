@@ -148,7 +148,7 @@ class OutputInversion(InversionStudy):
         """Say of each datum of a data set where it stands."""
         return self.measured(number).data_labels()
 
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say what is inverted, and how long that will take."""
         found: list[str] = named("workflows.studies.inversion_plan:plan_of_outputs")(self)
         return found

@@ -216,7 +216,7 @@ class OutputSelection(Comparison):
         return (WHOLE,)
 
     @property
-    def groups(self) -> dict[str, Data]:
+    def data_groups(self) -> dict[str, Data]:
         """Data by group; outputs are tests, whose data are told apart by their number."""
         names = self.data.names
         at = np.array([float(names[:k].count(name)) for k, name in enumerate(names)])

@@ -108,9 +108,9 @@ class Study(StudyKind):
         """Modules that a user has written for the model."""
         return self.model.modules
 
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
-        lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, groups)
+        lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, rank_groups)
         return lines
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from workflows.studies.sampling import Study
 
 
-def plan(study: Study, groups: int) -> list[str]:
+def plan(study: Study, rank_groups: int) -> list[str]:
     """Say what is sampled, how often, and how long that will take."""
     method, spec, planned = study.method, study.spec, study.planned
     up_to = "up to " if method.open_ended and not method.undecided else ""
@@ -40,7 +40,7 @@ def plan(study: Study, groups: int) -> list[str]:
     return [
         *lines,
         f"memory      about {needed / MIB:,.0f} MiB for each group of ranks",
-        *_told(parts(study), groups, up_to, later and ", then more"),
+        *_told(parts(study), rank_groups, up_to, later and ", then more"),
     ]
 
 
@@ -87,10 +87,10 @@ def _compiled_before() -> bool:
     return any(compiled_forms().glob("forms-*/*/"))
 
 
-def _told(found: Sequence[Part], groups: int, up_to: str, more: str) -> list[str]:
+def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str) -> list[str]:
     """Say what a study takes by the clock, if every group of ranks has a core, and of what that is the sum."""
-    by_clock = [part.seconds / (groups if part.shared else 1) for part in found]
-    cores = f"{groups} core{'s' if groups > 1 else ''}"
+    by_clock = [part.seconds / (rank_groups if part.shared else 1) for part in found]
+    cores = f"{rank_groups} core{'s' if rank_groups > 1 else ''}"
     lines = [f"time        {up_to}about {duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]
     lines += [f"            {duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
     if _compiled_before():

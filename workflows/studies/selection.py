@@ -187,7 +187,7 @@ class Comparison(StudyKind):
         raise NotImplementedError
 
     @property
-    def groups(self) -> dict[str, Data]:
+    def data_groups(self) -> dict[str, Data]:
         """Data by group."""
         raise NotImplementedError
 
@@ -233,7 +233,7 @@ class Comparison(StudyKind):
             return _elsewhere("workflows.studies.specimen_selection", "SpecimenSelection", blocks, folder)
         return Selection.model_validate(expanded(blocks, folder))
 
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say what is compared, and how long that will take."""
         lines: list[str] = named("workflows.studies.selection_plan:plan")(self)
         return lines
@@ -267,7 +267,7 @@ class Comparison(StudyKind):
             *((("other_noises", n), v) for n, v in self.method.other_noises.items()),
         ):
             yield from mistakes_of_factor(noise.factor, "method", *place, "factor")
-            for data in self.groups.values():
+            for data in self.data_groups.values():
                 try:
                     noise.sigma(data.values, data.sigma)
                 except ValueError as error:
@@ -312,7 +312,7 @@ class Selection(Comparison):
     @property
     def group_names(self) -> tuple[str, ...]:
         """Names of the groups."""
-        return self.data.groups
+        return self.data.data_groups
 
     def tests(self, group: str) -> tuple[str, ...]:
         """Names of the tests that were measured in a group."""
@@ -328,10 +328,10 @@ class Selection(Comparison):
         return self.candidates[name].kind
 
     @property
-    def groups(self) -> dict[str, Data]:
+    def data_groups(self) -> dict[str, Data]:
         """Data by group."""
         found = {}
-        for group in self.data.groups:
+        for group in self.data.data_groups:
             tests = self._measured(group)
             known = all(test.sigma is not None for test in tests)
             labels = [test.label for test in self._tests(group) for _ in test.at]
@@ -367,7 +367,7 @@ class Selection(Comparison):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        for group in self.data.groups:
+        for group in self.data.data_groups:
             labels = [test.label for test in self._tests(group)]
             twice = next((label for label in labels if labels.count(label) > 1), None)
             if twice is not None:

@@ -12,7 +12,7 @@ from uq.findings import add
 from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
 from workflows.studies.finer import FINER, solved_by
 from workflows.studies.job import MethodJob
-from workflows.studies.selection_results import groups
+from workflows.studies.selection_results import arviz_groups
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,7 +43,7 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
                 return Finer(None, why[name])
             return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
-        return study.method.run(study.models, study.groups, recorded, free, finer if why else None)
+        return study.method.run(study.models, study.data_groups, recorded, free, finer if why else None)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
@@ -55,4 +55,6 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
     others |= {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}
     first = makers[study.pairs[0]]()
-    return MethodJob(first, others, task, recorders, labelled, groups=partial(groups, study), costly=study.costly)
+    return MethodJob(
+        first, others, task, recorders, labelled, arviz_groups=partial(arviz_groups, study), costly=study.costly
+    )

@@ -28,15 +28,15 @@ def plan(study: Comparison) -> list[str]:
         meshes = [(0.0, NOT_ASKED)]
     seconds += sum(once for once, _ in meshes)
     check = " and nested sampling, which takes minutes" if method.check else ""
-    data = study.groups.values()
+    data = study.data_groups.values()
     tests = sum(len(study.tests(group)) for group in study.group_names)
-    groups = f" in {len(data)} groups" if len(data) > 1 else ""
+    among = f" in {len(data)} groups" if len(data) > 1 else ""
     kind, parts = DATA[study.quantity]
     count = f"{sum(one.values.size for one in data)} {kind} of {tests} {parts}"
     return [
         f"method      {method.kind}",
         f"candidates  {', '.join(f'{name} ({len(c.parameters)})' for name, c in study.candidates.items())}",
-        f"data        {count}{groups}",
+        f"data        {count}{among}",
         f"evidences   {evidences}{check}",
         *(f"mesh check  {words}" for words in dict.fromkeys(words for _, words in meshes)),
         f"solves      about {study.planned:,}",

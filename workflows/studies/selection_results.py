@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 DRAWS = 1000  # of the constants
 
 
-def groups(study: Comparison, found: xr.Dataset) -> dict[str, xr.Dataset]:
+def arviz_groups(study: Comparison, found: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return ArviZ's groups: `arviz.from_netcdf("results.nc")`.
 
     Draws of the constants of every model before and after the data, in each group of data; ln of the density of each

@@ -255,7 +255,7 @@ class SpecimenSelection(Comparison):
         return (WHOLE,)
 
     @property
-    def groups(self) -> dict[str, Data]:
+    def data_groups(self) -> dict[str, Data]:
         """Data by group; load cases are tests, whose data are told apart by their number."""
         data, cases = self.data, list(dict.fromkeys(self.data.cases))
         kinds = 3 * np.array([cases.index(case) for case in data.cases]) + self._axes

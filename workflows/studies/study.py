@@ -96,7 +96,7 @@ class StudyKind(Settings):
         return ()
 
     @abstractmethod
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say line by line what it is and what it will cost with so many groups of ranks."""
 
     @abstractmethod

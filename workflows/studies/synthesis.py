@@ -98,7 +98,7 @@ class Synthesis(StudyKind):
         """The specimen."""
         return (self.model,)
 
-    def plan(self, groups: int) -> list[str]:
+    def plan(self, rank_groups: int) -> list[str]:
         """Say what is made, and how long that will take."""
         return plan(self)
 

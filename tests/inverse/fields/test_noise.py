@@ -86,7 +86,7 @@ def test_models_that_are_not_linear():
     found = infer_noise(posterior, LogUniform(lower=0.1, upper=100.0))
     assert found.converged
     assert abs(np.log(found.factor * 0.01 / truth_sigma)) < 3 * found.log_std
-    again = find_mode(found.posterior, tolerance=1e-8).point.noise
+    again = find_mode(found.posterior, tolerance=1e-8).point.whitened
     np.testing.assert_allclose(found.mode.point.whitened, again, atol=0.02)
 
 

@@ -178,7 +178,7 @@ def test_nested_sampling_agrees_on_brain():
     study = load(CONFIGS / "brain.toml")
     for kind in study.candidates:
         it = SerialEvaluate(study.build(kind, "cortex"))
-        whole = assemble(study.models[kind], study.groups["cortex"], study.method.noise, it)
+        whole = assemble(study.models[kind], study.data_groups["cortex"], study.method.noise, it)
         found = evidence(whole, laplace(whole), 256)
         value, error = nested(whole)
         assert abs(found.log_evidence - value) < 3 * np.hypot(found.error, error), kind

@@ -35,7 +35,7 @@ from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.run.run import run as run_study
 from workflows.starter import starter
-from workflows.studies.inversion_results import _volumes, groups
+from workflows.studies.inversion_results import _volumes, arviz_groups
 
 ROOT = Path(__file__).parent.parent.parent.parent
 
@@ -527,10 +527,10 @@ def test_chains_are_those_of_arviz(folder):
         },
         {"data_set": ["made-1"], "parameter": list(study.names)},
     )
-    kept = groups(study, found)
+    kept = arviz_groups(study, found)
     assert kept["log_likelihood"]["displacement"].shape == (4, 12, 2)
     np.testing.assert_array_equal(kept["posterior"]["material.mu"], 1 + 2 * np.arange(48).reshape(4, 12))
-    assert groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
+    assert arviz_groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
 
 
 def test_a_field_and_its_report(folder):

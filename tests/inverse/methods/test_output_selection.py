@@ -100,7 +100,10 @@ def test_linear_models_have_their_exact_evidences(folder):
     assert set(json.loads((out / "summary.json").read_text())["models"]) == {"one", "one-alone", "other"}
     assert "one-alone" in (out / "report.html").read_text()
     study, table = load(folder / "rivals.toml"), 'data={file="table.csv", sigma={w=0.3}}'
-    assert load(folder / "rivals.toml", [table]).groups["all"].sigma.tolist() == study.groups["all"].sigma.tolist()
+    assert (
+        load(folder / "rivals.toml", [table]).data_groups["all"].sigma.tolist()
+        == study.data_groups["all"].sigma.tolist()
+    )
     assert parse(document(study)) == study
     assert main(["check", str(folder / "rivals.toml")]) == 0
 

@@ -101,7 +101,7 @@ def test_uniaxial_data_alone_mislead():
     names = ("neo-hookean", "mooney-rivlin", "yeoh", "gent")
     models = {pair: study.build(*pair) for pair in study.pairs}
     chosen = {name: study.models[name] for name in names}
-    found = study.method.run(chosen, study.groups, lambda *pair: SerialEvaluate(models[pair]))
+    found = study.method.run(chosen, study.data_groups, lambda *pair: SerialEvaluate(models[pair]))
     assert "It depends: the most probable is mooney-rivlin with uniaxial tension alone." in texts(found)
     assert texts(found)[0].startswith("yeoh is the most probable")
 
@@ -205,7 +205,7 @@ def test_whole_tests_are_held_out():
 def test_least_squares_are_modes_with_wide_priors():
     """Yeoh on all of Treloar's tests: the mode is the solution of the normal equations."""
     study = treloar()
-    data = study.groups["all"]
+    data = study.data_groups["all"]
     it = HomogeneousModel("yeoh", {}, study.data.tests, ("C10", "C20", "C30"))
     sigma = np.full(data.values.size, 5e4)
     A = it.stresses_and_derivatives(np.zeros((1, 3)))[1][0]
@@ -223,8 +223,8 @@ def test_brain_cortex_is_in_the_second_invariant():
     from scipy.optimize import nnls
 
     study = load(CONFIGS / "brain.toml")
-    assert study.data.groups == ("basal_ganglia", "corona_radiata", "corpus_callosum", "cortex")
-    data = study.groups["cortex"]
+    assert study.data.data_groups == ("basal_ganglia", "corona_radiata", "corpus_callosum", "cortex")
+    data = study.data_groups["cortex"]
     A = study.build("mooney-rivlin", "cortex").stresses_and_derivatives(np.full((1, 2), 100.0))[1][0]
     (C1, C2), _ = nnls(A, data.values)
     assert C1 < 1e-6 * C2

@@ -88,8 +88,8 @@ def test_evidence_is_that_of_quadrature(study):
     """One parameter: ln Z of both meshes by the trapezoidal rule over the prior; the coarse mesh is found out."""
     it = load(study)
     models = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
-    found = it.method.run(it.models, it.groups, lambda name, _: SerialEvaluate(models[name]))
-    data = it.groups["all"]
+    found = it.method.run(it.models, it.data_groups, lambda name, _: SerialEvaluate(models[name]))
+    data = it.data_groups["all"]
     grid = np.arange(-2.4, 0.7, 0.08)  # beyond, the data are far away
     prior = LogNormal(mean=1.2e4, std=4e3)
     for k, model in enumerate(models.values()):
@@ -152,7 +152,7 @@ def test_what_a_finer_mesh_does_to_an_evidence(study):
     here, there = (
         it.method.run(
             it.models,
-            it.groups,
+            it.data_groups,
             lambda name, _, models=models: SerialEvaluate(models[name]),
             finer=lambda name, _: Finer(lambda point: FinerMesh(coarse[name]).outputs(coarse[name], point)),
         )

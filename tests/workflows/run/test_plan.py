@@ -34,8 +34,8 @@ def test_the_plan_is_the_sum_of_its_parts(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     study = load(CONFIGS / "beam.toml")
 
-    def shown(groups):
-        lines = plan(study, groups)
+    def shown(rank_groups):
+        lines = plan(study, rank_groups)
         (first,) = [i for i, line in enumerate(lines) if line.startswith("time ")]
         return lines[first:]
 
