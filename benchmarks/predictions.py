@@ -86,7 +86,7 @@ def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]
     predicted = np.array(
         [
             model_times.first,
-            model_times.reference(d),
+            model_times.reference_factor(d),
             model_times.tangents(d),
             model_times.corrected,
             model_times.first,  # with its analysis, as it is the first of this model

@@ -108,7 +108,7 @@ class DerivativeError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceSolution:
     """A solution that was found before, whose linearisation may serve the solves near it.
 
     Attributes
@@ -126,7 +126,7 @@ class Reference:
     state: FloatArray
     spread: FloatArray | None = None
 
-    def same(self, other: Reference) -> bool:
+    def same(self, other: ReferenceSolution) -> bool:
         """Whether both are at the same place, for the same parameters."""
         pairs = zip(*([one.parameters, one.state, one.spread] for one in (self, other)), strict=True)
         return self is other or all(a is b or np.array_equal(a, b) for a, b in pairs)
@@ -151,7 +151,7 @@ class Guess:
     """
 
     state: FloatArray | None = None
-    reference: Reference | None = None
+    reference: ReferenceSolution | None = None
     iterations: int | None = None
 
 

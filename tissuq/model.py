@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, Guess, Reference, gathered
+from forward.model import FloatArray, Guess, ReferenceSolution, gathered
 from forward.settings import nearest
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Model:
                 message = f"'{path}' is not among the numbers that change; {nearest(path, tuple(self.parameters))}"
                 raise KeyError(message)
         point = np.array([values.get(path, value) for path, value in self.parameters.items()])
-        guess = None if near is None else Guess(near.solved.state, Reference(near.point, near.solved.state))
+        guess = None if near is None else Guess(near.solved.state, ReferenceSolution(near.point, near.solved.state))
         return Solution(self, point, self._model.solve(point, guess))
 
     @property

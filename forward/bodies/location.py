@@ -30,14 +30,14 @@ class Located:
     ----------
     cells
         Number (n,) of the cell.
-    reference
+    local
         Coordinates (n, 3) in the reference cell, never outside.
     distances
         How far (n,) the place there is from the point (m); zero for rounding, infinite where there are no cells.
     """
 
     cells: NDArray[np.int64]
-    reference: FloatArray
+    local: FloatArray
     distances: FloatArray
 
 
@@ -63,13 +63,13 @@ def locate(corners: FloatArray, points: FloatArray) -> Located:
 def _some(corners: FloatArray, boxes: tuple[FloatArray, FloatArray], points: FloatArray, tiny: float) -> Located:
     point, cell = _candidates(*boxes, points)
     of_cells = corners[cell]
-    reference = (_in_tetrahedra if corners.shape[1] == 4 else _in_hexahedra)(of_cells, points[point])
-    gap = np.einsum("nk,nka->na", shapes(reference, corners.shape[1]), of_cells) - points[point]
+    local = (_in_tetrahedra if corners.shape[1] == 4 else _in_hexahedra)(of_cells, points[point])
+    gap = np.einsum("nk,nka->na", shapes(local, corners.shape[1]), of_cells) - points[point]
     distance = np.linalg.norm(gap, axis=1)
     distance[distance < tiny] = 0.0
     order = np.lexsort((cell, distance, point))
     best = order[np.searchsorted(point[order], np.arange(len(points)))]
-    return Located(cell[best], reference[best], distance[best])
+    return Located(cell[best], local[best], distance[best])
 
 
 def _candidates(lows: FloatArray, highs: FloatArray, points: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -94,18 +94,18 @@ def _candidates(lows: FloatArray, highs: FloatArray, points: FloatArray) -> tupl
     return point[order], cell[order]
 
 
-def shapes(reference: FloatArray, corners: int) -> FloatArray:
+def shapes(local: FloatArray, corners: int) -> FloatArray:
     """Values (n, 4 or 8) of the linear shape functions of the corners at reference coordinates (n, 3)."""
     if corners == 4:
-        return np.column_stack([1 - reference.sum(axis=1), reference])
-    ends = np.stack([1 - reference, reference], axis=1)  # (n, 2, 3)
+        return np.column_stack([1 - local.sum(axis=1), local])
+    ends = np.stack([1 - local, local], axis=1)  # (n, 2, 3)
     return np.asarray(np.einsum("ni,nj,nk->nkji", ends[..., 0], ends[..., 1], ends[..., 2]).reshape(-1, 8))
 
 
-def _slopes(reference: FloatArray) -> FloatArray:
+def _slopes(local: FloatArray) -> FloatArray:
     """Their derivatives (n, 8, 3) in hexahedra."""
-    ends = np.stack([1 - reference, reference], axis=1)
-    along = np.broadcast_to(np.array([-1.0, 1.0]), (len(reference), 2))
+    ends = np.stack([1 - local, local], axis=1)
+    along = np.broadcast_to(np.array([-1.0, 1.0]), (len(local), 2))
     parts = []
     for axis in range(3):
         a, b, c = (along if k == axis else ends[..., k] for k in range(3))

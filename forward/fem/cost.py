@@ -148,7 +148,7 @@ class Times:
         corrections = CORRECTIONS[self.slender]
         return (corrections + 2) * self.substitution + (corrections + ACTIONS) * self.residual
 
-    def reference(self, parameters: int) -> float:
+    def reference_factor(self, parameters: int) -> float:
         """The factor of a reference, and the vectors for the screen of stability."""
         directions = min(parameters, DIRECTIONS)
         vectors = CHANGES * directions * self.residual + SUBSTITUTIONS * (1 + directions) * self.substitution

@@ -82,7 +82,7 @@ class FinerMesh:
         if cells.shape[1] == 8:
             cells = cells[:, VTK_TO_TENSOR]
         found = locate(vertices.coordinates[cells], self._model.vertices.coordinates)
-        return cells[found.cells], shapes(found.reference, cells.shape[1])
+        return cells[found.cells], shapes(found.local, cells.shape[1])
 
     def outputs(self, observed: SpecimenModel, point: FloatArray) -> FloatArray:
         """Solve at parameters (d,) of the specimen, and return what is `observed` of it; collective.

@@ -15,7 +15,7 @@ from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, Reference, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, ReferenceSolution, SolveError, Stability, Work
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
@@ -141,7 +141,7 @@ class HyperelasticModel(OneByOne):
         """Whether the factor at hand is that of a solution."""
         return self.equations.latest.factorised is solution
 
-    def take_reference(self, reference: Reference) -> ReferenceFactor:
+    def take_reference(self, reference: ReferenceSolution) -> ReferenceFactor:
         """Return the factor of a reference; this may change parameters and state."""
         self.reference.prepare(reference)
         return self.reference
@@ -162,7 +162,9 @@ class _Way:
         A number in [0, 1) that depends on the parameters asked for.
     """
 
-    def __init__(self, model: HyperelasticModel, reference: Reference, parameters: FloatArray, *, screen: bool) -> None:
+    def __init__(
+        self, model: HyperelasticModel, reference: ReferenceSolution, parameters: FloatArray, *, screen: bool
+    ) -> None:
         self._screen = screen
         self.draw = draw(parameters)
         self._equations, self._factor = model.equations, model.reference
@@ -241,7 +243,13 @@ class FiniteElementSolution:
         return model.linearise(self).back_substitute(right, transpose=transpose)
 
     def _solve_near(
-        self, right: FloatArray, reference: Reference, R: FloatArray, *, transpose: bool, directions: FloatArray | None
+        self,
+        right: FloatArray,
+        reference: ReferenceSolution,
+        R: FloatArray,
+        *,
+        transpose: bool,
+        directions: FloatArray | None,
     ) -> FloatArray | None:
         """Solve with the factor of the reference, turned as for its prediction; None if that is too far away."""
         model = self._model

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from forward.fem.equations import Discretisation
-from forward.model import FloatArray, Reference, Work
+from forward.model import FloatArray, ReferenceSolution, Work
 from forward.solvers.anderson import Inverse
 from forward.solvers.linear import LinearSolver
 from forward.solvers.rotations import rotations, turn, turned
@@ -27,12 +27,12 @@ class ReferenceFactor:
         self._equations = equations
         self._solver = equations.new_solver()
         self._rotations = np.empty((3, 3, 0))
-        self._reference: Reference | None = None
+        self._reference: ReferenceSolution | None = None
         self._slopes: FloatArray | None = None
         self._vectors: FloatArray | None = None
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
 
-    def prepare(self, reference: Reference) -> None:
+    def prepare(self, reference: ReferenceSolution) -> None:
         """Factorise at a reference, if the factor at hand is another's; this changes parameters and state."""
         if self._reference is not None and self._reference.same(reference):
             return
@@ -42,7 +42,7 @@ class ReferenceFactor:
         self._rotations = rotations(equations.gradients())
         self._reference = reference
 
-    def _set(self, reference: Reference) -> Discretisation:
+    def _set(self, reference: ReferenceSolution) -> Discretisation:
         equations = self._equations
         equations.set_parameters(reference.parameters)
         equations.at_load(1.0)
@@ -95,7 +95,7 @@ class ReferenceFactor:
         assert self._screening is not None
         return self._screening
 
-    def _changes(self, reference: Reference, random: np.random.Generator) -> Iterator[Rows]:
+    def _changes(self, reference: ReferenceSolution, random: np.random.Generator) -> Iterator[Rows]:
         """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents.
 
         They are differences of differences of forces: a product is two of them, where a stiffness is assembled in the

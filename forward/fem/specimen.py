@@ -19,7 +19,7 @@ from forward.bodies.geometry import AXES
 from forward.fem.dolfinx import spaces
 from forward.fem.layout import Layout
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
-from forward.model import FloatArray, Guess, OneByOne, Reference, SolveError, Stability, Work
+from forward.model import FloatArray, Guess, OneByOne, ReferenceSolution, SolveError, Stability, Work
 from forward.specimen import Observed, Specimen
 
 
@@ -149,7 +149,7 @@ class SpecimenModel(OneByOne):
                 yield Guess(state, iterations=guess.iterations)
             else:
                 spread = None if near.spread is None else near.spread[..., where]
-                reference = Reference(near.parameters[where], self.states(near.state)[k], spread)
+                reference = ReferenceSolution(near.parameters[where], self.states(near.state)[k], spread)
                 yield Guess(state, reference, guess.iterations)
 
     def states(self, rows: FloatArray) -> list[FloatArray]:

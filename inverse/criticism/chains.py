@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from forward.model import FloatArray, Guess, Reference, SolveError
+from forward.model import FloatArray, Guess, ReferenceSolution, SolveError
 from inverse.criticism.predictive import ResidualTest
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy, worth
 from inverse.fields.field_posterior import Point
@@ -346,7 +346,7 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
     state = np.array(mode.solution.state)
     # Where the samples go is what the screen of stability has to know.
     draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.whitened))))
-    reference = Reference(mode.values, state, mode.posterior.prior.root(draws))
+    reference = ReferenceSolution(mode.values, state, mode.posterior.prior.root(draws))
     strong = pairs.values > STRONG
     vectors, images, stiffness = pairs.vectors[strong], pairs.images[strong], 1 + pairs.values[strong]
     centre = vectors @ mode.whitened

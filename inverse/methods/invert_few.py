@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Guess, Reference, SolveError
+from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
 from inverse.criticism.chains import Chains, chains_of_few, ensemble, verdict_on_few
 from inverse.criticism.comparison import quantiles
 from inverse.criticism.finer import NOT_LOOKED, Finer, parameters_moved
@@ -76,7 +76,7 @@ class Nearby:
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) with its reference."""
-        reference = Reference(self.point, self.state, self.spread)
+        reference = ReferenceSolution(self.point, self.state, self.spread)
         return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
 
 

@@ -146,7 +146,7 @@ def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, Floa
 
 
 def combine(
-    reference: FloatArray,
+    offset: FloatArray,
     terms: Sequence[Term],
     coefficient: float | FloatArray = 1.0,
     second_coefficient: float | FloatArray = 1.0,
@@ -155,7 +155,7 @@ def combine(
 
     Parameters
     ----------
-    reference
+    offset
         ψ̄ (…).
     terms
         The terms.
@@ -165,7 +165,7 @@ def combine(
     m1, mean_variance, variance, variance_error = _sums(terms)
     std: FloatArray = np.sqrt(variance)
     return Estimates(
-        mean=reference + m1,
+        mean=offset + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
         std_error=error_of_root(std, variance_error),
@@ -204,7 +204,7 @@ def _sum(arrays: Iterable[FloatArray]) -> FloatArray:
 def estimate(
     sums: FloatArray,
     n: int,
-    reference: FloatArray,
+    offset: FloatArray,
     control_variance: FloatArray | None = None,
     coefficient: Coefficient = "one",
     second_moment: SecondMoment = "quadratic",
@@ -217,7 +217,7 @@ def estimate(
         Sums (k, …) of w^a L^b over the samples.
     n
         Number of samples, at least 2.
-    reference
+    offset
         ψ̄ (…).
     control_variance
         V = E[L²] (…); without it the estimators are those of plain Monte Carlo.
@@ -229,7 +229,7 @@ def estimate(
     controlled = control_variance is not None
     exponents = EXPONENTS if controlled else tuple((a, 0) for a in range(1, 5))
     means = {e: s / n for e, s in zip(exponents, sums, strict=True)}
-    zero: FloatArray = np.zeros_like(reference)
+    zero: FloatArray = np.zeros_like(offset)
 
     def mean_of(a: int, b: int) -> FloatArray:
         return np.asarray(means.get((a, b), zero))
@@ -262,7 +262,7 @@ def estimate(
     )
     one = reduced(beta1, beta2)
     _, _, _, variance_error = _sums([one])
-    found = combine(reference, [one], beta1, beta2)
+    found = combine(offset, [one], beta1, beta2)
 
     return Moments(
         mean=found.mean,
@@ -278,7 +278,7 @@ def estimate(
 
 def estimate_from_replicates(
     means: FloatArray,
-    reference: FloatArray,
+    offset: FloatArray,
     expected: tuple[FloatArray, FloatArray] | None = None,
     coefficient: Coefficient = "one",
 ) -> Estimates:
@@ -295,7 +295,7 @@ def estimate_from_replicates(
     ----------
     means
         Means (2, R, …) of w and w² over each of R replicates; (4, R, …) of w, w², C and D with a control.
-    reference
+    offset
         ψ̄ (…).
     expected
         E[C] and E[D] (…).
@@ -313,11 +313,11 @@ def estimate_from_replicates(
     """
     w, square = means[:2]
     R = len(w)
-    beta1 = beta2 = leverage1 = leverage2 = np.zeros_like(reference)
+    beta1 = beta2 = leverage1 = leverage2 = np.zeros_like(offset)
     if expected is not None:
         c, d = means[2] - expected[0], means[3] - expected[1]
         if coefficient == "one":
-            beta1 = beta2 = np.ones_like(reference)
+            beta1 = beta2 = np.ones_like(offset)
         else:
             beta1, leverage1 = _regression(w, c)
             beta2, leverage2 = _regression(square, d)
@@ -337,7 +337,7 @@ def estimate_from_replicates(
     variance_variance += 2 * mean_variance**2  # as in `_sums`
     std = np.sqrt(variance)
     return Estimates(
-        mean=reference + m1,
+        mean=offset + m1,
         mean_error=np.sqrt(mean_variance),
         std=std,
         std_error=error_of_root(std, np.sqrt(variance_variance)),

@@ -23,7 +23,7 @@ from forward.model import (
     Guess,
     InadmissibleError,
     ModelError,
-    Reference,
+    ReferenceSolution,
     Solution,
     SolveError,
     displacements,
@@ -174,7 +174,7 @@ class Prediction:
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
         state, slopes = scattered(model, self.state[None, :])[0], scattered(model, self.slopes)
-        reference = Reference(self.point, state, self.spread)
+        reference = ReferenceSolution(self.point, state, self.spread)
         if len(slopes) == 0:
             return lambda _: Guess(state, reference)
         here = self.coordinates.of(self.point)

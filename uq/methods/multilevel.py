@@ -212,7 +212,7 @@ class MultilevelMonteCarlo(Amount):
                 "mesh_std": (both, np.array([e.std for e in telescoped])),
                 "mesh_variance": (both, np.array([s.std**2 for s in single])),
                 "mesh_variance_ratio": (both, np.array([s.variance_ratio for s in single])),
-                "difference_mean": (both, np.array([m.reference + m.term.first for m in meshes])),
+                "difference_mean": (both, np.array([m.offset + m.term.first for m in meshes])),
                 "difference_mean_error": (both, np.sqrt(controlled / np.array([[t.n] for t in differences]))),
                 "difference_variance": (both, plain),
                 "difference_variance_ratio": (both, ratio(plain, controlled, empty=1.0)),
@@ -360,7 +360,7 @@ class _Mesh:
         return self.centre.outputs - (0 if self._coarser is None else self._coarser.centre.outputs)
 
     @property
-    def reference(self) -> FloatArray:
+    def offset(self) -> FloatArray:
         """Difference (m,) of what the deviations are from."""
         return self.centre.middle - (0 if self._coarser is None else self._coarser.centre.middle)
 
@@ -403,10 +403,10 @@ class _Mesh:
     def single(self) -> Moments:
         """Moments on this mesh alone."""
         w, T, V = self.deviations(self.fine[self.ok], self.points[self.ok])
-        n, reference = len(w), self.centre.middle
+        n, offset = len(w), self.centre.middle
         if self._method.control == "none":
-            return estimate(monomials(w, None).sum(axis=1), n, reference)
-        return estimate(monomials(w, T).sum(axis=1), n, reference, V)
+            return estimate(monomials(w, None).sum(axis=1), n, offset)
+        return estimate(monomials(w, T).sum(axis=1), n, offset, V)
 
 
 @dataclass(frozen=True)
@@ -435,7 +435,7 @@ class _Found:
     def of(cls, meshes: Sequence[_Mesh]) -> _Found:
         terms = [mesh.term for mesh in meshes]
         by_mesh = tuple(combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
-        differences = np.array([mesh.reference + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
+        differences = np.array([mesh.offset + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
         # The differences at the mean parameters converge at the same rate, without sampling error.
@@ -464,7 +464,7 @@ def _consistency(coarser: _Mesh, mesh: _Mesh) -> FloatArray:
     with standard errors σ: beyond 1 the sum does not telescope (M. B. Giles, Acta Numerica 24 (2015), section 3.3).
     """
     a, b, c = coarser.single, mesh.single, mesh.term
-    c_mean, c_error = mesh.reference + c.first, np.sqrt(c.variance / c.n)
+    c_mean, c_error = mesh.offset + c.first, np.sqrt(c.variance / c.n)
     gap = np.abs(a.mean - b.mean + c_mean)
     # Rounding is no inconsistency, where the control leaves nothing else.
     gap = np.where(gap < 1e-12 * np.abs(b.mean), 0.0, gap)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, ForwardModel, Guess, Reference, Solution, SolveError, scattered
+from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
 from uq.estimators.indices import partial_variances, shares
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
@@ -198,7 +198,7 @@ class StateExpansion:
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
         """Return the function parameters (d,) → predicted state (U_local,) and its reference, for one group's model."""
         coefficients, state = scattered(model, self.coefficients), scattered(model, self.state[None, :])[0]
-        reference = Reference(self.point, state, self.spread)
+        reference = ReferenceSolution(self.point, state, self.spread)
         return lambda parameters: Guess(self.basis.at(parameters) @ coefficients, reference)
 
 

@@ -464,12 +464,12 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     tuple of numpy.ndarray
         The samples, and what the deviations are from (m,).
     """
-    reference = data.values.mean(axis=0)
+    offset = data.values.mean(axis=0)
     constant = (largest == 0).all(axis=1)
-    mean = (fit.without[:, constant].sum(axis=1) - reference)[fit.held]
+    mean = (fit.without[:, constant].sum(axis=1) - offset)[fit.held]
     square = (fit.without[:, ~constant] ** 2).sum(axis=1)[fit.held] + mean**2
-    f = data.values - reference
-    return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, reference
+    f = data.values - offset
+    return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
 
 def beyond(
@@ -655,7 +655,7 @@ def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
     """
     weights = (data.weights / data.weights.sum())[:, None]
     independent = 1 / (weights**2).sum()  # as many samples of equal weight know as much
-    first, second, reference = _unseen_samples(fit, largest, data)
+    first, second, offset = _unseen_samples(fit, largest, data)
     mean = (weights * first).sum(axis=0)
     second = second - 2 * mean * first + mean**2
     scale = student(max(len(data.values) - 1, 1)) / Z / np.sqrt(max(independent - 1, 1))
@@ -664,7 +664,7 @@ def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
     variance_error = scale * np.sqrt((weights * (second - variance) ** 2).sum(axis=0))
     std = np.sqrt(np.maximum(variance + mean_error**2, 0.0))
     return {
-        "mean": reference + mean,
+        "mean": offset + mean,
         "mean_error": mean_error,
         "std": std,
         "std_error": error_of_root(std, variance_error),

@@ -76,7 +76,7 @@ def parts(study: Study) -> list[Part]:
         *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
         Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
         Part(sum(one.tangents(dimension) for one in found), "its tangents"),
-        *([Part(sum(one.reference(dimension) for one in found), "reference factor")] if corrected else []),
+        *([Part(sum(one.reference_factor(dimension) for one in found), "reference factor")] if corrected else []),
         *([Part(seconds, further, shared=True)] if samples > 0 else []),
         Part(REPORT, "results and report"),
     ]

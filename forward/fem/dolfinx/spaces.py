@@ -106,7 +106,7 @@ def point_weights(
     found = locate(msh.geometry.x[version.corners_of_cells(msh)[: owned_cells(msh)]], points)
     every = np.array(comm.allgather(found.distances))
     # Nodes of degree 1 and 2 stand in the same order in every cell: none has two on an edge or a face.
-    values = cell_element(space).tabulate(0, found.reference)[0, :, :, 0]
+    values = cell_element(space).tabulate(0, found.local)[0, :, :, 0]
     mine = every.argmin(axis=0) == comm.rank
     here = [
         (np.asarray(space.dofmap.cell_dofs(cell)), np.array(row)) if own else None

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 
 from benchmarks import buckling
 from forward.hyperelastic import Hyperelastic
-from forward.model import Guess, Reference, SolveError, Stability
+from forward.model import Guess, ReferenceSolution, SolveError, Stability
 from forward.solvers import stability
 from forward.solvers.rotations import turn
 from uq.estimators import branch
@@ -121,7 +121,7 @@ def test_the_answer_does_not_depend_on_the_path(column):
     )
     guess = centre.prediction.on(model)
     reference = guess(problem.inputs.mean).reference
-    without = Reference(reference.parameters, reference.state)  # no spread, so no screen
+    without = ReferenceSolution(reference.parameters, reference.state)  # no spread, so no screen
     for load, stable in ((85.0, True), (112.0, True), (123.0, True), (127.0, False), (145.0, False)):
         point = np.array([load])
         straight = np.array(lenient.solve(point, guess(point)).state)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.model import Guess, Reference
+from forward.model import Guess, ReferenceSolution
 from tests.bodies import OUTPUTS, loaded_body, unloaded_body
 
 pytestmark = pytest.mark.fem
@@ -36,7 +36,7 @@ def points(values, spread, count=6):
 
 def test_the_answer_is_that_of_newton_without_a_stiffness(case):
     model, values, base, slopes = case
-    reference = Reference(values, base.state)
+    reference = ReferenceSolution(values, base.state)
     for point in points(values, 0.3):
         expected = model.solve(point)
         found = model.solve(point, Guess(base.state + (point - values) @ slopes, reference))
@@ -55,7 +55,7 @@ def test_derivatives_are_as_good_as_asked_and_no_dearer(material):
         base = model.solve(values)
         point, few = points(values, 0.3)[0], np.diag(values)[:3]
         start = base.state + base.state_tangent(point - values)
-        found = model.solve(point, Guess(start, Reference(values, base.state)))
+        found = model.solve(point, Guess(start, ReferenceSolution(values, base.state)))
         before = found.work.residuals
         tangents = found.state_tangent(few)
         products.append(found.work.residuals - before)
@@ -68,7 +68,7 @@ def test_derivatives_are_as_good_as_asked_and_no_dearer(material):
 def test_derivatives_follow_to_the_tolerance_of_the_solver(case):
     model, values, base, slopes = case
     point = points(values, 0.3)[0]
-    found = model.solve(point, Guess(base.state + (point - values) @ slopes, Reference(values, base.state)))
+    found = model.solve(point, Guess(base.state + (point - values) @ slopes, ReferenceSolution(values, base.state)))
     exact = model.solve(point)
     directions, weights = np.diag(values)[:3], np.eye(len(OUTPUTS))[:3]
     for name, rows in (("state_tangent", directions), ("tangent", directions), ("adjoint", weights)):
@@ -95,7 +95,10 @@ def test_rows_of_directions_are_one_direction_after_the_other(case):
 
 def test_what_was_solved_before_changes_nothing(case):
     model, values, base, slopes = case
-    reference, elsewhere = Reference(values, base.state), Reference(1.1 * values, model.solve(1.1 * values).state)
+    reference, elsewhere = (
+        ReferenceSolution(values, base.state),
+        ReferenceSolution(1.1 * values, model.solve(1.1 * values).state),
+    )
     point = points(values, 0.2)[0]
     start = base.state + (point - values) @ slopes
     direction = np.eye(len(values))[0]
@@ -103,7 +106,7 @@ def test_what_was_solved_before_changes_nothing(case):
     tangent = first.tangent(direction)
     model.solve(points(values, 0.3)[1], None).tangent(direction)
     model.solve(point, Guess(start, elsewhere)).tangent(direction)
-    again = model.solve(point, Guess(start, Reference(values.copy(), base.state.copy())))
+    again = model.solve(point, Guess(start, ReferenceSolution(values.copy(), base.state.copy())))
     np.testing.assert_array_equal(again.state, first.state)
     np.testing.assert_array_equal(again.tangent(direction), tangent)
     model.solve(point, Guess(start, elsewhere))
@@ -116,7 +119,7 @@ def test_a_reference_that_is_too_far_hands_over_to_newton(case):
     for i, path in enumerate(model.parameters):
         far[i] *= 0.2 if path.startswith("material.") else 1.5 if path.startswith("loads.") else 1
     expected = model.solve(far)
-    found = model.solve(far, Guess(base.state + (far - values) @ slopes, Reference(values, base.state)))
+    found = model.solve(far, Guess(base.state + (far - values) @ slopes, ReferenceSolution(values, base.state)))
     np.testing.assert_allclose(found.state, expected.state, rtol=0, atol=1e-7 * np.abs(expected.state).max())
     found.tangent(np.eye(len(values)))
 
@@ -125,7 +128,7 @@ def test_a_reference_that_is_too_far_hands_over_to_newton(case):
 def test_a_useless_prediction_does_no_harm(case, wrong):
     model, values, base, _ = case
     start = wrong * np.random.default_rng(0).random(len(base.state))
-    found = model.solve(values, Guess(start, Reference(values, base.state)))
+    found = model.solve(values, Guess(start, ReferenceSolution(values, base.state)))
     np.testing.assert_allclose(found.state, base.state, rtol=0, atol=1e-8 * np.abs(base.state).max())
 
 
@@ -134,7 +137,7 @@ def test_the_textbook_path_takes_no_help():
     textbook = model.spec.model_copy(update={"solver": model.spec.solver.model_copy(update={"kind": "newton"})})
     plain = textbook.build(MPI.COMM_SELF, model.parameters)
     base = plain.solve(values)
-    again = plain.solve(values, Guess(base.state, Reference(values, base.state)))
+    again = plain.solve(values, Guess(base.state, ReferenceSolution(values, base.state)))
     assert again.work == base.work
     assert base.work.factorisations == base.work.back_substitutions
     np.testing.assert_array_equal(again.state, base.state)
@@ -161,7 +164,7 @@ def test_a_column_that_buckles_is_told_from_one_that_stands():
 
 def test_a_few_corrections_say_how_far_they_are(case):
     model, values, base, slopes = case
-    reference = Reference(values, base.state)
+    reference = ReferenceSolution(values, base.state)
     point = points(values, 0.3)[0]
     start = base.state + (point - values) @ slopes
     exact = model.solve(point)
@@ -210,7 +213,7 @@ def test_a_few_newton_steps_go_from_the_start(case):
 def test_a_partial_state_that_is_not_admissible_is_solved_and_charged(case, wrong):
     model, values, base, _ = case
     start = wrong * np.random.default_rng(0).random(len(base.state))
-    found = model.solve(values, Guess(start, Reference(values, base.state), 2))
+    found = model.solve(values, Guess(start, ReferenceSolution(values, base.state), 2))
     assert found.converged
     np.testing.assert_allclose(found.state, base.state, rtol=0, atol=1e-8 * np.abs(base.state).max())
     assert found.work.residuals > model.solve(values).work.residuals
