@@ -36,7 +36,7 @@ def test_points_within_rounding_of_a_vertex_lie_in_a_cell(kind, rounding):
     points = np.concatenate([vertices, RNG.uniform(size=(50, 3))])
     points[:-50] += rounding * RNG.uniform(-1, 1, (len(vertices), 3))
     found = locate(corners, points)
-    assert ((found.local >= 0) & (found.reference <= 1)).all()
+    assert ((found.local >= 0) & (found.local <= 1)).all()
     assert (found.distances <= 2 * max(rounding, 1e-12)).all()
     np.testing.assert_allclose(places(corners, found), points, atol=2 * max(rounding, 1e-12))
 
