@@ -257,6 +257,11 @@ class Hyperelastic(ModelSpec):
         """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
         return self.model_copy(update={"body": self.body.refined(level)})
 
+    def enriched(self) -> Self:
+        """Return the same problem on the same mesh in elements of one degree more, in the form that it has here."""
+        formulation = "mixed" if self.mixed else "displacement"
+        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
+
     def mistakes_of_samples(self) -> Iterator[Mistake]:
         """Find random fields whose coefficients cannot be drawn."""
         for i, field in enumerate(self.fields):

@@ -155,6 +155,35 @@ class Guess:
     iterations: int | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class MeshError:
+    """What error its mesh is estimated to make of a solution: the exact minus the discrete value, so with a sign.
+
+    Estimates, and no bounds.
+
+    Attributes
+    ----------
+    outputs
+        Errors of the outputs (m,): added to these they correct them. NaN where there is no estimate, as of stresses at
+        single points.
+    state
+        This rank's part (U_local,) of the error of the state at its own nodes.
+    energy
+        Half of the square of its energy norm (J).
+    relative
+        Its energy norm relative to the size of the state, as the root of `energy` over the energy that is stored; NaN
+        where none is.
+    work
+        What the estimate has cost.
+    """
+
+    outputs: FloatArray
+    state: FloatArray
+    energy: float
+    relative: float
+    work: Work
+
+
 class Solution(Protocol):
     """The answer of a model at one parameter vector, with its linearisation there.
 
@@ -197,6 +226,15 @@ class Solution(Protocol):
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U_local,) along a `direction` (d,) of the parameters; (k, U_local)."""
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the error that the mesh makes of outputs and state; None for a model without a mesh; collective.
+
+        Raises
+        ------
+        SolveError
+            If there is no estimate at this solution.
+        """
 
 
 class NamedOutput(Protocol):
@@ -427,6 +465,10 @@ class FunctionSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """No state: empty."""
         return np.empty((*np.shape(direction)[:-1], 0))
+
+    def mesh_error(self) -> None:
+        """No mesh."""
+        return
 
     def _jacobian(self) -> FloatArray:
         if self.model.jacobian is None:

@@ -131,6 +131,14 @@ class ModelSpec(Settings):
         message = f"a model of kind '{self.kind}' has no meshes"
         raise ModelError(message)
 
+    def enriched(self) -> Self:
+        """Return the same model on the same mesh in elements of one degree more, which tell the error of its mesh.
+
+        Only what this costs is asked of it; solutions estimate the error (`Solution.mesh_error`).
+        """
+        message = f"a model of kind '{self.kind}' has no meshes"
+        raise ModelError(message)
+
     def textbook(self) -> Self:
         """Return the same model solved as in a textbook, by which it is measured what a better solver saves."""
         return self

@@ -147,6 +147,11 @@ class Specimen(ModelSpec):
         """Return the formulation for values of parameters within ranges, by their paths, and why it is taken."""
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
 
+    def enriched(self) -> Self:
+        """Return the same specimen on the same mesh in elements of one degree more, in the form that it has here."""
+        formulation = "mixed" if self.decision({}).mixed else "displacement"
+        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
+
     @property
     def mixable(self) -> bool:
         """Whether it can have pressures as unknowns."""

@@ -14,6 +14,7 @@ import numpy as np
 from annotated_types import Gt
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from forward.bodies.elements import default_quadrature
 from forward.bodies.mesh_file import MeshFile
 from forward.model import Finding, FloatArray
 from forward.settings import Settings
@@ -174,8 +175,7 @@ class _SixSided(Settings):
     @property
     def quadrature(self) -> int:
         """The degree of quadrature in force."""
-        default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
-        return self.quadrature_degree or default[self.cell, self.degree]
+        return self.quadrature_degree or default_quadrature(self.cell, self.degree)
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
@@ -192,6 +192,12 @@ class _SixSided(Settings):
             share = np.diff(_graded(np.linspace(0, 1, n + 1), *ends)).max()
             edges.append(np.linalg.norm(np.diff(corners, axis=2 - a), axis=-1).max() * share)
         return float(max(edges))
+
+    def enriched(self) -> Self:
+        """Return the same body on the same mesh with elements of one degree more, for estimates of its error."""
+        degree = self.degree + 1  # beyond what a study may ask for
+        quadrature = max(self.quadrature, default_quadrature(self.cell, degree))
+        return self.model_copy(update={"degree": degree, "quadrature_degree": quadrature})
 
     def refined(self, level: int) -> Self:
         """Return the same body with every cell divided by 2^level along each edge: its mesh is nested.

@@ -27,6 +27,7 @@ from annotated_types import Gt
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from forward.bodies.elements import default_quadrature, node_count
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
 from forward.settings import Settings, nearest, one_line
@@ -256,10 +257,7 @@ class MeshFile(Settings):
     def nodes(self) -> int:
         """Number of nodes of the displacement."""
         found = self.found
-        if self.degree == 1:
-            return found.vertices
-        inside = found.faces + found.cells if found.cell == "hexahedron" else 0
-        return found.vertices + found.edges + inside
+        return node_count(found.cell, self.degree, found.vertices, found.edges, found.faces, found.cells)
 
     @property
     def vertex_count(self) -> int:
@@ -269,8 +267,7 @@ class MeshFile(Settings):
     @property
     def quadrature(self) -> int:
         """The degree of quadrature in force."""
-        default = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
-        return self.quadrature_degree or default[self.cell, self.degree]
+        return self.quadrature_degree or default_quadrature(self.cell, self.degree)
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
@@ -342,6 +339,12 @@ class MeshFile(Settings):
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
         return list(self.found.boundaries[boundary])
+
+    def enriched(self) -> Self:
+        """Return the same body on the same mesh with elements of one degree more, for estimates of its error."""
+        degree = self.degree + 1  # beyond what a study may ask for
+        quadrature = max(self.quadrature, default_quadrature(self.cell, degree))
+        return self.model_copy(update={"degree": degree, "quadrature_degree": quadrature})
 
     def refined(self, level: int) -> Self:
         """Return the same body with every tetrahedron divided into eight `level` times, when it is meshed.

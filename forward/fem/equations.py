@@ -20,6 +20,7 @@ import numpy as np
 
 from forward.fem import ranks
 from forward.fem.dolfinx import spaces
+from forward.fem.forms import Forms
 from forward.fem.linearisation import Linearisation
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import moduli
@@ -40,8 +41,8 @@ class Discretisation(Linearisation):
 
     _deadline: tuple[float, float] | None = None  # end of the time of a solve, and its length
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
-        super().__init__(spec, comm, parameters)
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
+        super().__init__(spec, comm, parameters, beside)
         self._jacobians = self.at_points(self.J)
         self._external = 0.0
         self._stretch = self._small_stretch()

@@ -8,6 +8,7 @@ from typing import Any, Literal, assert_never
 
 import numpy as np
 import ufl
+from numpy.typing import NDArray
 
 from forward.bodies.inclusions import stiffness_factor
 from forward.bodies.mesh_file import MeshFile
@@ -24,13 +25,22 @@ class Forms:
     """What is integrated over a body, as functions of its state, its parameters and directions of both.
 
     Forms that only derivatives need are compiled when they are first used.
+
+    Parameters
+    ----------
+    spec, comm, parameters
+        As of `HyperelasticModel`.
+    beside
+        Forms of the same body in other elements, whose mesh and random fields these share.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         self.spec = spec
         self.comm = comm
         self.parameters = parameters
-        self.mesh, self.facets = meshes.mesh_body(comm, spec.body)
+        found = meshes.mesh_body(comm, spec.body) if beside is None else (beside.mesh, beside.facets)
+        self.mesh: Any = found[0]
+        self.facets: dict[str, NDArray[np.int32]] = found[1]
         self.unknowns = unknowns.Unknowns(self.mesh, spec.body.degree, mixed=spec.mixed)
         self.size = self.unknowns.size
         self.space = self.unknowns.displacement
@@ -47,7 +57,11 @@ class Forms:
         }
         self._variables = {path: ufl.variable(constant) for path, constant in self._constants.items()}
         self.scalars = np.array([i for i, path in enumerate(parameters) if path in self._values], dtype=np.int64)
-        self.fields = tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
+        self.fields: tuple[VertexField, ...] = (
+            tuple(VertexField(field, spec.body, self.mesh, comm, parameters) for field in spec.fields)
+            if beside is None
+            else beside.fields
+        )
         self._directions = {path: spaces.constant(self.mesh, 0.0) for path in parameters if path in self._constants}
         self._load = spaces.constant(self.mesh, 1.0)
 
@@ -251,6 +265,12 @@ class Forms:
                 form = ufl.replace(form, {self._variation: self._along})
                 found.append((field, self.by_vertices(form)))
         return tuple(found)
+
+    @cached_property
+    def _weighted_imbalance(self) -> assembly.VectorAssembler:
+        form = self._imbalance_form()
+        hat = ufl.TestFunction(spaces.scalar_space(self.mesh, 1))
+        return self.by_vertices(ufl.replace(form, {self._variation: hat * self._along}))
 
     @cached_property
     def _stiffness_action(self) -> assembly.VectorAssembler:

@@ -78,11 +78,11 @@ class Layout:
         everywhere = np.concatenate(self._comm.allgather(cells))
         return everywhere[np.lexsort(everywhere.T[::-1])], kind
 
-    def by_cell(self, values: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return numbers of this rank's cells for all cells (n_cells,), in the order of `cells`; collective."""
+    def by_cell(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of this rank's cells for all cells (n_cells,), in the order of `cells`; collective."""
         own, _ = self._cells()
         cells, found = (np.concatenate(self._comm.allgather(part)) for part in (own, values[: len(own)]))
-        return np.asarray(found[np.lexsort(cells.T[::-1])], dtype=np.int64)
+        return np.asarray(found[np.lexsort(cells.T[::-1])])
 
     def _cells(self) -> tuple[NDArray[np.int64], int]:
         """This rank's cells."""

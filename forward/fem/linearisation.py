@@ -26,8 +26,8 @@ class Linearisation(Forms):
     Vectors hold this rank's part (U_local,); rows of prescribed unknowns are those of the identity.
     """
 
-    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
-        super().__init__(spec, comm, parameters)
+    def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
+        super().__init__(spec, comm, parameters, beside)
         self.work = Work()
         self.latest = Latest()
         imbalance = self._imbalance_form()
@@ -169,6 +169,15 @@ class Linearisation(Forms):
         self.unknowns.give(self._along, w)
         self.work.residuals += 1
         return (self._transposed_action if transpose else self._stiffness_action)()
+
+    def imbalance_by_vertices(self, w: FloatArray) -> FloatArray:
+        """Virtual works F(u; φ_i w) (n_vertices,) of w (U_local,) times the hat function of each own vertex.
+
+        At the state that is set; they sum to wᵀF.
+        """
+        self.unknowns.give(self._along, w)
+        self.work.residuals += 1
+        return self._weighted_imbalance()
 
     def free_stiffness_times(self, x: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Product (k, n) of the matrix that `back_substitute` inverts, at the state that is set, with rows x (k, n)."""

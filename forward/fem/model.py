@@ -11,11 +11,22 @@ from typing import Any
 
 import numpy as np
 
+from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
-from forward.model import FloatArray, Guess, InadmissibleError, OneByOne, ReferenceSolution, SolveError, Stability, Work
+from forward.model import (
+    FloatArray,
+    Guess,
+    InadmissibleError,
+    MeshError,
+    OneByOne,
+    ReferenceSolution,
+    SolveError,
+    Stability,
+    Work,
+)
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
@@ -65,6 +76,11 @@ class HyperelasticModel(OneByOne):
     def reference(self) -> ReferenceFactor:
         """The factor of the last reference that was given."""
         return ReferenceFactor(self.equations)
+
+    @cached_property
+    def enriched(self) -> Enriched:
+        """The body in elements of one degree more, which tell the error of its mesh; collective at first."""
+        return Enriched(self.equations, self.spec.enriched())
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -311,3 +327,32 @@ class FiniteElementSolution:
             multipliers[:, equations.fixed] = 0
             gradients -= np.array([equations.field_products(multiplier) for multiplier in multipliers])
         return gradients.reshape(*np.shape(weights)[:-1], -1)
+
+    @cached_property
+    def enriched_state(self) -> EnrichedState:
+        """The state in elements of one degree more, as one linear solve from this state has it; collective."""
+        self._model.visit(self)
+        return self._model.enriched.state(self)
+
+    def mesh_error(self) -> MeshError:
+        """Estimate the error that the mesh makes of outputs and state (`forward.fem.enriched`); collective.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness in the enriched space is singular.
+        """
+        found, enriched = self.enriched_state, self._model.enriched
+        enriched.visit(self)
+        errors = enriched.values(found.state) - self.outputs
+        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work)
+
+    def mesh_indicators(self, weights: FloatArray) -> FloatArray:
+        """Return what each of this rank's cells adds to the mesh error of outputs, by `weights` (m,); collective.
+
+        They are (n_cells,), or (k, n_cells) for k rows of weights, in DOLFINx's order, and not negative
+        (`Enriched.indicators`).
+        """
+        self._model.visit(self)
+        found = self._model.enriched.indicators(self, np.atleast_2d(weights))
+        return found.reshape(*np.shape(weights)[:-1], -1)

@@ -26,7 +26,8 @@ class BodySpace:
         equations = self._equations
         if not isinstance(equations.spec.body, MeshFile):
             return None
-        return self._layout.by_cell(meshes.region_numbers(equations.comm, equations.spec.body, equations.mesh))
+        numbers = self._layout.by_cell(meshes.region_numbers(equations.comm, equations.spec.body, equations.mesh))
+        return np.asarray(numbers, dtype=np.int64)
 
     def interpolation(self, points: FloatArray) -> tuple[list[tuple[NDArray[np.int64], FloatArray]], FloatArray]:
         """Return nodes and weights that interpolate at each of points (n, 3), and how far (n,) these lie outside.

@@ -7,7 +7,7 @@ a case is Bu with a sparse B.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,12 @@ from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import AXES
 from forward.fem.dolfinx import spaces
+from forward.fem.enriched import relative
+from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
-from forward.model import FloatArray, Guess, OneByOne, ReferenceSolution, SolveError, Stability, Work
+from forward.fem.space import BodySpace
+from forward.model import FloatArray, Guess, MeshError, OneByOne, ReferenceSolution, SolveError, Stability, Work
 from forward.specimen import Observed, Specimen
 
 
@@ -98,11 +101,22 @@ class SpecimenModel(OneByOne):
         numbers = range(len(self.models))
         self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
         found = [
-            _interpolation(model, self.places[self.cases == number], self.axes[self.cases == number])
+            _interpolation(model.equations, self.places[self.cases == number], self.axes[self.cases == number])
             for number, model in zip(numbers, self.models, strict=True)
         ]
         self.observations: list[csr_matrix] = [matrix for matrix, _ in found]
+        self._enriched_observations: list[csr_matrix] | None = None
         self.distances = np.concatenate([distances for _, distances in found])
+
+    @property
+    def enriched_observations(self) -> list[csr_matrix]:
+        """The B (n, U⁺_local) of each case in elements of one degree more; collective when first asked for."""
+        if self._enriched_observations is None:
+            self._enriched_observations = [
+                _interpolation(model.enriched.equations, self.places[self.cases == n], self.axes[self.cases == n])[0]
+                for n, model in enumerate(self.models)
+            ]
+        return self._enriched_observations
 
     @cached_property
     def vertices(self) -> Layout:
@@ -196,7 +210,7 @@ class SpecimenSolution:
         self._model = model
         self.solutions = solutions
         self.state = np.concatenate([solution.state for solution in solutions])
-        self.outputs = self._observe([solution.state for solution in solutions])
+        self.outputs = self._observe([solution.state for solution in solutions], model.observations)
         for array in (self.state, self.outputs):
             array.flags.writeable = False
         self.residual = max(solution.residual for solution in solutions)
@@ -211,10 +225,10 @@ class SpecimenSolution:
     @property
     def work(self) -> Work:
         """What the solutions of all cases have cost so far."""
-        return Work(*sum(solution.work.as_array() for solution in self.solutions).tolist())  # type: ignore[union-attr]
+        return _sum(solution.work for solution in self.solutions)
 
-    def _observe(self, states: list[FloatArray]) -> FloatArray:
-        parts = zip(self._model.models, self._model.observations, states, strict=True)
+    def _observe(self, states: list[FloatArray], observations: list[csr_matrix]) -> FloatArray:
+        parts = zip(self._model.models, observations, states, strict=True)
         return np.concatenate([model.equations.total((B @ u.T).T) for model, B, u in parts], axis=-1)
 
     def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
@@ -227,7 +241,7 @@ class SpecimenSolution:
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
-        return self._observe(self._state_tangents(direction))
+        return self._observe(self._state_tangents(direction), self._model.observations)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
@@ -237,6 +251,25 @@ class SpecimenSolution:
         for solution, where, B, w in parts:
             gradients[..., where] += solution.state_adjoint((B.T @ w.T).T)
         return gradients
+
+    def mesh_error(self) -> MeshError:
+        """Estimate the error that the mesh makes of what is observed and of the states of all cases; collective.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness in the enriched space is singular.
+        """
+        model, found = self._model, [solution.enriched_state for solution in self.solutions]
+        outputs = self._observe([one.state for one in found], model.enriched_observations) - self.outputs
+        parts = zip(model.models, found, strict=True)
+        state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
+        energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
+        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found))
+
+
+def _sum(works: Iterable[Work]) -> Work:
+    return Work(*sum(work.as_array() for work in works).tolist())  # type: ignore[union-attr]
 
 
 def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
@@ -249,7 +282,7 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
 
 
 def _interpolation(
-    model: HyperelasticModel, places: FloatArray, axes: NDArray[np.int64]
+    equations: Discretisation, places: FloatArray, axes: NDArray[np.int64]
 ) -> tuple[csr_matrix, FloatArray]:
     """Return B (n, U_local) of components (n,) at places (n, 3), and how far (n,) these lie outside; collective.
 
@@ -258,10 +291,10 @@ def _interpolation(
     ValueError
         If a place is farther from the mesh than the mesh can be from the body.
     """
-    equations, layout = model.equations, model.equations.layout
+    layout = equations.layout
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
     which = which.ravel()
-    held, distances = model.space.interpolation(different)
+    held, distances = BodySpace(equations).interpolation(different)
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
     rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]

@@ -20,6 +20,7 @@ class MaxVonMises(Observable):
 
     kind: Literal["max-von-mises"] = "max-von-mises"
     unit: ClassVar[str] = "Pa"
+    estimable: ClassVar[bool] = False  # at an edge that is held it grows without end as the mesh is refined
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""

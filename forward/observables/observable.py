@@ -159,6 +159,7 @@ class Observable(Settings):
     name: str = Field(min_length=1)
     unit: ClassVar[str] = "m"  # SI unit of the value
     of_held: ClassVar[bool] = False  # whether its boundary has to be clamped or moved
+    estimable: ClassVar[bool] = True  # whether an error of the mesh can be estimated: not of stresses at single points
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation; collective.

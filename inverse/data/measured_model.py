@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Guess, NodalSpace, OneByOne, Solution, Stability, Work
+from forward.model import FloatArray, ForwardModel, Guess, MeshError, NodalSpace, OneByOne, Solution, Stability, Work
 
 
 @dataclass(frozen=True)
@@ -104,3 +104,8 @@ class MeasuredSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state along a `direction` (d,), or of k of them."""
         return self.solution.state_tangent(direction)
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the error that the mesh makes; None without a mesh."""
+        found = self.solution.mesh_error()
+        return None if found is None else replace(found, outputs=found.outputs[self.which])

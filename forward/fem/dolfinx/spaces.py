@@ -105,7 +105,7 @@ def point_weights(
     msh, comm = space.mesh, space.mesh.comm
     found = locate(msh.geometry.x[version.corners_of_cells(msh)[: owned_cells(msh)]], points)
     every = np.array(comm.allgather(found.distances))
-    # Nodes of degree 1 and 2 stand in the same order in every cell: none has two on an edge or a face.
+    # Where an edge or a face has several nodes, DOLFINx permutes them: they stand as on the reference cell.
     values = cell_element(space).tabulate(0, found.local)[0, :, :, 0]
     mine = every.argmin(axis=0) == comm.rank
     here = [

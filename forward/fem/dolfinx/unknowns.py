@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.fem.dolfinx import version
-from forward.fem.dolfinx.spaces import new_space, owned_nodes, vector_space
+from forward.fem.dolfinx.spaces import cell_element, new_space, owned_nodes, scalar_space, vector_space
+from forward.fem.dolfinx.version import nodes_of_cells
 from forward.model import FloatArray
 
 
@@ -48,12 +49,12 @@ class Unknowns:
         cell = msh.ufl_cell()
         elements = [version.lagrange(cell, degree, vector=True), version.lagrange(cell, degree - 1, vector=False)]
         self.whole = new_space(msh, version.mixed(elements))
-        self.displacement, displacements = self.whole.sub(0).collapse()
-        self.pressure, pressures = self.whole.sub(1).collapse()
+        self.displacement, self.pressure = vector_space(msh, degree), scalar_space(msh, degree - 1)
         self.pressures = int(self.pressure.dofmap.index_map.size_global)
-        self._numbers = np.array(displacements, dtype=np.int32).ravel()
+        parts = [self.whole.sub(0).sub(axis) for axis in range(3)]
+        self._numbers = np.column_stack([_numbers(self.displacement, part) for part in parts]).ravel()
         owned = self._numbers[: 3 * owned_nodes(self.displacement)]
-        self._order = np.concatenate([owned, np.array(pressures, dtype=np.int32).ravel()[: owned_nodes(self.pressure)]])
+        self._order = np.concatenate([owned, _numbers(self.pressure, self.whole.sub(1))[: owned_nodes(self.pressure)]])
         self.size = len(self._order)
 
     def split(self, all_of_them: Any) -> tuple[Any, Any]:
@@ -86,3 +87,15 @@ class Unknowns:
         reordered = np.empty_like(values)
         reordered[..., self._order] = values
         return reordered
+
+
+def _numbers(space: Any, part: Any) -> NDArray[np.int32]:
+    """Return the numbers (n,) that the nodes of a space, ghosts included, have in a part of a mixed space.
+
+    (The map of DOLFINx's `collapse` is wrong from degree 3 on: it does not permute the nodes of edges and faces.)
+    """
+    count = len(cell_element(space).points)
+    index_map = space.dofmap.index_map
+    found = np.empty(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    found[nodes_of_cells(space, count)] = nodes_of_cells(part, count)
+    return found

@@ -1,0 +1,197 @@
+"""The same body on the same mesh in elements of one degree more: what error the mesh makes of a solution.
+
+With u_h the solution on V_h, V⁺ ⊃ V_h the enriched space and F⁺, K⁺ the equations there, one linear solve
+K⁺(u_h) e = −F⁺(u_h) estimates the error of the whole state, and ψ⁺(u_h + e) − ψ(u_h) that of an output ψ. To first
+order this is the dual-weighted residual −F⁺(u_h; z⁺) with the adjoint z⁺ ∈ V⁺ of every output (R. Becker, R. Rannacher,
+An optimal control approach to a posteriori error estimation, Acta Numerica 10 (2001) 1–102), without one adjoint each.
+Prescribed unknowns stay what they are on V_h. Elements of V⁺ err too: what e misses is its saturation.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from forward.fem.dolfinx import spaces, version
+from forward.fem.dolfinx.meshes import owned_cells
+from forward.fem.dolfinx.transfer import Transfer
+from forward.fem.equations import Discretisation
+from forward.model import FloatArray, Work
+from forward.observables.observable import Functional
+
+if TYPE_CHECKING:
+    from forward.fem.model import FiniteElementSolution
+    from forward.hyperelastic import Hyperelastic
+
+
+class EnrichedState(NamedTuple):
+    """A state of the enriched space, as one linear solve from a solution of the body has it.
+
+    Attributes
+    ----------
+    state, change
+        u_h + e and e (U⁺_local,).
+    energy
+        Half of the square of the energy norm of e (J).
+    stored
+        Energy (J) that is stored at u_h.
+    work
+        What it has cost.
+    """
+
+    state: FloatArray
+    change: FloatArray
+    energy: float
+    stored: float
+    work: Work
+
+    @property
+    def relative(self) -> float:
+        """Energy norm of e relative to the size of the state; NaN where no energy is stored."""
+        return relative(self.energy, self.stored)
+
+
+def relative(energy: float, stored: float) -> float:
+    """Return the size of an error of such energy (J) relative to a state that stores so much; NaN where it has none."""
+    return float(np.sqrt(max(energy, 0.0) / stored)) if stored > 0 else np.nan
+
+
+class Enriched:
+    """The equations of a body in an enriched space, and its transfer to and from the space of the body.
+
+    Parameters
+    ----------
+    equations
+        Those of the body.
+    spec
+        Specification of the body in elements of a higher degree.
+
+    Attributes
+    ----------
+    equations
+        The equations of the body in the enriched space.
+    """
+
+    def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
+        self._coarse = equations
+        self.equations = Discretisation(spec, equations.comm, equations.parameters, equations)
+        pairs = [(equations.unknowns.displacement, self.equations.unknowns.displacement)]
+        if equations.unknowns.pressure is not None:
+            pairs.append((equations.unknowns.pressure, self.equations.unknowns.pressure))
+        self._up = [Transfer(coarse, fine) for coarse, fine in pairs]
+        self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
+        self._functionals: list[Functional | None] = [
+            output.functional(self.equations) if output.estimable else None for output in spec.outputs
+        ]
+        self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
+
+    def up(self, u: FloatArray) -> FloatArray:
+        """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
+        parts = np.split(u, [3 * self._coarse.nodes_owned])
+        return np.concatenate([up(part) for up, part in zip(self._up, parts, strict=False)])
+
+    def down(self, u: FloatArray) -> FloatArray:
+        """Interpolate a vector (U⁺_local,) of the enriched space at the nodes of the body (U_local,)."""
+        parts = np.split(u, [3 * self.equations.nodes_owned])
+        return np.concatenate([down(part) for down, part in zip(self._down, parts, strict=False)])
+
+    def restrict(self, forces: FloatArray) -> FloatArray:
+        """Return forces (U⁺_local,) of the enriched space as those (U_local,) of the body: the transpose of `up`."""
+        parts = np.split(forces, [3 * self.equations.nodes_owned])
+        return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
+
+    def visit(self, solution: FiniteElementSolution) -> Discretisation:
+        """Set parameters, loads and state to those of a solution of the body."""
+        equations = self.equations
+        if equations.latest.solution is not solution:
+            equations.set_parameters(solution.parameters)
+            equations.at_load(1.0)
+            equations.set_state(self.up(solution.state))
+            equations.latest.solution = solution
+        return equations
+
+    def imbalance(self, solution: FiniteElementSolution) -> FloatArray:
+        """F⁺(u_h) (U⁺_local,) of a solution, zero on prescribed unknowns."""
+        equations = self.visit(solution)
+        forces = equations.imbalance()
+        equations.work.residuals += 1
+        forces[equations.fixed] = 0
+        return forces
+
+    def state(self, solution: FiniteElementSolution) -> EnrichedState:
+        """Find u_h + e; collective.
+
+        Raises
+        ------
+        SolveError
+            If the stiffness is singular.
+        """
+        equations = self.equations
+        equations.work = Work()
+        forces = -self.imbalance(solution)
+        self._factorise(solution)
+        change = equations.back_substitute(forces)
+        start = self.up(solution.state)
+        # In the mixed form the energy is a saddle, in which the pressures count with the other sign.
+        energy = 0.5 * equations.curvature(change, forces)
+        equations.set_state(start)
+        return EnrichedState(start + change, change, energy, float(self._stored()), equations.work)
+
+    def _factorise(self, solution: FiniteElementSolution) -> None:
+        equations = self.visit(solution)
+        if equations.latest.factorised is not solution:
+            equations.factorise(self.up(solution.state))
+            equations.latest.factorised = equations.latest.solution = solution
+
+    def values(self, state: FloatArray) -> FloatArray:
+        """Return the outputs (m,) at a state (U⁺_local,) and the parameters that are set; NaN where not estimated."""
+        self.equations.set_state(state)
+        return np.array([np.nan if f is None else f.value() for f in self._functionals])
+
+    def adjoints(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+        """Return z⁺ (k, U⁺_local) with K⁺ᵀz⁺ = ∂ψ/∂u of outputs weighted by `weights` (k, m); collective.
+
+        Raises
+        ------
+        ValueError
+            If an output is weighted whose error is not estimated.
+        """
+        known = [i for i, f in enumerate(self._functionals) if f is not None]
+        if np.delete(weights, known, axis=1).any():
+            message = "an output is weighted of which no error of the mesh is estimated"
+            raise ValueError(message)
+        self._factorise(solution)
+        self.visit(solution)
+        gradients = np.array([f.gradient() for f in self._functionals if f is not None])
+        loads = weights[:, known] @ gradients
+        loads[:, self.equations.fixed] = 0
+        return self.equations.back_substitute(loads, transpose=True)
+
+    def indicators(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+        """Return what each of this rank's cells (k, n_cells) adds to the error of outputs weighted by (k, m); ≥ 0.
+
+        The dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i, in equal parts
+        of its size to the cells that meet there: T. Richter, T. Wick, Variational localizations of the dual weighted
+        residual estimator, J. Comput. Appl. Math. 279 (2015) 192–208. (Cut by cells without jumps of stresses, what
+        cancels between neighbours would count.) Cells are in DOLFINx's order.
+        """
+        equations = self.equations
+        found = []
+        for z in self.adjoints(solution, weights):
+            self.visit(solution)
+            sizes = np.abs(equations.imbalance_by_vertices(z - self.up(self.down(z))))
+            found.append(shared_by_cells(sizes, equations))
+        return np.array(found)
+
+
+def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:
+    """Share what this rank's vertices have between the cells that meet there, in equal parts; (n_cells,) of them."""
+    space = spaces.scalar_space(equations.mesh, 1)
+    corners = version.nodes_of_cells(space, len(spaces.cell_element(space).points))[: owned_cells(equations.mesh)]
+    carrier = spaces.function(space)
+    carrier.x.array[:] = np.bincount(corners.ravel(), minlength=len(carrier.x.array))
+    meeting = spaces.sum_ghosts(carrier)
+    carrier.x.array[: len(sizes)] = sizes / meeting
+    carrier.x.scatter_forward()
+    return np.asarray(carrier.x.array[corners].sum(axis=1))

@@ -1,0 +1,241 @@
+"""What the mesh adds to outputs and states, as elements of one degree more see it."""
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from forward.external.models import PythonModel
+from forward.hyperelastic import Hyperelastic
+from forward.model import FunctionModel, ModelError
+from forward.specimen import Specimen
+from inverse.data.measured_model import MeasuredModel
+from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
+from tests.launch import run_script
+from tests.meshes import box
+
+pytestmark = pytest.mark.fem
+LENGTH, HEAVY = 2.0, 9.81e-3  # m, Pa/m
+PLAIN = tuple(output for output in OUTPUTS if output["kind"] in {"displacement", "max-displacement", "max-von-mises"})
+
+
+def solved(spec, parameters=(), comm=MPI.COMM_SELF):
+    scalars = spec.scalars
+    return spec.build(comm, tuple(parameters)).solve(np.array([scalars[path].value for path in parameters]))
+
+
+def column(degree, cell="hexahedron", kind="saint-venant-kirchhoff"):
+    """A column that stands in a rigid pipe, under its own small weight: −ρg (L z − z²/2)/(λ + 2μ)."""
+    constants = {"lmbda": 1e5, "mu": 4e4}
+    sides = [{"on": f"{axis}-{end}", axis: 0.0} for axis in "xy" for end in ("min", "max")]
+    middle = {"kind": "displacement", "component": "z"}
+    return Hyperelastic.model_validate(
+        {
+            "formulation": "displacement",
+            "body": {"size": (1.0, 1.0, LENGTH), "cells": (1, 1, 2), "cell": cell, "degree": degree},
+            "material": {"kind": kind, **constants},
+            "displacements": (*sides, {"on": "z-min", "z": 0.0}),
+            "loads": ({"kind": "gravity", "density": 1e-3},),
+            "outputs": (
+                *({**middle, "name": f"{z}", "at": (0.5, 0.5, z)} for z in (0.37, 0.5, 1.5)),
+                {"kind": "strain-energy", "name": "energy"},
+            ),
+            "solver": {"tolerance": 1e-12},
+        }
+    )
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_what_lies_in_the_enriched_space_is_found_exactly(cell):
+    solution = solved(column(1, cell))
+    error = solution.mesh_error()
+    modulus, z = 1.8e5, np.array([0.37, 0.5, 1.5])
+    exact = [*(-HEAVY / modulus * (LENGTH * z - z**2 / 2)), HEAVY**2 * LENGTH**3 / 6 / modulus]
+    assert (np.abs(solution.outputs / exact - 1) > 0.01).all()
+    np.testing.assert_allclose(solution.outputs + error.outputs, exact, rtol=1e-6)
+    stored = HEAVY**2 * LENGTH**3 / 6 / modulus
+    # Of a linear problem the error's energy is what the energy lacks.
+    assert error.energy == pytest.approx(stored - solution.outputs[3], rel=1e-6)
+    assert error.relative == pytest.approx(np.sqrt(error.energy / solution.outputs[3]), rel=1e-6)
+    nodes = solution._model.space.coordinates[:, 2]
+    (corrected,) = solution._model.space.gather((solution.state + error.state)[None])
+    np.testing.assert_allclose(corrected[2::3], -HEAVY / modulus * (LENGTH * nodes - nodes**2 / 2), atol=1e-13)
+
+
+def test_nothing_is_left_where_the_space_of_the_body_holds_the_solution():
+    error = solved(column(2)).mesh_error()
+    assert np.abs(error.outputs[:3]).max() < 1e-9 * HEAVY / 1e5
+    assert error.relative < 1e-6
+
+
+def bent(cells=(4, 1, 1), cell="hexahedron", degree=1, **blocks):
+    """A thick cantilever that bends."""
+    return Hyperelastic.model_validate(
+        {
+            "formulation": "displacement",
+            "body": {"size": (2.0, 1.0, 1.0), "cells": cells, "cell": cell, "degree": degree},
+            "material": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 4e4},
+            "clamp": ("x-min",),
+            "loads": ({"kind": "traction", "on": "x-max", "direction": (0, 0, -1), "size": 400.0},),
+            "outputs": (
+                {"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "z"},
+                {"kind": "displacement", "name": "middle", "at": (1.0, 0.5, 0.5), "component": "z"},
+                {"kind": "strain-energy", "name": "energy"},
+                {"kind": "max-von-mises", "name": "peak"},
+            ),
+            "solver": {"tolerance": 1e-10},
+        }
+        | blocks
+    )
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_the_error_of_a_coarse_mesh_is_told(cell):
+    solution = solved(bent(cells=(4, 2, 2), cell=cell))
+    fine = solved(bent(cells=(12, 6, 6), degree=2)).outputs
+    error = solution.mesh_error()
+    effectivity = error.outputs[:3] / (fine - solution.outputs)[:3]
+    assert ((effectivity > 0.85) & (effectivity < 1.1)).all(), effectivity
+    assert np.isnan(error.outputs[3])
+    assert error.work.factorisations == error.work.back_substitutions == 1
+
+
+QUICK = ("mooney-rivlin", "demiray", "holzapfel-gasser-ogden", *MIXED)
+SLOW = [pytest.param(form, marks=pytest.mark.slow) for form in (*MATERIALS, *MORE_MATERIALS) if form not in QUICK]
+
+
+@pytest.mark.parametrize("form", [*QUICK, *SLOW])
+def test_every_material_and_load_and_form_is_orthogonal(form):
+    plain = loaded_body(form)
+    quadrature = plain.body.enriched().quadrature  # that of the forces must be the same for this
+    solution = solved(loaded_body(form, body={"quadrature_degree": quadrature}, outputs=PLAIN))
+    model, enriched = solution._model, solution._model.enriched
+    np.testing.assert_allclose(enriched.down(enriched.up(solution.state)), solution.state, atol=1e-14, rtol=1e-12)
+    forces = enriched.imbalance(solution)
+    coarse = enriched.restrict(forces)
+    coarse[model.equations.fixed] = 0
+    assert np.linalg.norm(coarse) < 1e-8 * np.linalg.norm(forces)
+    error = solution.mesh_error()
+    assert np.isfinite(error.outputs[:3]).all()
+    assert np.isnan(error.outputs[3:]).all()
+    assert error.energy > 0
+    weights = np.array([[0.0, 0.0, 1.0, 0.0]])
+    (adjoint,) = enriched.adjoints(solution, weights)
+    assert -adjoint @ forces == pytest.approx(error.outputs[2], rel=1e-7)  # the dual-weighted residual
+    cells = solution.mesh_indicators(weights[0])
+    assert cells.shape == (model.spec.body.cell_count,)
+    assert abs(error.outputs[2]) <= cells.sum() * (1 + 1e-7)
+
+
+def test_a_weight_on_what_is_not_estimated_is_refused():
+    solution = solved(bent())
+    with pytest.raises(ValueError, match="no error of the mesh"):
+        solution.mesh_indicators(np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+def test_regions_inclusions_and_random_fields_are_those_of_the_body(tmp_path):
+    path = tmp_path / "box.msh"
+    meshio.write(path, box("tetra"), file_format="gmsh22", binary=True)
+    fields = [
+        {"of": "stiffness", "length": 0.5, "std": 0.3, "modes": 3},
+        {"of": "density", "length": 0.5, "std": 0.3, "modes": 2},
+    ]
+    inclusion = {"kind": "sphere", "x": 0.5, "y": 0.4, "z": 0.4, "radius": 0.3, "width": 0.3, "contrast": 5.0}
+    changes = {"regions": {"right": {"C1": 3e4}}, "inclusions": (inclusion,), "fields": fields, "outputs": PLAIN}
+    boxed = loaded_body("mooney-rivlin", outputs=PLAIN).model_dump(exclude_none=True)
+    spec = Hyperelastic.model_validate(
+        boxed | {"body": {"kind": "mesh", "file": str(path), "degree": 1, "quadrature_degree": 3}} | changes
+    )
+    paths = ("fields.stiffness.0", "fields.stiffness.1")
+    model = spec.build(MPI.COMM_SELF, paths)
+    assert spec.enriched().body.nodes == len(model.enriched.equations.layout.coordinates)
+    found = []
+    for point in ([0.0, 0.0], [1.5, -1.0], [0.0, 0.0]):
+        solution = model.solve(np.array(point))
+        forces = model.enriched.imbalance(solution)
+        coarse = model.enriched.restrict(forces)
+        coarse[model.equations.fixed] = 0
+        assert np.linalg.norm(coarse) < 1e-8 * np.linalg.norm(forces)
+        found.append(solution.mesh_error().outputs[:3])
+        np.testing.assert_array_equal(solution.outputs, model.solve(np.array(point)).outputs)
+    np.testing.assert_allclose(found[0], found[2], rtol=1e-9)  # whatever was estimated before
+    assert np.abs(found[1] / found[0] - 1).max() > 0.01
+
+
+def test_data_of_a_specimen_have_errors():
+    spec = Specimen.model_validate(
+        {
+            "body": {"size": (1.0, 1.0, 1.0), "cells": (3, 3, 3), "degree": 1},
+            "material": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 4e4},
+            "cases": [
+                {
+                    "name": name,
+                    "clamp": ["z-min"],
+                    "loads": [{"kind": "traction", "on": "z-max", "direction": along, "size": 2000.0}],
+                }
+                for name, along in (("shear", (1, 0, 0)), ("pull", (0, 0, 1)))
+            ],
+            "observed": [{"at": [(1.0, 1.0, 1.0), (0.41, 0.0, 0.77)]}],
+        }
+    )
+    solution = solved(spec)
+    finest = spec.model_copy(update={"body": spec.body.model_copy(update={"cells": (8, 8, 8), "degree": 2})})
+    exact = solved(finest).outputs
+    error = solution.mesh_error()
+    assert error.outputs.shape == (12,)
+    large = np.abs(exact - solution.outputs) > 0.1 * np.abs(exact - solution.outputs).max()
+    effectivity = (error.outputs / (exact - solution.outputs))[large]
+    assert ((effectivity > 0.8) & (effectivity < 1.2)).all(), effectivity
+    assert error.state.shape == solution.state.shape
+    seen = MeasuredModel(solution._model, (3, 3, 0)).solve(np.zeros(0)).mesh_error()
+    np.testing.assert_array_equal(seen.outputs, error.outputs[[3, 3, 0]])
+    other = solution._model.observing(np.array([[1.0, 1.0, 1.0]]), (2,), (1,)).solve(np.zeros(0)).mesh_error()
+    assert other.outputs == pytest.approx(error.outputs[8:9], rel=1e-9)
+
+
+def test_models_without_a_mesh_have_none():
+    model = FunctionModel(np.sum, ("a", "b"), ("sum",))
+    assert model.solve(np.ones(2)).mesh_error() is None
+    spec = bent().enriched()
+    assert spec.body.degree == 2
+    assert spec.cost().textbook > bent().cost().textbook
+
+    plain = PythonModel.model_validate({"function": "math.hypot", "parameters": {"x": 1.0}, "outputs": ["y"]})
+    with pytest.raises(ModelError, match="no meshes"):
+        plain.enriched()
+
+
+SCRIPT = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from tests.bodies import OUTPUTS, loaded_body
+
+comm = MPI.COMM_WORLD
+for form in ("neo-hookean mixed", "mooney-rivlin"):
+    spec = loaded_body(form, body={"cells": (3, 2, 2)}, outputs=OUTPUTS[:4])
+    model = spec.build(comm, ())
+    solution = model.solve(np.zeros(0))
+    error = solution.mesh_error()
+    assert all(np.array_equal(error.outputs, other) for other in comm.allgather(error.outputs))
+    state = model.space.gather(error.state[None])
+    cells = model.equations.layout.by_cell(solution.mesh_indicators(np.array([0.0, 0.0, 1.0, 0.0])))
+    if comm.rank == 0:
+        found = {"outputs": error.outputs, "sizes": [error.energy, error.relative], "state": state, "cells": cells}
+        np.savez(f"{sys.argv[1]}/{form}.npz", **found)
+"""
+
+
+@pytest.mark.mpi
+def test_ranks_agree(tmp_path):
+    found = []
+    for ranks in (1, 2, 3):
+        folder = tmp_path / str(ranks)
+        folder.mkdir()
+        done = run_script(ranks, SCRIPT, folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+        found.append([dict(np.load(folder / f"{form}.npz")) for form in ("neo-hookean mixed", "mooney-rivlin")])
+    for other in found[1:]:
+        for here, expected in zip(other, found[0], strict=True):
+            for name, values in expected.items():
+                np.testing.assert_allclose(here[name], values, rtol=0, atol=1e-8 * np.abs(values).max(), err_msg=name)
