@@ -9,7 +9,7 @@ Prescribed unknowns stay what they are on V_h. Elements of V⁺ err too: what e 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,8 +21,14 @@ from forward.model import FloatArray, Work
 from forward.observables.observable import Functional
 
 if TYPE_CHECKING:
-    from forward.fem.model import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
+
+
+class Solved(Protocol):
+    """A solution of the body: its parameters (d,) and this rank's part (U_local,) of its state."""
+
+    parameters: FloatArray
+    state: FloatArray
 
 
 class EnrichedState(NamedTuple):
@@ -101,7 +107,7 @@ class Enriched:
         parts = np.split(forces, [3 * self.equations.nodes_owned])
         return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
 
-    def visit(self, solution: FiniteElementSolution) -> Discretisation:
+    def visit(self, solution: Solved) -> Discretisation:
         """Set parameters, loads and state to those of a solution of the body."""
         equations = self.equations
         if equations.latest.solution is not solution:
@@ -111,7 +117,7 @@ class Enriched:
             equations.latest.solution = solution
         return equations
 
-    def imbalance(self, solution: FiniteElementSolution) -> FloatArray:
+    def imbalance(self, solution: Solved) -> FloatArray:
         """F⁺(u_h) (U⁺_local,) of a solution, zero on prescribed unknowns."""
         equations = self.visit(solution)
         forces = equations.imbalance()
@@ -119,7 +125,7 @@ class Enriched:
         forces[equations.fixed] = 0
         return forces
 
-    def state(self, solution: FiniteElementSolution) -> EnrichedState:
+    def state(self, solution: Solved) -> EnrichedState:
         """Find u_h + e; collective.
 
         Raises
@@ -138,7 +144,7 @@ class Enriched:
         equations.set_state(start)
         return EnrichedState(start + change, change, energy, float(self._stored()), equations.work)
 
-    def _factorise(self, solution: FiniteElementSolution) -> None:
+    def _factorise(self, solution: Solved) -> None:
         equations = self.visit(solution)
         if equations.latest.factorised is not solution:
             equations.factorise(self.up(solution.state))
@@ -149,7 +155,7 @@ class Enriched:
         self.equations.set_state(state)
         return np.array([np.nan if f is None else f.value() for f in self._functionals])
 
-    def adjoints(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+    def adjoints(self, solution: Solved, weights: FloatArray) -> FloatArray:
         """Return z⁺ (k, U⁺_local) with K⁺ᵀz⁺ = ∂ψ/∂u of outputs weighted by `weights` (k, m); collective.
 
         Raises
@@ -168,7 +174,7 @@ class Enriched:
         loads[:, self.equations.fixed] = 0
         return self.equations.back_substitute(loads, transpose=True)
 
-    def indicators(self, solution: FiniteElementSolution, weights: FloatArray) -> FloatArray:
+    def indicators(self, solution: Solved, weights: FloatArray) -> FloatArray:
         """Return what each of this rank's cells (k, n_cells) adds to the error of outputs weighted by (k, m); ≥ 0.
 
         The dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i, in equal parts
