@@ -75,7 +75,7 @@ def main() -> None:
     P, true = np.concatenate(said), np.concatenate(happened)
     bars = []
     print(f"{DRAWS} draws from each of five models, {len(labels)} stresses with errors of {100 * NOISE:.0f} %\n")
-    print("| probability said | cases | mean of it | share that happened | ± |")
+    print("| stated probability | cases | its mean | observed frequency | ± |")
     print("|---|---|---|---|---|")
     for low, high in pairwise(BINS):
         members = (low <= P) & ((high > P) | (high == 1.0))
@@ -110,7 +110,7 @@ def draw(bars: FloatArray) -> None:
     axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.8, label="as said")
     axis.errorbar(*bars.T[:2], yerr=2 * bars[:, 2], fmt="o", capsize=3, label="found, ± 2 standard errors")
     axis.set(
-        xlabel="probability said", ylabel="share that happened", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal"
+        xlabel="stated probability", ylabel="observed frequency", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal"
     )
     axis.legend(loc="lower right")
     figure.savefig(PICTURE, dpi=110)
