@@ -19,8 +19,8 @@ from forward.model import DerivativeError, FloatArray, ForwardModel, Solution
 STEPS = tuple(2.0**-k for k in range(4, 11))
 STATE = "state"
 
-FAULT = 1e-5  # relative error of a tangent that is not tolerated
-EXACT = 1e-10  # what linear algebra must fulfil
+FAULT = 1e-5  # relative error of a tangent above which it is wrong
+EXACT = 1e-10  # relative error allowed in linear algebra
 ABOVE_ROUNDING = 100  # how much larger than rounding a remainder is that has an order
 WINDOW = 3  # steps from which the error of a tangent is extrapolated
 
@@ -38,8 +38,8 @@ class Conformance:
     directions
         Names of the k directions.
     orders
-        Orders (k, columns) of the Taylor remainders, 2 for right tangents, at the smallest steps where the remainder is
-        above rounding; NaN where it never is (an output that is linear in the parameters). A second derivative that
+        Orders (k, columns) of the Taylor remainders, 2 for correct tangents, at the smallest steps where the remainder
+        is above rounding; NaN where it never is (an output that is linear in the parameters). A second derivative that
         vanishes, or nearly so, gives another order.
     faults
         Relative errors (k, columns) of the tangents, extrapolated from Taylor remainders; 0 where these are rounding.
@@ -51,7 +51,7 @@ class Conformance:
     stale
         Change of the derivatives of a solution while the model solves elsewhere, in the same measure.
     changed
-        What changed of a solution after it was made, expected to be immutable.
+        What changed in a solution after it was made: solutions must be immutable.
     """
 
     outputs: tuple[str, ...]
@@ -64,7 +64,7 @@ class Conformance:
     changed: tuple[str, ...]
 
     def mistakes(self) -> tuple[str, ...]:
-        """Say what is wrong, one line each; none for a model that conforms."""
+        """Say what is wrong, one line each; empty for a model that conforms."""
         return tuple(self._mistakes())
 
     def require(self) -> None:
@@ -110,7 +110,8 @@ def check_derivatives(
     model
         Any differentiable model.
     parameters
-        Where (d,). Outputs must be smooth there: the place of a maximum must not jump within the largest step.
+        Parameter vector (d,) at which to check. Outputs must be smooth there: the place of a maximum must not jump
+        within the largest step.
     scale
         Changes (d,) of the parameters that matter, such as their standard deviations; the unit of the steps.
     directions
@@ -225,7 +226,7 @@ def _lasting(
     vector = point.copy()
     waiting, asked = model.solve(vector), model.solve(point.copy())
     with suppress(ValueError):
-        asked.tangent(along[0])[...] = np.nan  # what a solution gives away is no part of it
+        asked.tangent(along[0])[...] = np.nan  # arrays that a solution returns are no part of it
     before = [(solution, np.array(solution.outputs), np.array(solution.state)) for solution in (waiting, asked)]
     vector[:] = elsewhere
     other = model.solve(elsewhere)

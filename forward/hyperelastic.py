@@ -1,6 +1,6 @@
 """The specification of a hyperelastic body: geometry, material, loads, outputs and solver; no FEniCSx until built.
 
-It is long because it is one block of a study: every number, mistake and finding that only the whole body can know.
+It is long because it holds one whole block of a study: all numbers, mistakes and findings that need the complete body.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ CONTRAST = "contrast"
 
 
 class RegionNumbers(Settings):
-    """What a region may have besides constants of the material.
+    """What a region may have besides material constants.
 
     Parameters
     ----------
     contrast
-        Stiffness there divided by that of its constants (1).
+        Factor (1) on the stiffness that follows from its constants.
     """
 
     contrast: Annotated[float, Gt(0)]
@@ -100,7 +100,7 @@ class Hyperelastic(ModelSpec):
     material
         Strain energy and its constants.
     regions
-        Numbers of named regions of the mesh: constants of the material, which take the place of those of `material`,
+        Numbers of named regions of the mesh: constants of the material, which replace those of `material`,
         and `contrast`, by which the energy density is multiplied: ``{ tumour = { contrast = 9 } }``.
     inclusions
         Balls that are stiffer or softer: their factors multiply the energy density.
@@ -109,19 +109,18 @@ class Hyperelastic(ModelSpec):
     clamp
         Boundaries that do not move.
     displacements
-        Boundaries with components that are moved by a given amount. Where boundaries share an edge, clamps come
-        first, then later entries before earlier ones.
+        Boundaries with components that are moved by a given amount. Where boundaries share an edge, clamps take
+        precedence, then later entries over earlier ones.
     loads
         Gravity, tractions and pressures.
     outputs
         What is computed from the deformed body.
     solver
-        Path, tolerance and limits of the solver; its kind alone may be given as a word, `solver = "newton"`.
+        Path, tolerance and limits of the solver; a word stands for its kind, `solver = "newton"`.
     formulation
         Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
         and a material with a constant D1 or a stated volumetric part). "auto" is mixed where that is possible and κ/μ
-        may be above 3: over all
-        values of the inputs in a study, with the constants as given elsewhere.
+        may be above 3: for some values of the inputs in a study, otherwise for the constants as given.
     """
 
     meshed: ClassVar[bool] = True
@@ -198,7 +197,7 @@ class Hyperelastic(ModelSpec):
         return self.decision({}).mixed
 
     def decision(self, ranges: Ranges) -> Decision:
-        """Return the formulation for values of parameters within ranges, by their paths, and why it is taken."""
+        """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
 
     def over(self, ranges: Ranges) -> Self:
@@ -216,7 +215,7 @@ class Hyperelastic(ModelSpec):
 
     @property
     def _splits(self) -> bool:
-        """Whether the energy is the sum of a part of the shape and a part of the volume alone."""
+        """Whether the energy is the sum of an isochoric and a purely volumetric part."""
         return splits(self.energy)
 
     @property
@@ -232,7 +231,7 @@ class Hyperelastic(ModelSpec):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the body before anything is solved."""
+        """Findings about the body before anything is solved."""
         points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
         return (
             *(Finding("warning", text) for text in self.body.warnings),
@@ -243,7 +242,7 @@ class Hyperelastic(ModelSpec):
         )
 
     def _of_followers(self) -> Iterator[Finding]:
-        """What the test of stability cannot see under loads that turn with the body."""
+        """What the stability test cannot see under loads that follow the body."""
         followers = [load.label for load in self.loads if not load.symmetric]
         if followers and not self.solver.accept_unstable:
             text = (
@@ -254,11 +253,11 @@ class Hyperelastic(ModelSpec):
             yield Finding("note", text)
 
     def refined(self, level: int) -> Self:
-        """Return the same problem on a finer mesh, as of the body's `refined`; `formulation` stays what it is here."""
+        """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""
         return self.model_copy(update={"body": self.body.refined(level)})
 
     def enriched(self) -> Self:
-        """Return the same problem on the same mesh in elements of one degree more, in the form that it has here."""
+        """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
         formulation = "mixed" if self.mixed else "displacement"
         return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
 
@@ -270,7 +269,7 @@ class Hyperelastic(ModelSpec):
                 yield ("model", "fields", i, "basis"), message, field.basis
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         return (*dict.fromkeys((*self.findings, *too_far(self.body, ranges))), *self.locking(ranges))
 
     def textbook(self) -> Self:
@@ -278,7 +277,7 @@ class Hyperelastic(ModelSpec):
         return self.model_copy(update={"solver": self.solver.model_copy(update={"kind": "newton"})})
 
     def tighter(self, factor: float) -> Self:
-        """Return the same problem with the tolerances of its solver times a factor."""
+        """Return the same problem with the solver's tolerances multiplied by a factor."""
         tolerances = {name: factor * getattr(self.solver, name) for name in ("tolerance", "derivative_tolerance")}
         return self.model_copy(update={"solver": self.solver.model_copy(update=tolerances)})
 
@@ -288,12 +287,12 @@ class Hyperelastic(ModelSpec):
         return self.model_copy(update={"solver": solver})
 
     def cost(self, factors: int = 2) -> Times:
-        """Predict what a solve takes; a factor of a solution and one of a reference are kept."""
+        """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
         predicted = self.solver.kind != "newton"
         return times(self.body, mixed=self.mixed, symmetric=self.symmetric, predicted=predicted, factors=factors)
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Say what was found in the file of a mesh, how many unknowns there are, and which."""
+        """Say what a mesh file holds, and how many unknowns there are of which kind."""
         decision, body = self.decision(ranges), self.body
         form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
         unknowns = self.over(ranges).unknowns
@@ -307,7 +306,7 @@ class Hyperelastic(ModelSpec):
         return words
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides on results; of the file of a mesh its hash counts, not its place."""
+        """Return everything that results depend on; a mesh file counts by its hash, not by its path."""
         found = super().identity()
         found["body"].pop("file", None)
         return found
@@ -343,7 +342,7 @@ class Hyperelastic(ModelSpec):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        """Everything that no single block can see: unknown boundaries, repeated names, a body that can float away."""
+        """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
         boundaries = self.body.boundaries
         places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
         for block in ("displacements", "loads", "outputs"):
@@ -450,7 +449,7 @@ class Hyperelastic(ModelSpec):
                 yield ("displacements", i, "on"), message, item.on
 
     def _held_against_turning(self) -> bool:
-        """Whether none of the 6 small rigid motions t + r × x leaves all that is clamped or prescribed in place."""
+        """Whether each of the 6 small rigid motions t + r × x moves something that is clamped or prescribed."""
         held = [(on, axis) for on in self.clamp for axis in AXES]
         held += [(item.on, axis) for item in self.displacements for axis in item.components]
         extent = np.ptp(self.body.vertices, axis=0).max()

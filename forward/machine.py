@@ -1,6 +1,6 @@
-"""What the machine has left: memory, room on disk, and the exceptions that say that one of them ran out.
+"""What the machine has left, memory and disk space, and the exceptions that say that it ran out.
 
-Nothing is imported here, not even NumPy, so that this can be asked before anything is.
+Nothing is imported at the top, not even NumPy, so that this can be asked before anything else is imported.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ NO_ROOM = ("no space left on device", "disk quota exceeded", "file too large")
 class StopError(Exception):
     """The run cannot go on here and now: no memory, no room on disk, a model that ends its process.
 
-    Nothing is wrong with the study. What is finished is kept, nothing of what was going on is, and the same command
-    continues where the reason, which the message gives in a line, is gone.
+    Nothing is wrong with the study. Finished work is kept, work in progress is lost, and the same command continues
+    once the cause, which the message gives in one line, is gone.
     """
 
 
 @dataclass(frozen=True)
 class Headroom:
-    """Memory that this process can still take.
+    """Memory that this process can still allocate.
 
     Attributes
     ----------
@@ -53,9 +53,9 @@ class Headroom:
     limit
         What sets this limit, in words.
     of_addresses
-        Whether what counts is what is asked for, and not what is used.
+        Whether allocated memory counts, rather than used memory.
     of_each_process
-        Whether other processes have as much for themselves.
+        Whether every process has its own limit, rather than a share.
     """
 
     size: float
@@ -83,7 +83,7 @@ def headroom() -> Headroom:
 
 
 def require(size: float, what: str) -> None:
-    """Make sure of memory before it is asked for: where there is none, libraries crash, or wait for ever.
+    """Check that memory is available before it is needed: without it, libraries crash or wait for ever.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def require(size: float, what: str) -> None:
 
 
 def reserve_for_linear_algebra() -> None:
-    """Let linear algebra take its buffer now, which it keeps.
+    """Let the linear algebra library allocate now the buffer that it keeps.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def _limits() -> Iterator[Headroom]:
 
 
 def _of_control_groups(root: Path, own: Path) -> Iterator[Headroom]:
-    """What the control groups of this process leave (containers, batch systems), of both versions of the interface."""
+    """Limits of the control groups of this process (containers, batch systems), in both versions of the interface."""
     try:
         memberships = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
     except OSError:
@@ -181,7 +181,7 @@ def _of_group(group: Path, most: str, used: str, cached: str) -> Headroom | None
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an exception, or one that it came from, says that memory ran out."""
+    """Whether an exception, or one of its causes, says that memory ran out."""
     return any(
         isinstance(one, MemoryError)
         or getattr(one, "ierr", None) == PETSC_OUT_OF_MEMORY
@@ -192,7 +192,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def out_of_room(error: BaseException) -> str | None:
-    """Return, in a line, which file has no room on disk if an exception, or one that it came from, says so."""
+    """Return, in a line, which file found no space on disk, if an exception or one of its causes says so."""
     for one in _chain(error):
         if isinstance(one, OSError) and one.errno in FULL:
             place = f"{os.fsdecode(one.filename)}: " if isinstance(one.filename, str | bytes) else ""
@@ -214,7 +214,7 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def reason_to_stop(error: BaseException, needed: float | None = None) -> str | None:
-    """Say in a line why an exception ends the run, where the cause is no mistake of the program; None for any other.
+    """Say in a line why an exception ends the run, if the cause is not a bug of the program; otherwise None.
 
     Parameters
     ----------
@@ -239,12 +239,12 @@ def reason_to_stop(error: BaseException, needed: float | None = None) -> str | N
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under another name and rename it into place, so that it is there whole or not at all.
+    """Write a file under another name and rename it into place, so that it exists completely or not at all.
 
     Raises
     ------
     StopError
-        If there is no room for it; nothing of it is left then.
+        If there is no space for it; no partial file is left.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -3,7 +3,7 @@
 A model maps parameters (d,) to a solution; the solution is immutable and carries its own linearisation, so that a
 stale derivative cannot be written. Nothing here knows FEniCSx or MPI.
 
-The module is longer than others because the whole contract, most of which is words, stands in one place.
+The module is longer than others because the whole contract, most of it documentation, is in one place.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ WORK = tuple(field.name for field in fields(Work))
 
 
 class Stability(IntEnum):
-    """How it was looked at whether an equilibrium is stable, and what was found."""
+    """How the stability of an equilibrium was tested, and the result."""
 
-    NOT_TESTED = 0  # it was not asked for, or the state is none that can be unstable, or no equilibrium
-    SCREENED = 1  # a few directions that are likely to show an instability show none
+    NOT_TESTED = 0  # not requested, or the model has no equilibria, or the state is not one
+    SCREENED = 1  # directions that are likely to show an instability show none
     COUNTED = 2  # the stiffness at the state has no negative eigenvalue
-    REFUSED = 3  # the stiffness at an equilibrium has some, and no stable one was found
-    MISSED = 4  # the same where the screen had shown none, or where another equilibrium was found then
+    REFUSED = 3  # the stiffness has negative eigenvalues, and no stable equilibrium was found
+    MISSED = 4  # as REFUSED, but the screen had shown none, or another equilibrium was found afterwards
 
 
 class SolveError(Exception):
@@ -60,7 +60,7 @@ class SolveError(Exception):
     work
         What was spent on the attempt.
     stability
-        Whether it is an equilibrium that was refused.
+        Whether an equilibrium was found and refused.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class SolveError(Exception):
 
 
 class InadmissibleError(SolveError):
-    """There is no such material, or it has no energy there: nothing to solve for, and no likelihood of any data."""
+    """The material is inadmissible, or its energy undefined: there is nothing to solve, and the likelihood is zero."""
 
 
 Severity = Literal["note", "warning", "error"]
 
 
 class Finding(NamedTuple):
-    """What a user has to know of a result beside its numbers.
+    """What a user has to know about a result besides its numbers.
 
     Parameters
     ----------
@@ -100,26 +100,26 @@ class Finding(NamedTuple):
 
 
 class ModelError(ValueError):
-    """A model cannot be made or used at all, wherever its parameters are; the message is one line for the user."""
+    """A model cannot be made or used at all, whatever its parameters; the message is one line for the user."""
 
 
 class DerivativeError(Exception):
-    """A derivative was asked for that the model or the output does not have."""
+    """A derivative was requested that the model or the output does not have."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSolution:
-    """A solution that was found before, whose linearisation may serve the solves near it.
+    """An earlier solution whose linearisation can help to solve nearby.
 
     Attributes
     ----------
     parameters
-        Where (d,).
+        Parameter vector (d,) of the solution.
     state
         This rank's part (U_local,) of the state there.
     spread
-        How far the parameters vary, where that is known: standard deviations (d,) of independent ones, or a few random
-        draws (k, d) of their differences from a mean.
+        How far the parameters vary, if known: standard deviations (d,) of independent parameters, or a few random draws
+        (k, d) of their differences from the mean.
     """
 
     parameters: FloatArray
@@ -134,9 +134,9 @@ class ReferenceSolution:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """What is known of a solution before it is solved for.
+    """What is known about a solution before it is computed.
 
-    A state and a reference may change what the solution costs, never the answer beyond the solver's tolerance.
+    A state and a reference may change the cost of the solution, but the answer only within the solver's tolerance.
 
     Attributes
     ----------
@@ -145,9 +145,8 @@ class Guess:
     reference
         A solution nearby, whose linearisation helps.
     iterations
-        The solver makes at most so many, and the solution is the state that it has then, whose `residual` says how far
-        it is from equilibrium; only where that state is not admissible is the model solved after all. None: it goes on
-        to its tolerance.
+        Maximum number of iterations: the solution is then the state reached, and its `residual` says how far it is from
+        equilibrium. If that state is not admissible, the model is solved after all. None: iterate to the tolerance.
     """
 
     state: FloatArray | None = None
@@ -188,7 +187,8 @@ class Solution(Protocol):
     """The answer of a model at one parameter vector, with its linearisation there.
 
     With d parameters, m outputs and a state of U unknowns (of which a rank of a distributed model holds its part).
-    Directions and weights may be stacked as k rows; then so are the results, which costs less than one at a time.
+    Directions and weights may be stacked as k rows, and then so are the results; this costs less than one at a
+    time.
     """
 
     @property
@@ -208,11 +208,11 @@ class Solution(Protocol):
 
     @property
     def converged(self) -> bool:
-        """Whether that meets the solver's tolerance (or is rounding); if not, the solver was stopped before."""
+        """Whether the residual meets the solver's tolerance (or is rounding); if not, the solver was stopped early."""
 
     @property
     def stability(self) -> Stability:
-        """What is known of the stability of the equilibrium so far."""
+        """What is known so far about the stability of the equilibrium."""
 
     @property
     def work(self) -> Work:
@@ -238,7 +238,7 @@ class Solution(Protocol):
 
 
 class NamedOutput(Protocol):
-    """What a specification says of an output."""
+    """What a specification says about an output."""
 
     @property
     def name(self) -> str:
@@ -250,7 +250,7 @@ class NamedOutput(Protocol):
 
 
 class NodalSpace(Protocol):
-    """The nodes of a body, the cells between them, and states over them, of which each rank of the group holds a part.
+    """The nodes of a body, the cells between them, and states over them, distributed over a group's ranks.
 
     Nodes are in canonical order: sorted by x, then y, then z, whatever the number of ranks. A state (U,) in canonical
     order begins with the displacements of the nodes, interleaved by component.
@@ -262,9 +262,9 @@ class NodalSpace(Protocol):
 
     @property
     def displacements(self) -> int:
-        """Number of displacements with which a state (U,) begins; 0 where a state is no displacement field.
+        """Number of displacements with which a state (U,) begins; 0 if a state is not a displacement field.
 
-        What follows (pressures) is needed to predict states, and is no displacement field.
+        The rest of the state (pressures) is needed to predict states.
         """
 
     def cells(self) -> tuple[NDArray[np.int64], int]:
@@ -282,8 +282,8 @@ class NodalSpace(Protocol):
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), by its name.
 
-        Collective; empty but on the first rank. The nodes are those of displacements, or of another degree: 1 is for
-        the vertices.
+        Collective; empty except on the first rank. The nodes are those of the displacements, or of another degree: 1
+                for the vertices.
         """
 
     @property
@@ -324,17 +324,17 @@ class ForwardModel(Protocol):
     ) -> Iterator[Solution | SolveError]:
         """Solve at points (n, d), each with its guess; yield the solutions in this order, or why there is none.
 
-        What is wanted of a solution is cheapest before the next one is asked for.
+        Whatever is needed from a solution is cheapest before the next one is requested.
         """
 
 
 class OneByOne:
-    """`solve_many` of a model that solves one point after the other."""
+    """`solve_many` for models that solve one point at a time."""
 
     def solve_many(
         self: ForwardModel, points: FloatArray, guesses: Iterable[Guess | None] | None = None
     ) -> Iterator[Solution | SolveError]:
-        """Yield the solution at each of points (n, d), or why there is none; each is solved when it is asked for."""
+        """Yield the solution at each of points (n, d), or why there is none; each is solved on demand."""
         for point, guess in zip(points, guesses or repeat(None), strict=False):
             try:
                 found: Solution | SolveError = self.solve(point, guess)
@@ -364,7 +364,7 @@ def real(returned: object, what: str) -> FloatArray:
     Raises
     ------
     ModelError
-        If it is none: texts, complex numbers, rows of different lengths.
+        If it is not such an array: text, complex numbers, rows of different lengths.
     """
     try:
         found = np.asarray(returned)
@@ -388,7 +388,7 @@ class FunctionModel(OneByOne):
     parameters, outputs
         Names.
     jacobian
-        (d,) → (m, d); without it the solutions have no derivatives.
+        (d,) → (m, d); without it, solutions have no derivatives.
     """
 
     function: Callable[[FloatArray], ArrayLike]
@@ -436,7 +436,7 @@ class FunctionSolution:
 
     @property
     def residual(self) -> float:
-        """Nothing is left to solve."""
+        """Zero: there is nothing to solve."""
         return 0.0
 
     @property
@@ -446,12 +446,12 @@ class FunctionSolution:
 
     @property
     def stability(self) -> Stability:
-        """No equilibrium that could be unstable."""
+        """There is no equilibrium that could be unstable."""
         return Stability.NOT_TESTED
 
     @property
     def work(self) -> Work:
-        """No work that is counted."""
+        """No work is counted."""
         return Work()
 
     def tangent(self, direction: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Kinds of blocks by their names: each is imported when it is asked for, also from outside the program.
+"""Kinds of blocks by name: each is imported on demand, also from outside the program.
 
 A kind is one of the program's own, or one that an installed package declares by an entry point of the group ``tissuq``
 (named ``FAMILY.KIND``, such as ``material.fung``), or a dotted path (``my_tissue.fung``) to a module beside the study
@@ -22,7 +22,7 @@ ENTRY_POINTS = "tissuq"
 
 
 class KindError(ValueError):
-    """There is no such kind, or what stands for it cannot be used; the message is one line for the user."""
+    """There is no such kind, or it cannot be used; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Kinds:
     own
         Those of the program: ``MODULE:NAME`` by kind.
     expected
-        The class that every one must be a subclass of.
+        The class of which every kind must be a subclass.
     objection
-        Instead, where they are no classes: why something is none of them, or None if it is one.
+        For kinds that are not classes: returns why something is not of this family, or None if it is.
     """
 
     family: str
@@ -48,11 +48,11 @@ class Kinds:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Kinds that have a name without dots: the program's own, and those of installed packages."""
+        """Kinds whose name has no dots: the program's own, and those of installed packages."""
         return (*self.own, *(name for name in self._installed() if name not in self.own))
 
     def __getitem__(self, kind: str) -> Any:
-        """Import what a kind stands for.
+        """Import the object of a kind.
 
         Raises
         ------
@@ -96,23 +96,25 @@ class Kinds:
         if self.objection is not None:
             objection = self.objection(found)
             if objection is not None:
-                raise KindError(f"'{module}.{name}' is no {self.family}: {objection}")
+                raise KindError(f"'{module}.{name}' cannot be used as {self.family}: {objection}")
             return found
         if not (isinstance(found, type) and issubclass(found, self.expected)):
-            raise KindError(f"'{module}.{name}' is no {self.family}: expected a subclass of {self.expected.__name__}")
+            raise KindError(
+                f"'{module}.{name}' cannot be used as {self.family}: expected a subclass of {self.expected.__name__}"
+            )
         if issubclass(found, Settings) and "kind" not in found.model_fields:
             raise KindError(f"the {self.family} '{module}.{name}' has no field called kind, expected kind: str")
         return found
 
 
 def named(text: str) -> Any:
-    """Return what a text "module:Name" names, of which the module is imported now."""
+    """Import and return the object that a string "module:Name" names."""
     module, _, name = text.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
 def dotted(document: Any) -> Iterator[str]:
-    """Return the modules of all kinds in a document that are dotted paths, wherever in it they are."""
+    """Return the modules of all kinds in a document that are dotted paths, at any depth."""
     if isinstance(document, Mapping):
         kind = document.get("kind")
         if isinstance(kind, str) and "." in kind and all(step.isidentifier() for step in kind.split(".")):
@@ -128,16 +130,16 @@ def dotted(document: Any) -> Iterator[str]:
 class OfKind:
     """Annotation of a field that holds a block of one of these kinds: ``Annotated[Settings, OfKind(LOADS)]``.
 
-    Only the kind that is written is imported. Mistakes in the block have their places, as in unions of pydantic.
+    Only the kind that is named is imported. Mistakes in the block are located as in pydantic's unions.
 
     Parameters
     ----------
     kinds
         The kinds.
     default
-        The kind where none is written; None where it must be.
+        The kind if none is given; None if it is required.
     make
-        Returns the block of a kind, where the kinds are no blocks themselves.
+        Returns the block of a kind, if the kinds are not blocks themselves.
     """
 
     kinds: Kinds
@@ -149,7 +151,7 @@ class OfKind:
         return self.kinds[kind] if self.make is None else self.make(kind)
 
     def validate(self, value: Any) -> Any:
-        """Return the block that a table describes; blocks that were made before pass."""
+        """Return the block that a table describes; blocks are returned as they are."""
         if isinstance(value, self.kinds.expected):
             return value
         if not isinstance(value, Mapping):
@@ -170,14 +172,14 @@ class OfKind:
         return core_schema.no_info_before_validator_function(self.validate, core_schema.any_schema())
 
     def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        """Any of the kinds that have a name, or a block of a dotted one, of which nothing is known."""
+        """Any of the named kinds, or a block of a dotted kind, about which nothing is known."""
         known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.names]
         other = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}}
         return {"anyOf": [*known, {**other, "required": ["kind"]}]}
 
 
 def _with_reference(block: type[Settings]) -> core_schema.CoreSchema:
-    """Return the schema of a block by which it has a place of its own in a JSON Schema, that others refer to."""
+    """Return the schema of a block as a separate definition of a JSON Schema, to which others refer."""
     found: core_schema.CoreSchema = block.__pydantic_core_schema__
     name = found.get("ref")
     if not isinstance(name, str):

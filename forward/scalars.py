@@ -31,12 +31,12 @@ class Scalar(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """SI unit, as the annotation of the field says it; "1" without."""
+        """SI unit from the annotation of the field; "1" without."""
         return next((item.unit for item in self.block.model_fields[self.field].metadata if isinstance(item, Unit)), "1")
 
 
 def numbers(block: type[Settings]) -> tuple[str, ...]:
-    """Return the fields of a block that are annotated with a unit: those that can be made parameters."""
+    """Return the fields of a block that are annotated with a unit: these can be parameters."""
     return tuple(
         name for name, field in block.model_fields.items() if any(isinstance(item, Unit) for item in field.metadata)
     )

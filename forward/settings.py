@@ -1,4 +1,4 @@
-"""The frozen, strictly checked block that every specification, method and study is made of."""
+"""The frozen, strictly checked block of which every specification, method and study consists."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Settings(BaseModel):
             ) from None
 
     def __hash__(self) -> int:
-        """Hash what the block says: tables within it are dictionaries, which have no hash of their own."""
+        """Hash the contents of the block: the tables in it are dictionaries, which are not hashable."""
         return hash(json.dumps(self.model_dump(mode="json"), sort_keys=True))
 
 
@@ -55,7 +55,7 @@ LISTED = 30  # words that a message proposes
 
 
 def shown(value: Any) -> str:
-    """Return a value for a message, cut where it is long."""
+    """Return a value for a message, shortened if it is long."""
     try:
         text = repr(list(value) if isinstance(value, tuple) else value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, lists nested as deep
@@ -69,7 +69,7 @@ def cut(text: str, most: int) -> str:
 
 
 def one_line(text: str, most: int = 600) -> str:
-    """Return a message without line breaks and letters that cannot be seen, its words and itself cut where long."""
+    """Return a message on one line without invisible characters; long words and long messages are shortened."""
     visible = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
     visible = re.sub(r"\S{300,}", lambda word: cut(word[0], LONGEST), visible)
     return visible if len(visible) <= most else f"{visible[: most // 2]} ... {visible[-most // 2 :]}"
@@ -110,14 +110,14 @@ _PATTERNS = {  # of texts, by how they begin
 
 
 def _follows(line: Any) -> bool:
-    """Whether a mistake is that a list is too short only because there are mistakes in its items."""
+    """Whether a list counts as too short only because there are mistakes in its items."""
     return line["type"] == "too_short" and len(line["input"]) >= int(
         line["ctx"].get("min_length", len(line["input"]) + 1)
     )
 
 
 def _explain(cls: type[BaseModel], line: Any) -> InitErrorDetails:
-    """Carry one pydantic error on, in words; an unknown key of this very block gets its nearest known key."""
+    """Reword one pydantic error; for an unknown key of this block, suggest the nearest known key."""
     place, given, kind, context = line["loc"], line["input"], line["type"], {}
     message = _PLAIN.get(kind, line["msg"].removeprefix("Value error, "))
     if kind == "extra_forbidden" and len(place) == 1:

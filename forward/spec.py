@@ -1,7 +1,7 @@
-"""What a study asks of a model before it is made: the base of every block `[model]`, and the kinds there are.
+"""What a study asks of a model before it is built: the base of every block `[model]`, and the kinds of models.
 
-A specification needs no FEniCSx. A kind of one's own is a subclass in a module beside the study or in an installed
-package (`forward.registry`): it says its numbers and its outputs, and `build` makes it.
+A specification needs no FEniCSx. Your own kind is a subclass in a module beside the study or in an installed package
+(`forward.registry`): it states its numbers and outputs, and `build` makes the model.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 
 class ModelSpec(Settings):
-    """A model as a study describes it. What is not abstract holds for a map from numbers to numbers.
+    """A model as a study describes it. Whatever is not abstract is right for a map from numbers to numbers.
 
     Attributes
     ----------
     meshed
-        Whether its state lives on a mesh, of which `refined` gives finer ones.
+        Whether its state lives on a mesh that `refined` can refine.
     iterative
         Whether a solve can be stopped after some iterations.
     shareable
@@ -44,7 +44,7 @@ class ModelSpec(Settings):
 
         @property
         def kind(self) -> str:
-            """As the study has it."""
+            """Its kind, as in the study."""
 
         @property
         def outputs(self) -> Sequence[NamedOutput]:
@@ -74,7 +74,7 @@ class ModelSpec(Settings):
 
     @abstractmethod
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Say what it is, for values of parameters within ranges by their paths: words and what they are of."""
+        """Describe the model for values of parameters within ranges, by their paths: yield labels and texts."""
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved: headings, each with its lines.
@@ -82,9 +82,9 @@ class ModelSpec(Settings):
         Parameters
         ----------
         said
-            What is said of a number of the model, by its path.
+            Describes a number of the model, by its path.
         where
-            What is added to what is true of one mesh only.
+            Added to statements that hold for one mesh only.
         """
         yield "model", [self.description]
         yield "parameters", [f"{name} = {said(name)}" for name in self.scalars]
@@ -102,12 +102,12 @@ class ModelSpec(Settings):
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Modules that the user has written for it: results are not continued once their text has changed."""
+        """Modules that the user has written for it: results are not continued once their source has changed."""
         return ()
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns of its equations; 0 where there are none."""
+        """Number of unknowns of its equations; 0 if there are none."""
         return 0
 
     def materials(self, parameters: Collection[str] = ()) -> Materials | None:
@@ -119,11 +119,11 @@ class ModelSpec(Settings):
         return self
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
-        """Find what cannot be where parameters are drawn: the places of these mistakes begin with "model"."""
+        """Find what is impossible with random parameters; the places of these mistakes begin with "model"."""
         yield from ()
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         return ()
 
     def refined(self, level: int) -> Self:
@@ -132,7 +132,7 @@ class ModelSpec(Settings):
         raise ModelError(message)
 
     def enriched(self) -> Self:
-        """Return the same model on the same mesh in elements of one degree more, which tell the error of its mesh.
+        """Return the same model on the same mesh with elements of one degree higher, to estimate its mesh error.
 
         Only what this costs is asked of it; solutions estimate the error (`Solution.mesh_error`).
         """
@@ -140,11 +140,11 @@ class ModelSpec(Settings):
         raise ModelError(message)
 
     def textbook(self) -> Self:
-        """Return the same model solved as in a textbook, by which it is measured what a better solver saves."""
+        """Return the same model with the textbook solver, against which the gain of a better solver is measured."""
         return self
 
     def tighter(self, factor: float) -> Self:
-        """Return the same model with the tolerances of its solver times a factor."""
+        """Return the same model with the solver's tolerances multiplied by a factor."""
         return self
 
     def solved_to(self, tolerance: Any) -> Self:
@@ -158,11 +158,11 @@ class ModelSpec(Settings):
         return self
 
     def cost(self) -> Times | None:
-        """Predict what a solve takes; None where that is not known."""
+        """Predict the cost of a solve; None if it is unknown."""
         return None
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides on results, as a table."""
+        """Return everything that results depend on, as a table."""
         return self.model_dump(mode="json", exclude_none=True)
 
 

@@ -1,4 +1,4 @@
-"""The specification of a specimen: one body under several load cases, of which displacements are observed."""
+"""The specification of a specimen: one body in several load cases, with observed displacements."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class LoadCase(Settings):
     Parameters
     ----------
     name
-        In names of observations.
+        Used in names of observations.
     clamp, displacements, loads
-        As of `Hyperelastic`.
+        As in `Hyperelastic`.
     """
 
     name: str = Field(pattern=r"^[^.\s]+$")
@@ -50,16 +50,16 @@ class LoadCase(Settings):
 
 
 class Observed(Settings):
-    """Displacements (m) that are measured.
+    """Measured displacements (m).
 
     Parameters
     ----------
     name
-        In names of observations; by default the boundary, or "points".
+        Used in names of observations; by default the boundary, or "points".
     on
-        Boundary at all of whose nodes they are measured.
+        Boundary; they are measured at all of its nodes.
     at
-        Points of the undeformed body (m); either these or `on`.
+        Points of the undeformed body (m), as an alternative to `on`.
     components
         Those that are measured.
     cases
@@ -86,7 +86,7 @@ class Observed(Settings):
 
 
 class _Loaded(Hyperelastic):
-    """The body in one load case; what is observed of it are no outputs."""
+    """The body in one load case; observations are not outputs."""
 
     outputs: tuple[Output, ...] = ()
 
@@ -97,11 +97,11 @@ class Specimen(ModelSpec):
     Parameters
     ----------
     body, material, regions, inclusions, fields, solver, formulation
-        As of `Hyperelastic`; the same in all cases.
+        As in `Hyperelastic`; the same in all cases.
     cases
         Load cases.
     observed
-        What is measured; not needed where data say it.
+        What is measured; not needed if the data say it.
     """
 
     shareable: ClassVar[bool] = True
@@ -144,11 +144,11 @@ class Specimen(ModelSpec):
         return materials(self.material, self.regions, parameters)
 
     def decision(self, ranges: Ranges) -> Decision:
-        """Return the formulation for values of parameters within ranges, by their paths, and why it is taken."""
+        """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
 
     def enriched(self) -> Self:
-        """Return the same specimen on the same mesh in elements of one degree more, in the form that it has here."""
+        """Return the same specimen on the same mesh with elements of one degree higher, in the same formulation."""
         formulation = "mixed" if self.decision({}).mixed else "displacement"
         return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
 
@@ -177,7 +177,7 @@ class Specimen(ModelSpec):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the load cases before anything is solved, each once."""
+        """Findings about the load cases before anything is solved, each once."""
         return tuple(dict.fromkeys(finding for case in self.cases for finding in self.loaded(case).findings))
 
     def mistakes_of_samples(self) -> Iterator[Mistake]:
@@ -192,7 +192,7 @@ class Specimen(ModelSpec):
         yield from self.loaded(self.cases[0]).mistakes_of_samples()
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
-        """What is to be said before anything is solved at values of parameters within ranges, by their paths."""
+        """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         return (*self.findings, *self.locking(ranges))
 
     @property
@@ -203,12 +203,12 @@ class Specimen(ModelSpec):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Displacements of the points that are observed, case after case.
+        """Displacements of the observed points, case after case.
 
         Raises
         ------
         ModelError
-            If nodes of a boundary are observed: which these are, only the mesh can tell.
+            If nodes of a boundary are observed: only the mesh knows which these are.
         """
         found = []
         for i, item in enumerate(self.observed):
@@ -224,11 +224,11 @@ class Specimen(ModelSpec):
         return tuple(found)
 
     def cost(self) -> Times:
-        """Predict what a solve of all load cases takes, of which each has a factor."""
+        """Predict the cost of a solve of all load cases, each with its own factor."""
         return sum_of([self.loaded(case).cost(factors=1) for case in self.cases])
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Say what was found in the file of a mesh, the load cases, and which unknowns they have."""
+        """Say what a mesh file holds, which load cases there are, and which unknowns they have."""
         decision, names = self.decision(ranges), ", ".join(case.name for case in self.cases)
         yield from self.body.listed.items()
         yield "load cases", f"{names}, of {self.over(ranges).unknowns:,} unknowns each"
@@ -242,7 +242,7 @@ class Specimen(ModelSpec):
         comm
             mpi4py communicator of the ranks that share the model.
         parameters
-            As of `Hyperelastic.build`.
+            As in `Hyperelastic.build`.
         """
         return named("forward.fem.specimen:SpecimenModel")(self, comm, parameters)
 

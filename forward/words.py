@@ -7,7 +7,7 @@ from typing import Any
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DIGITS = 15  # that a number has
-NONE = "–"  # what stands for a number that there is not
+NONE = "–"  # shown for a missing number
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -49,7 +49,7 @@ def duration(seconds: float) -> str:
 
 
 def worth(ratio: float) -> str:
-    """Write how many plain samples a controlled one is worth."""
+    """Write how many plain samples one controlled sample replaces."""
     return number(ratio, 3)
 
 
@@ -83,7 +83,7 @@ def listed(value: Any) -> str:
 
 
 def _power(value: float) -> int:
-    """Power of ten that is written apart: none for numbers of ordinary size."""
+    """Power of ten that is written separately: 0 for numbers of ordinary size."""
     power = math.floor(math.log10(abs(value))) if value else 0
     return 0 if -3 <= power < 6 else power
 

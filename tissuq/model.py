@@ -123,7 +123,7 @@ class Solution(Mapping[str, float]):
         """
         weights = np.array([float(name == output) for name in self])
         if not weights.any():
-            message = f"'{output}' is no output; {nearest(output, tuple(self))}"
+            message = f"'{output}' is not an output; {nearest(output, tuple(self))}"
             raise KeyError(message)
         return dict(zip(self._of.parameters, map(float, self.solved.adjoint(weights)), strict=True))
 

@@ -1,1 +1,1 @@
-"""What is asked of a deformed body: outputs, one file each."""
+"""Outputs: what is computed from a deformed body, one file each."""

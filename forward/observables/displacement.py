@@ -26,7 +26,7 @@ class PointDisplacement(Observable):
 
         (found,), (distance,) = spaces.point_weights(equations.space, np.array([self.at]))
         spec = equations.spec.body
-        # Points beside bodies with six sides were refused before; the mesh may cut their curved faces.
+        # Points outside boxes and blocks were refused before; the mesh may cut their curved faces.
         most = tolerance(spec) if isinstance(spec, MeshFile) else max(tolerance(spec), spec.longest_edge)
         if distance > most:
             where = ", ".join(f"{x:g}" for x in self.at)
@@ -39,5 +39,5 @@ class PointDisplacement(Observable):
         if found is not None:
             nodes, weights = found
             probe.x.array[3 * nodes + AXES.index(self.component)] = weights
-        # Weights of ghost nodes travel to the ranks that own them.
+        # Weights of ghost nodes are sent to the ranks that own them.
         return Linear(equations, equations.with_pressures(spaces.sum_ghosts(probe)))

@@ -1,4 +1,4 @@
-"""Functionals that several outputs are made of; they import UFL, so outputs import them when they are evaluated."""
+"""Functionals shared by several outputs; they import UFL, so outputs import them only when they are evaluated."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Integral:
         """Return ψ."""
         return float(self._value() / self.size)
 
-    # What is compiled lives as long as the output that it belongs to.
+    # Compiled forms live as long as the output that they belong to.
     @cached_property
     def _gradient(self) -> Any:
         return self._equations.vector(self._equations.derivative(self._density * self._measure))
@@ -57,7 +57,7 @@ class Integral:
 
     @cached_property
     def _by_fields(self) -> tuple[tuple[Any, Any], ...]:
-        """The random fields that the density depends on, with its derivative by their values at the vertices."""
+        """The random fields on which the density depends, with its derivative by their values at the vertices."""
         equations = self._equations
         return tuple(
             (

@@ -14,7 +14,7 @@ from forward.observables.observable import Equations, Functional, Observable
 class MaxDisplacement(Observable):
     """Largest |u_c| over the nodes (m), or largest |u| where `component` is "magnitude".
 
-    Differentiable where the node that attains it is unique; derivatives are those at that node.
+    Differentiable where only one node attains it; derivatives are those at that node.
     """
 
     kind: Literal["max-displacement"] = "max-displacement"
@@ -26,7 +26,7 @@ class MaxDisplacement(Observable):
 
 
 class _Extreme:
-    """ψ = max over the nodes of |u_c|, or of |u|; of nodes that tie, the first in the canonical order counts."""
+    """ψ = max over the nodes of |u_c|, or of |u|; of tied nodes, the first in canonical order counts."""
 
     def __init__(self, equations: Equations, axis: int | None) -> None:
         self._equations = equations

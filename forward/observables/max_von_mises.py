@@ -28,7 +28,7 @@ class MaxVonMises(Observable):
 
 
 class _MaxVonMises:
-    """ψ = max of the von Mises stress over the quadrature points; of points that tie, the first of the lowest rank.
+    """ψ = max of the von Mises stress over the quadrature points; of tied points, the first of the lowest rank.
 
     The stress at one point is written as the integral ∫ w σ dX / ∫ w dX with w = 1 at that point and 0 at the others,
     so that its derivatives are those of an integral.
@@ -40,7 +40,7 @@ class _MaxVonMises:
         from forward.fem.dolfinx import spaces
 
         self._equations = equations
-        # A pressure has no deviator: in the mixed form the energy of the change of shape is all that is needed.
+        # A pressure has no deviator: in the mixed form the isochoric energy is all that is needed.
         cauchy = equations.stress_of(equations.energy) * equations.F.T / equations.J
         stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
         degree = equations.spec.body.quadrature
@@ -54,7 +54,7 @@ class _MaxVonMises:
         return -ranks.smallest(self._equations.comm, -self._values().max(initial=0.0))
 
     def _at_place(self) -> Integral:
-        """Return the stress at the point where it is largest now."""
+        """Return the stress at the point where it is currently largest."""
         equations = self._equations
         here = np.argwhere(self._values() >= self.value())
         holders = equations.comm.allgather(len(here) > 0)

@@ -1,6 +1,6 @@
-"""What every output is: a block of settings with a unit, that knows its value and its derivatives.
+"""What every output is: a block of settings with a unit that knows its value and its derivatives.
 
-An output is a class with one file, here or beside a study (``kind = "my_tissue.Lengthening"``):
+An output is a class in its own file, here or beside a study (``kind = "my_tissue.Lengthening"``):
 
     class Lengthening(Observable):
         "Mean of λ² − 1 along x."
@@ -13,7 +13,7 @@ An output is a class with one file, here or beside a study (``kind = "my_tissue.
 
             return Integral(equations, (equations.F.T * equations.F)[0, 0] - 1, equations.volume)
 
-A field that is called `on` is the name of a boundary, one that is called `at` a point (m) of the undeformed body. UFL
+A field called `on` is the name of a boundary, a field called `at` is a point (m) of the undeformed body. UFL
 and FEniCSx are imported inside the methods, so that a study can be checked without them.
 """
 
@@ -34,7 +34,7 @@ from forward.settings import Settings
 class Functional(Protocol):
     """An output ψ(u, ω) of a discretised body, at the state and the parameters that its equations are set to.
 
-    Every method is collective over its ranks.
+    All methods are collective over the ranks of the equations.
     """
 
     def value(self) -> float:
@@ -59,7 +59,7 @@ class Equations(Protocol):
     parameters
         Paths of the parameters.
     scalars
-        Which of them (s,) are numbers of the model, and no coefficients of random fields.
+        Which of them (s,) are numbers of the model rather than coefficients of random fields.
     fields
         Random fields.
     mesh, facets, space
@@ -95,7 +95,7 @@ class Equations(Protocol):
 
     @property
     def energy(self) -> Any:
-        """Energy density; in the mixed form, without that of the change of volume."""
+        """Energy density; in the mixed form, without its volumetric part."""
 
     @property
     def volume(self) -> float:
@@ -126,7 +126,7 @@ class Equations(Protocol):
         """Compile a form that is linear in values at the vertices."""
 
     def at_points(self, expression: Any) -> Any:
-        """Compile an expression that is wanted at the quadrature points."""
+        """Compile an expression for evaluation at the quadrature points."""
 
     def state(self) -> FloatArray:
         """This rank's part (U_local,) of the state."""
@@ -154,7 +154,7 @@ class Equations(Protocol):
 
 
 class Observable(Settings):
-    """An output of a body; `kind` and `functional` are defined by every kind."""
+    """An output of a body; every kind defines `kind` and `functional`."""
 
     name: str = Field(min_length=1)
     unit: ClassVar[str] = "m"  # SI unit of the value

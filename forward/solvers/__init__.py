@@ -1,1 +1,1 @@
-"""Finding equilibria of a discrete system, and whether they are stable; nothing here knows finite elements."""
+"""Finding equilibria of a discrete system and testing their stability; nothing here knows finite elements."""

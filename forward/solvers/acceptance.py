@@ -1,4 +1,4 @@
-"""Whether a state is an equilibrium, and one that a body takes."""
+"""Whether a state is an equilibrium, and a stable one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from forward.solvers.settings import SolverSettings
 from forward.solvers.stability import NOT_SCREENED
 from forward.solvers.system import Residual, System, Way
 
-STALLED = 0.5  # a residual that falls by less may have met its floor of rounding
+STALLED = 0.5  # a residual that falls by less may have reached rounding
 
 
 class Diverged(Exception):  # noqa: N818 - control flow of the solvers
@@ -26,7 +26,7 @@ class Unstable(Diverged):
 def converged(system: System, tolerance: float, u: FloatArray, residual: Residual, sizes: list[float]) -> bool:
     """Whether a state is an equilibrium to the tolerance or, where the residual no longer falls, to rounding.
 
-    `sizes` are those of the residuals before, to which this one is added.
+    `sizes` are those of the previous residuals, to which this one is appended.
     """
     if residual.gap != 0:
         return False
@@ -39,7 +39,7 @@ def converged(system: System, tolerance: float, u: FloatArray, residual: Residua
 
 
 def convex(system: System, before: tuple[FloatArray, Residual], now: tuple[FloatArray, Residual]) -> bool:
-    """Whether the energy is convex along a move; where it is not, only a factor can tell what the state is."""
+    """Whether the energy is convex along a move; if not, only a factorisation can tell what the state is."""
     return system.curvature(now[0] - before[0], now[1].vector - before[1].vector) >= 0
 
 
@@ -51,10 +51,10 @@ def accepted(
     way: Way | None = None,
     history: list[str] | None = None,
 ) -> Stability:
-    """Look at an equilibrium: no cell is turned inside out and it is not unstable, or raise `Diverged`.
+    """Check that an equilibrium has no inverted cell and is not unstable, or raise `Diverged`.
 
-    What counts is the stiffness at the state itself, however it was found. Only where a reference is at hand may a
-    screen take the place of counting its negative eigenvalues.
+    What counts is the stiffness at the state itself, however it was found. Only with a reference solution may a screen
+    replace counting its negative eigenvalues.
     """
     check_jacobian(system, u)
     if settings.accept_unstable:
@@ -78,7 +78,7 @@ def accepted(
 
 
 def check_jacobian(system: System, u: FloatArray) -> None:
-    """Raise `Diverged` where a cell is turned inside out."""
+    """Raise `Diverged` if a cell is inverted."""
     jacobian = system.smallest_jacobian(u)
     if not jacobian > 0:
         message = f"a cell is turned inside out (smallest J = {jacobian:.3g})"
@@ -86,7 +86,7 @@ def check_jacobian(system: System, u: FloatArray) -> None:
 
 
 def instability(system: System) -> str:
-    """Say what the last factor tells of a failure; empty where it shows no negative eigenvalue."""
+    """Say what the last factor tells about a failure; empty if it shows no negative eigenvalue."""
     negative = system.inertia()
     if negative is None or negative <= 0:
         return ""

@@ -1,7 +1,7 @@
 """Solving with the factor of another matrix: Anderson mixing for equilibria, projections for linear systems.
 
 Both improve the plain correction x ← x − P⁻¹r(x) by what earlier corrections have shown of r. On a linear system the
-two span the same spaces. They converge as fast as P resembles the derivative of r; neither needs it symmetric.
+two span the same spaces. They converge the faster, the closer P is to the derivative of r, which need not be symmetric.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from forward.model import FloatArray
 
 Inverse = Callable[[FloatArray], FloatArray]  # applies P⁻¹ to (n,) or to rows (k, n)
 Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
-NEGLIGIBLE = 1e-13  # relative size of a direction, in least squares, that is taken to be rounding
-MARGIN = 2.0  # what convergence may fall short of that of the iterations before
+NEGLIGIBLE = 1e-13  # relative size of a direction, in least squares, that counts as rounding
+MARGIN = 2.0  # margin by which convergence may be slower than in the iterations before
 
 
 class AndersonMixing:
     """Fixed-point iteration u ← u − P⁻¹f(u) with mixing of the last iterates.
 
-    Of all combinations of the last differences, the one is taken out that leaves the linearised f smallest in the
-    Euclidean norm. Source: H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49 (2011) 1715–1735.
+    Subtracts the combination of the last differences that makes the linearised f smallest in the Euclidean norm.
+    Source: H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49 (2011) 1715–1735.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class AndersonMixing:
     total
         Sum over the ranks.
     weights
-        What makes the entries (n,) of f comparable in the Euclidean norm.
+        Weights that make the entries (n,) of f comparable in the Euclidean norm.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class AndersonMixing:
 
 
 def _least_squares(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations (k, k) of scaled columns, without the directions that are rounding."""
+    """Solve the normal equations (k, k) of scaled columns, without directions that are rounding."""
     size = np.sqrt(np.diag(gram))
     size[size == 0] = 1
     values, vectors = np.linalg.eigh(gram / np.outer(size, size))
@@ -94,10 +94,10 @@ def block_galerkin(
     """Solve A x_i = b_i for all k right-hand sides together, with residuals orthogonal to all directions searched.
 
     Where A is symmetric these are block conjugate gradients, whose errors are the smallest in energy; with
-    P ≈ A that says more about x than the size of a residual does. Full orthogonalisation keeps them so after rounding,
+    P ≈ A that says more about x than the size of a residual. Full orthogonalisation preserves this under rounding,
     and allows A without symmetry. All systems share their search spaces, so that k need fewer iterations than one.
-    Stopped where the next correction, times the factor by which both of the last two iterations have shortened it and
-    with a margin, is below the tolerance; that correction is still added, since it costs no product.
+    Stops when the next correction, times the factor by which both of the last two iterations have shortened it and with
+    a margin, is below the tolerance; that correction is still added, since it costs no product.
     Sources: D. P. O'Leary, Linear Algebra Appl. 29 (1980) 293–322; Y. Saad, Math. Comp. 37 (1981) 105–126.
 
     Parameters
@@ -109,7 +109,7 @@ def block_galerkin(
     total
         Sum over the ranks.
     size
-        (k, n) → (k,): what corrections and solutions are measured with.
+        (k, n) → (k,): norm of corrections and solutions.
     tolerance
         Error of each solution relative to its size.
     iterations
@@ -120,7 +120,7 @@ def block_galerkin(
     Returns
     -------
     numpy.ndarray or None
-        Solutions (k, n); None if they are not reached.
+        Solutions (k, n); None without convergence.
     """
     x, r = np.zeros_like(right), np.array(right)
     most = (0 if first is None else len(first)) + iterations * len(right)

@@ -11,17 +11,17 @@ from forward.solvers.settings import SolverSettings
 from forward.solvers.system import Found, Residual, System, Way
 
 WINDOW = 8  # differences that Anderson mixing keeps
-PATIENCE = 6  # corrections without a smaller residual before they are given up
-ROUGH = 1e-2  # relative residual of a state that only serves to predict the next
-SHORTEST = 1 / 8  # part of the way from the reference that is not divided any more
-ROUNDED = 1e-2  # relative residual above which a correction that does not help has not met rounding
+PATIENCE = 6  # corrections without a smaller residual before giving up
+ROUGH = 1e-2  # relative residual of a state that only predicts the next
+SHORTEST = 1 / 8  # fraction of the path from the reference that is not divided further
+ROUNDED = 1e-2  # relative residual above which a useless correction is not due to rounding
 
 
 def predict_correct(system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]) -> Found:
-    """Correct a prediction with a reference factor, in steps along the way where one is too long; or raise `Diverged`.
+    """Correct a prediction with a reference factor, in several steps if one is too long; or raise `Diverged`.
 
-    With s the slope of the prediction, the state after a part t of the way is ū + t s + t² q(t). The first step takes
-    q = 0; each state that is found gives a value of q, through the last two of which the next is predicted.
+    With s the slope of the prediction, the state after a fraction t of the path is ū + t s + t² q(t). The first step
+    takes q = 0; each state found gives a value of q, and the last two values predict the next.
     """
     slope = start - way.state
     known: list[tuple[float, FloatArray]] = []
@@ -52,7 +52,7 @@ def predict_correct(system: System, settings: SolverSettings, start: FloatArray,
 
 
 def _line(known: list[tuple[float, FloatArray]], t: float) -> FloatArray | float:
-    """Value at t of the line through the last two of the points known, of the constant through one, or zero."""
+    """Value at t of the line through the last two known points, of the constant through one, or zero."""
     if not known:
         return 0.0
     (b, q) = known[-1]

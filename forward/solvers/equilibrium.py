@@ -1,11 +1,11 @@
 """Finding the equilibrium of a discretised body: predict and correct with a reference factor, Newton, load steps.
 
 From a prediction, `solve` first corrects with the factor of a reference state and Anderson mixing, which needs no
-stiffness; where that is slow it goes on with Newton's method, then with adaptive load steps. All of them stop at the
-same test of the residual. `solve` can also be told to stop after a few iterations, wherever it is then.
+stiffness; if that is slow it continues with Newton's method, then with adaptive load steps. All of them use the same
+residual test. `solve` can also be told to stop after a few iterations, wherever it is then.
 
-Whole Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
-what stops the iteration are steps that grow. A line search on the residual or on the energy, or the natural
+Full Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
+the iteration stops when steps grow. A line search on the residual or on the energy, or the natural
 monotonicity test of Deuflhard's NLEQ-ERR, would shorten the first step of a slender body in bending, after which the
 residual is 5000 times and the simplified correction 380 times larger although Newton converges in six more
 iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0002-newton-globalisation.md).
@@ -23,7 +23,7 @@ from forward.solvers.newton import admissible_step, factorise, load_steps, newto
 from forward.solvers.settings import SolverSettings
 from forward.solvers.system import Found, Residual, System, Way
 
-ASTRAY = 100  # relative residual after the corrections that were allowed: the reference is too far away
+ASTRAY = 100  # relative residual after all allowed corrections: the reference is too far away
 
 
 def solve(
@@ -39,7 +39,7 @@ def solve(
     Parameters
     ----------
     system
-        The body; its `work` counts what is spent.
+        The discrete equations; their `work` counts the cost.
     settings
         Path, tolerance and limits.
     zero
@@ -49,9 +49,9 @@ def solve(
     way
         Where the prediction comes from.
     iterations
-        Stop after so many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
-        or, without one, Newton steps. The equilibrium is looked for after all where they lead to no admissible state,
-        and where they are as many as the settings allow at all.
+        Stop after this many iterations from `start`, or from `zero`: corrections with the factor that belongs to `way`
+        or, without one, Newton steps. The equilibrium is computed after all if they lead to no admissible state, or if
+        they are as many as the settings allow anyway.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def solve(
             refused = max(refused, stop.stability)
 
     def known(found: Found) -> Found:
-        # What the screen has missed is to be known, even where another equilibrium is found in its place.
+        # A miss of the screen must be recorded, even if another equilibrium is found instead.
         return found._replace(stability=refused) if refused == Stability.MISSED else found
 
     if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
@@ -110,10 +110,10 @@ def solve(
 def _iterate_few(
     system: System, settings: SolverSettings, start: FloatArray, way: Way | None, iterations: int, history: list[str]
 ) -> Found:
-    """Make so many iterations, fewer if they meet the tolerance; or raise `Diverged`.
+    """Make this many iterations, fewer if they meet the tolerance; or raise `Diverged`.
 
-    What counts is the last state and not that with the smallest residual: the first step of a slender body in bending
-    raises the residual although it brings the body closer.
+    The last state counts, not the one with the smallest residual: the first step of a slender body in bending raises
+    the residual although it brings the body closer to equilibrium.
     """
     u = system.on_target(start)
     residual = system.residual(u)

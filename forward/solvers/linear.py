@@ -1,4 +1,4 @@
-"""What solvers of equilibria want of a linear solver."""
+"""What solvers of equilibria need from a linear solver."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from forward.model import FloatArray
 
 
 class LinearSolver(Protocol):
-    """A solver of K x = b for a stiffness K, which is that of the state that was set when `factorise` was last called.
+    """A solver of K x = b, with the stiffness K of the state that was set when `factorise` was last called.
 
     K may be symmetric and definite, symmetric and indefinite (with pressures as unknowns), or not symmetric (under
     loads that follow the body). Rows and columns of prescribed unknowns are those of the identity. Vectors hold this
@@ -16,7 +16,7 @@ class LinearSolver(Protocol):
     """
 
     def factorise(self) -> None:
-        """Take over the stiffness at the state that is set: assemble, and prepare whatever solutions need.
+        """Prepare for the stiffness at the current state: assemble it, and compute whatever solutions need.
 
         Raises
         ------
@@ -30,7 +30,7 @@ class LinearSolver(Protocol):
         """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides."""
 
     def negative_eigenvalues(self) -> int | None:
-        """Return the number of negative eigenvalues of K (its inertia); None where the solver does not know it."""
+        """Return the number of negative eigenvalues of K (its inertia); None if the solver does not know it."""
 
     def memory(self) -> int:
-        """Return the bytes that what is prepared takes on all ranks; 0 before."""
+        """Return the bytes that the prepared data take on all ranks; 0 before `factorise`."""

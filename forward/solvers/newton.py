@@ -10,12 +10,12 @@ from forward.solvers.corrections import mix
 from forward.solvers.settings import SolverSettings
 from forward.solvers.system import Found, Residual, System
 
-QUICK = 5  # a load step that needs no more iterations than this lets the next one be twice as long
+QUICK = 5  # after a load step with at most this many iterations, the next one is twice as long
 GROWTH = 4.0  # a Newton step that is longer than all before by this factor means divergence
-NEAR = 0.2  # a Newton step shorter than this part of the last: its factor is good for more than one correction
+NEAR = 0.2  # below this fraction of the last Newton step, a factor is used for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
-SQUEEZED = 0.3  # J of a cell that is worth a word where the load cannot be raised
-LOCATED = 1 / 64  # of the load: how near the end of a stable branch is looked for
+SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
+LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
 
 
@@ -24,8 +24,8 @@ def load_steps(
 ) -> Found:
     """Raise the load from zero; halve the step where Newton fails, double it where it is quick.
 
-    The load at which an equilibrium was found unstable is not tried again before the stable branch has been followed to
-    within `LOCATED` of it: from further away Newton would only find the same. Once an equilibrium was unstable (at full
+    The load at which an equilibrium was unstable is not tried again until the stable branch has been followed to within
+    `LOCATED` of it: from further away Newton would only find the same state. Once an equilibrium was unstable (at full
     load, if `unstable` says so), the branch is expected to end, and only `REFUSALS` more attempts may fail.
     """
     reached, step, refusals = 0.0, 0.5, 0
@@ -117,7 +117,7 @@ def factorise(system: System, u: FloatArray) -> None:
 def admissible_step(
     system: System, settings: SolverSettings, u: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, Residual]:
-    """Go the whole step, or halve it until the energy is defined and J > 0 at every quadrature point."""
+    """Take the full step, or halve it until the energy is defined and J > 0 at every quadrature point."""
     fraction = 1.0
     while fraction >= settings.minimum_damping:
         trial = u + fraction * step

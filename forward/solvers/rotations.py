@@ -1,9 +1,10 @@
 """The factor of a reference state as an approximate inverse of the stiffness at other states.
 
-Between two states of a slender body most of what changes is the orientation of its parts. So the reference factor K̄ is
-turned along: K(u)⁻¹ ≈ R K̄⁻¹ Rᵀ, where R holds at each node the rotation from the reference state to u. On the published
-beam this halves the number of corrections (docs/decisions/0004-turned-reference.md). The rotations are those of the
-polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. Stat. Comput. 7 (1986) 1160–1174.
+Between two states of a slender body it is mostly the orientation of its parts that changes. So the reference factor K̄
+is turned along with them: K(u)⁻¹ ≈ R K̄⁻¹ Rᵀ, where R holds at each node the rotation from the reference state to u. On
+the published beam this halves the number of corrections (docs/decisions/0004-turned-reference.md). The rotations are
+those of the polar decompositions of the deformation gradients: N. J. Higham, SIAM J. Sci. Stat. Comput. 7 (1986)
+1160–1174.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from forward.solvers.anderson import Inverse
 
 
 def rotations(F: FloatArray) -> FloatArray:
-    """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n); the identity where F turns space over."""
+    """Return the rotations (3, 3, n) in deformation gradients F (3, 3, n); the identity where det F is negative."""
     good = _determinant(F) > 0
     identity = np.broadcast_to(np.eye(3)[:, :, None], F.shape)
     X = np.where(good, F, identity)
@@ -25,7 +26,7 @@ def rotations(F: FloatArray) -> FloatArray:
         inverse = cofactors / (X[0] * cofactors[0]).sum(axis=0)  # transposed
         scale = ((inverse**2).sum(axis=(0, 1)) / (X**2).sum(axis=(0, 1))) ** 0.25
         before, X = X, (scale * X + inverse / scale) / 2
-        if np.abs(X - before).max(initial=0.0) < 1e-6:  # the error is the square of that
+        if np.abs(X - before).max(initial=0.0) < 1e-6:  # the error is its square
             break
     return X
 
@@ -44,7 +45,7 @@ def _determinant(F: FloatArray) -> FloatArray:
 
 
 def turn(x: FloatArray, R: FloatArray) -> FloatArray:
-    """Return x (n,) or rows (k, n) with the vectors of the nodes turned by R (3, 3, n_owned); what follows is kept."""
+    """Return x (n,) or rows (k, n) with nodal vectors turned by R (3, 3, n_owned); the rest is unchanged."""
     n = 3 * R.shape[2]
     y = np.array(x)
     for i in range(3):  # nine products of long vectors: much faster than many small matrices

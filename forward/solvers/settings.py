@@ -1,4 +1,4 @@
-"""Path, tolerance and limits of the solver, as a study has them."""
+"""Path, tolerance and limits of the solver, as given in a study."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ class SolverSettings(Settings):
     Parameters
     ----------
     kind
-        "predict-correct" uses a prediction and a reference factor where the method has them, and the last factor for
-        more than one correction; "newton" is the textbook: from zero, a new factor for every step. Where a method
-        counts iterations, both go from its prediction.
+        "predict-correct" uses a prediction and a reference factor if the method provides them, and the last factor for
+        more than one correction; "newton" is the textbook solver: from zero, a new factor for every step. If a method
+        limits the iterations, both start from its prediction.
     tolerance
         Largest residual of the free unknowns, relative to the loads (and to the reactions where displacements are
-        prescribed); in the mixed form, also of the volumes, as the force of the pressure that they lack.
+        prescribed); in the mixed form, also of the volumes, as the force of the missing pressure.
     derivative_tolerance
         Largest error of a tangent or adjoint of a solution that was found with a reference factor, relative to its
         size. Derivatives of other solutions are exact.
     iterations
         Newton iterations allowed in one load step.
     corrections
-        Corrections with a reference factor that are allowed before Newton takes over.
+        Largest number of corrections with a reference factor before Newton's method is used.
     minimum_damping
-        Shortest fraction of a Newton step that is tried where the whole step is not admissible.
+        Smallest fraction of a Newton step that is tried if the full step is not admissible.
     minimum_load_step
         Smallest load step, as a fraction of the load, before the solver gives up.
     solve_seconds
-        Longest time (s, by the clock) for one solve, after which it has failed; none by default. It is looked at
-        between iterations. Whether a solve that takes about so long fails depends on the machine.
+        Longest wall-clock time (s) of one solve, after which it has failed; no limit by default. It is checked between
+        iterations. Whether a solve of about this length fails depends on the machine.
     accept_unstable
-        Whether an equilibrium counts where the stiffness has negative eigenvalues (the body has buckled). Nothing is
-        then spent on looking for them.
+        Whether an equilibrium counts even if the stiffness has negative eigenvalues (the body has buckled). These are
+        then not looked for.
     """
 
     kind: Literal["predict-correct", "newton"] = "predict-correct"

@@ -1,19 +1,19 @@
 """Whether an equilibrium is stable: a cheap screen of its stiffness, with the factor of a reference at hand.
 
-An equilibrium is what a body takes only where its stiffness K is positive definite on the free unknowns. Counting the
+A body stays in an equilibrium only if its stiffness K is positive definite on the free unknowns. Counting the
 negative eigenvalues takes a factorisation. The screen takes a few products with K and one back-substitution: of the
 vectors along which the stiffness K̄ of the reference changes most as parameters change (linear buckling), and its
 lowest natural modes, the combination x with the smallest Rayleigh quotient xᵀKx/xᵀK̄x is improved by one step of
 inverse iteration, z = K̄⁻¹Kx, and the smallest quotient of both is an upper bound for the lowest eigenvalue of K over
-that of K̄: 1 at the reference, negative where the screen has *found* an instability. What it does not find may still be
-there, so states with small quotients are counted, as are those whose stiffness does not resemble K̄ in these vectors,
-and others at random (docs/decisions/0010-stability.md).
+that of K̄: 1 at the reference, negative if the screen has *found* an instability. It may miss one, so the negative
+eigenvalues are counted at states with small quotients, at those whose stiffness does not resemble K̄ in these vectors,
+and at others chosen at random (docs/decisions/0010-stability.md).
 
 Natural modes alone see nothing of a compressed block, of an arch, or of a cantilever that buckles sideways.
 
 In the mixed form vectors are pairs of displacements and pressures, p = C⁻¹Bᵀv of K̄ = [A B; Bᵀ −C], with which vᵀAv +
 2pᵀBᵀv − pᵀCp is the energy with the pressures condensed. At other states the same pressures make it smaller than that:
-the screen errs on the side of counting. Forces on pressures are left out wherever K̄⁻¹ is applied.
+the screen errs on the side of counting. Forces on pressures are ignored wherever K̄⁻¹ is applied.
 
 Source of the linear buckling problem (dK/dω along the tangent, K̄): K.-J. Bathe, Finite Element Procedures (1996),
 §6.8.2. Everything here is linear algebra on rows (k, n), of which a rank holds its part.
@@ -36,21 +36,21 @@ LOW = 1 / 3  # quotient below which the negative eigenvalues are counted
 ALIKE = 10.0  # ratio of quotients beyond which K̄ no longer resembles the stiffness, and they are counted too
 NATURAL = 3  # lowest natural modes among the vectors
 EXTREMES = 2  # vectors at each end of the spectrum of a change of stiffness
-WEAK = 0.1  # |μ| for one standard deviation, below which a parameter brings the body near no instability
+WEAK = 0.1  # |μ| for one standard deviation, below which a parameter does not lead towards instability
 BLOCK, STEPS = 6, 4  # of the Krylov spaces in which these vectors are looked for
-ROUNDING = 1e-10  # part of a vector, squared, that is left of it when it depends on others
-SAME = 1e-3  # the same for vectors that the screen can do without
+ROUNDING = 1e-10  # squared fraction of a vector that remains if it depends on others
+SAME = 1e-3  # the same for vectors that are not essential
 
 
 class Screened(NamedTuple):
-    """What the screen says of a state.
+    """The screen's result for a state.
 
     Attributes
     ----------
     lowest
         Smallest Rayleigh quotient xᵀKx/xᵀK̄x that it finds.
     largest
-        Largest one of the vectors that it looks with.
+        Largest quotient of the screening vectors.
     """
 
     lowest: float
@@ -58,12 +58,12 @@ class Screened(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether it shows no instability, and K resembles K̄ enough for the screen to be believed."""
+        """Whether it shows no instability, and K resembles K̄ enough to trust the screen."""
         return self.lowest >= LOW and self.largest <= ALIKE * self.lowest
 
     @property
     def chance(self) -> float:
-        """Probability with which negative eigenvalues are counted at the state."""
+        """Probability that negative eigenvalues are counted at the state."""
         return (LOW / self.lowest) ** 3 if self.clear else 1.0
 
 
@@ -71,7 +71,7 @@ NOT_SCREENED = Screened(np.nan, np.nan)
 
 
 def draw(parameters: FloatArray) -> float:
-    """Return a number in [0, 1) that looks random and depends on the parameters (d,) only."""
+    """Return a pseudo-random number in [0, 1) that depends only on the parameters (d,)."""
     digest = hashlib.sha256(np.ascontiguousarray(parameters, dtype=float).tobytes()).digest()
     return int.from_bytes(digest[:8], "little") / 2.0**64
 
@@ -79,7 +79,7 @@ def draw(parameters: FloatArray) -> float:
 def screening_vectors(
     changes: Iterable[Rows], solve: Rows, forces: FloatArray, free: FloatArray, total: Total
 ) -> FloatArray:
-    """Return rows (k, n), orthonormal in K̄, in which a stiffness that loses definiteness is likely to show it.
+    """Return rows (k, n), orthonormal in K̄, in which loss of definiteness is likely to show.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class _Space:
         self.rows = self.images = np.empty((0, 0))
 
     def add(self, rows: FloatArray, images: FloatArray) -> FloatArray:
-        """Append what is new of rows (k, n) with their products; return it, orthonormal."""
+        """Append the new part of rows (k, n), with its products; return it, orthonormal."""
         if self.rows.size == 0:
             self.rows = self.images = np.empty((0, rows.shape[1]))
         for tolerance in (self._tolerance, ROUNDING):
@@ -164,7 +164,7 @@ def screen(vectors: FloatArray, multiply: Rows, solve: Rows, free: FloatArray, t
     multiply, solve
         Apply K and K̄⁻¹.
     free, total
-        As of `screening_vectors`.
+        As in `screening_vectors`.
     """
     images = multiply(vectors)
     projected = _symmetric(total(vectors @ images.T))

@@ -1,4 +1,4 @@
-"""What the search for equilibria wants of a discrete system, and what it gives."""
+"""What the search for equilibria needs from a discrete system, and what it returns."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Residual:
     gap
         Largest distance of a prescribed unknown from its target (m).
     volume
-        Norm of the volumes out of balance, of all ranks, as a force (N); 0 where they are rounding, and where
-        pressures are no unknowns.
+        Norm of the residual of the volumes, over all ranks, as a force (N); 0 if it is rounding, or if pressures are
+        not unknowns.
     """
 
     vector: FloatArray
@@ -61,7 +61,7 @@ class System(Protocol):
         """Return the imbalance at u."""
 
     def rounding(self, u: FloatArray, scale: float) -> float:
-        """What the size of a residual with this scale cannot be expected to fall below at u, whatever the loads (N)."""
+        """Size (N) below which a residual with this scale cannot be expected to fall at u, whatever the loads."""
 
     def factorise(self, u: FloatArray) -> None:
         """Assemble and factorise the stiffness at u.
@@ -82,7 +82,7 @@ class System(Protocol):
         """Second difference of the energy along a move, from the change of the residual's vector."""
 
     def weights(self) -> FloatArray:
-        """What turns a residual's vector into forces (N)."""
+        """Weights that turn a residual's vector into forces (N)."""
 
     def norm(self, x: FloatArray) -> float:
         """Euclidean norm over the displacements of all ranks (pressures, in another unit, follow them)."""
@@ -93,11 +93,11 @@ class System(Protocol):
     def inertia(self) -> int | None:
         """Number of negative eigenvalues of the factorised stiffness of displacements; None if unknown.
 
-        A stable state has none. Those that belong to pressures (one each, whatever the state) do not count.
+        A stable state has none. Those due to pressures (one each, at every state) do not count.
         """
 
     def negative_eigenvalues(self, u: FloatArray) -> int | None:
-        """Factorise the stiffness at u; return the same of it, or of its symmetric part where it is not symmetric.
+        """Factorise the stiffness at u; count negative eigenvalues, of its symmetric part if it is not symmetric.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class System(Protocol):
 
 
 class Way(Protocol):
-    """The way in parameters from a reference state, whose factor is at hand, to the values that are asked for."""
+    """The path in parameters from a reference state, whose factor is available, to the requested values."""
 
     @property
     def state(self) -> FloatArray:
@@ -115,20 +115,20 @@ class Way(Protocol):
 
     @property
     def draw(self) -> float:
-        """A number in [0, 1) that depends on the parameters only: states are counted where it is small."""
+        """A number in [0, 1) that depends only on the parameters: eigenvalues are counted if it is small."""
 
     def screen(self, u: FloatArray, residual: Residual) -> Screened:
-        """Return what the screen of `forward.solvers.stability` says of an equilibrium."""
+        """Return the result of `forward.solvers.stability`'s screen for an equilibrium."""
 
     def at(self, fraction: float) -> None:
-        """Give the system the parameters after a part of the way."""
+        """Set the parameters of the system to those after a fraction of the path."""
 
     def inverse(self, u: FloatArray) -> Inverse:
         """Return an approximate inverse of the stiffness at u."""
 
 
 class Found(NamedTuple):
-    """A state (U_local,) and what is known of it.
+    """A state (U_local,) and what is known about it.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Found(NamedTuple):
     corrected
         Whether it was found with the factor of the reference.
     stability
-        How its stability was looked at; where that is by counting, the last factor is that of the stiffness there.
+        How its stability was tested; if by counting, the last factor is that of the stiffness there.
     """
 
     state: FloatArray

@@ -30,5 +30,5 @@ class Gravity(Term):
         return -at.numbers["density"] * at.density * ufl.dot(pull, at.u) * at.dx
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports."""
+        """Describe it for reports."""
         return f"gravity: density {numbers['density']} × {self.acceleration:g} m/s² along {listed(self.direction)}"

@@ -25,5 +25,5 @@ class Pressure(Term):
         return at.numbers["size"] * ufl.dot(normal, at.v) * at.on(self.on)
 
     def words(self, numbers: Mapping[str, str]) -> str:
-        """Say what it is, for reports."""
+        """Describe it for reports."""
         return f"pressure on {self.on}: {numbers['size']}"

@@ -1,6 +1,6 @@
-"""What every load is: a block of settings that adds to the potential of a body, or to the virtual work on it.
+"""What every load is: a block of settings that adds to the potential of a body, or to the virtual work done on it.
 
-A load is a class with one file, here or beside a study (``kind = "my_tissue.Springs"``):
+A load is a class in its own file, here or beside a study (``kind = "my_tissue.Springs"``):
 
     class Springs(Term):
         "Springs that hold a boundary: the traction −k u."
@@ -14,8 +14,8 @@ A load is a class with one file, here or beside a study (``kind = "my_tissue.Spr
 
             return at.numbers["k"] / 2 * ufl.inner(at.u, at.u) * at.on(self.on)
 
-Fields that are annotated with a unit are numbers of the model, which can be random; derivatives by them, and by the
-displacement, are found by UFL. A field that is called `on` is the name of a boundary. UFL is imported inside the
+Fields annotated with a unit are numbers of the model, which can be random; UFL finds derivatives by them and by the
+displacement. A field called `on` is the name of a boundary. UFL is imported inside the
 methods, so that a study can be checked without it.
 """
 
@@ -33,7 +33,7 @@ from forward.words import settings
 
 @dataclass(frozen=True)
 class Place:
-    """Where a load acts: expressions of UFL to write its potential or its virtual work with.
+    """Where a load acts: the UFL expressions with which its potential or virtual work is written.
 
     Attributes
     ----------
@@ -50,13 +50,13 @@ class Place:
     dx
         Measure of the undeformed body.
     on
-        Measure of the undeformed boundary of a name.
+        Returns the measure of a named undeformed boundary.
     numbers
         The numbers of this load, by the names of its fields.
     density
-        What random fields multiply the density by.
+        Factor of random fields on the density.
     constant
-        Makes a constant (a number or a vector) that forms are not compiled again for.
+        Makes a constant (a number or a vector) for which forms need not be compiled again.
     """
 
     u: Any

@@ -147,8 +147,14 @@ def test_installed_kinds_of_the_same_name_as_a_module_beside_the_study(beside):
     ("override", "said"),
     [
         ("model.kind=NAME.Sprng", r"^model\.kind: the module 'NAME' has no model 'Sprng'; did you mean 'Spring'"),
-        ("model.kind=NAME.Strange", r"^model\.kind: 'NAME\.Strange' is no model: expected a subclass of ModelSpec"),
-        ("method.kind=NAME.Spring", r"^method\.kind: 'NAME\.Spring' is no method: expected a subclass of Method"),
+        (
+            "model.kind=NAME.Strange",
+            r"^model\.kind: 'NAME\.Strange' cannot be used as model: expected a subclass of ModelSpec",
+        ),
+        (
+            "method.kind=NAME.Spring",
+            r"^method\.kind: 'NAME\.Spring' cannot be used as method: expected a subclass of Method",
+        ),
         ("method.kind=nowhere.Grid", r"^method\.kind: the method 'nowhere\.Grid' cannot be imported: No module"),
         ("model.stifness=1.0", r"^model\.stifness: unknown key; did you mean 'stiffness'\?"),
         ("method.samples=1", r"^method\.samples: input should be greater than or equal to 2; given 1"),
