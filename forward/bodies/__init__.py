@@ -1,1 +1,1 @@
-"""What a body is made of: its shape and mesh, inclusions in it, random fields over it; no FEniCSx is needed."""
+"""What a body consists of: shape and mesh, inclusions, random fields; no FEniCSx is needed."""

@@ -44,12 +44,12 @@ def unit_vector(direction: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
-ROUNDING = 1e-6  # of that distance: a move that is none
-NEARBY = 1e-3  # of the diagonal of a body: distance from it that is an inaccuracy of places
+ROUNDING = 1e-6  # of that distance: a move that counts as rounding
+NEARBY = 1e-3  # of the diagonal of a body: distance from it that counts as inaccuracy of positions
 
 
 class _SixSided(Settings):
-    """The image of a box that has a structured mesh: x-min, x-max, y-min … are the images of the faces of that box.
+    """The image of a box with a structured mesh: x-min, x-max, y-min … are the images of its faces.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ class _SixSided(Settings):
     degree
         Polynomial degree of the displacement.
     quadrature_degree
-        Degree that the integrals are exact for; by default the lowest that keeps the order of convergence. Less than 2
+        Degree of quadrature; by default the lowest that preserves the order of convergence. Less than 2
         (quadratic tetrahedra, linear hexahedra) or 4 (quadratic hexahedra) leaves deformations without energy.
     grading
-        By face: how many times thinner the cells there are than at the opposite face or, where that has a grading too,
-        than in the middle between both. Edges of cells grow geometrically: ``{ z-min = 8 }`` for a body that is
-        clamped there, since stresses change fast beside the rim of a clamp.
+        By face: how many times thinner the cells there are than at the opposite face or, if that has a grading too,
+        than in the middle between both. Edges of cells grow geometrically: ``{ z-min = 8 }`` for a body that is clamped
+        there, since stresses change fast beside the rim of a clamp.
     """
 
     kind: str
@@ -136,7 +136,7 @@ class _SixSided(Settings):
 
     @property
     def regions(self) -> tuple[str, ...]:
-        """No region has a name."""
+        """There are no named regions."""
         return ()
 
     @property
@@ -152,12 +152,12 @@ class _SixSided(Settings):
 
     @property
     def listed(self) -> dict[str, str]:
-        """What a file holds, in words: there is none."""
+        """Contents of a file, in words: there is no file."""
         return {}
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Nothing is odd about it."""
+        """No warnings."""
         return ()
 
     @property
@@ -298,7 +298,7 @@ class Block(_SixSided):
     """A block with eight given corners: the trilinear image of a cube.
 
     Its boundaries x-min, x-max, y-min, y-max, z-min and z-max are the images of the faces of the cube, whatever their
-    direction in space. Linear tetrahedra cut faces that are not plane.
+    direction in space. Linear tetrahedra cut off parts of curved faces.
 
     Parameters
     ----------
@@ -400,12 +400,12 @@ Body = Annotated[Box | Block | MeshFile, Field(discriminator="kind"), BeforeVali
 
 
 def tolerance(body: Body) -> float:
-    """How far (m) a point may lie outside a body and still be meant to lie on it: a thousandth of its diagonal."""
+    """Distance (m) up to which a point outside a body counts as lying on it: a thousandth of its diagonal."""
     return NEARBY * float(np.linalg.norm([high - low for low, high in body.bounds]))
 
 
 def outside(body: Body, point: Vector) -> float:
-    """How far (m) a point lies outside the undeformed body; of a mesh from a file, outside the box around it."""
+    """How far (m) a point lies outside the undeformed body; for a mesh from a file, outside the box around it."""
     if body.contains(point):
         return 0.0
     at = np.array([point])
@@ -414,7 +414,7 @@ def outside(body: Body, point: Vector) -> float:
 
 
 def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...]:
-    """Say how far points (m), by name, that lie outside a body are moved to it."""
+    """Say how far points (m) outside a body, given by name, are moved onto it."""
     distances = {name: outside(body, point) for name, point in points.items()}
     far = {name: distance for name, distance in distances.items() if distance > ROUNDING * tolerance(body)}
     if not far:
@@ -430,6 +430,6 @@ def moved_points(body: Body, points: Mapping[str, Vector]) -> tuple[Finding, ...
 def holds(body: Body, point: Vector) -> bool:
     """Whether a point (m) lies in the undeformed body, or no farther outside than `tolerance`.
 
-    Of a mesh from a file the box around it is looked at; where the mesh is made, the point must be near a cell.
+    For a mesh from a file, the box around it is tested here; once it is meshed, the point must be near a cell.
     """
     return outside(body, point) <= tolerance(body)

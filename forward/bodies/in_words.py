@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def in_words(model: Hyperelastic, said: Callable[[str], str], where: str) -> Iterator[tuple[str, list[str]]]:
-    """Say what a body is, is made of, and is held and loaded by; arguments as of `ModelSpec.words`."""
+    """Describe a body, its material, supports and loads; arguments as in `ModelSpec.words`."""
     body = model.body
     yield "body", [f"{body.description}; {body.cells_in_words} cells ({body.cell}, degree {body.degree}){where}"]
     pressures = " and pressures (mixed form)" if model.mixed else ""

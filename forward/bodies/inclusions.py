@@ -19,7 +19,7 @@ from forward.bodies.geometry import Length
 from forward.model import FloatArray
 from forward.settings import Named
 
-TINY = 1e-12  # of the squared radius: keeps distances from the centre, and angles, differentiable where they are zero
+TINY = 1e-12  # of the squared radius: keeps distances from the centre, and angles, differentiable at zero
 BLEND = 0.1  # squared distance from the centre, over that of the surface, up to which an ellipsoid counts as a ball
 
 
@@ -27,9 +27,9 @@ class Sphere(Named):
     """A ball in which the energy density is multiplied by `contrast`.
 
     The factor on the energy is contrast^s with s = ½(1 − tanh((|X−c| − radius)/width)): softer and stiffer
-    inclusions are treated alike, and the factors of inclusions that overlap multiply. A transition that is narrower
-    than a cell is seen by few quadrature points, and derivatives with respect to place and size become rough: let
-    `width` be about the length of a cell.
+    inclusions are treated alike, and the factors of overlapping inclusions multiply. If the transition is narrower
+    than a cell, few quadrature points see it, and derivatives with respect to position and size become rough: choose
+    `width` about the length of a cell.
 
     Parameters
     ----------
@@ -55,20 +55,20 @@ class Sphere(Named):
 class Ellipsoid(Named):
     """An ellipsoid in which the energy density is multiplied by `contrast`, as in a `Sphere`.
 
-    s = ½(1 − tanh(distance/width)) with a smooth function of the place that is zero on the surface, has there nearly
-    the slope of the distance, and is the distance where all radii are equal. Orders of the radii and turns by half a
-    circle give the same ellipsoid: let priors leave one of these.
+    s = ½(1 − tanh(distance/width)) with a smooth function of position that is zero on the surface, has nearly the slope
+    of the distance there, and is the distance if all radii are equal. Permuted radii and half turns give the same
+    ellipsoid: choose priors that allow only one of these.
 
     Parameters
     ----------
     x, y, z
         Centre in the undeformed body (m).
     a, b, c
-        Radii (m) along the axes of the ellipsoid, which are those of the body where nothing is turned.
+        Radii (m) along the axes of the ellipsoid, which without rotation are those of the body.
     turn_x, turn_y, turn_z
         Rotation vector (rad): the ellipsoid is turned about this direction, by an angle that is its length.
     contrast, width
-        As of a sphere.
+        As for a sphere.
     """
 
     kind: Literal["ellipsoid"] = "ellipsoid"
@@ -192,7 +192,7 @@ def derived(
 def log_factor(
     inclusions: Sequence[Sphere | Ellipsoid], parameters: Sequence[str], points: FloatArray, places: FloatArray
 ) -> FloatArray:
-    """Return ln of what inclusions multiply the stiffness by (n, k) at places (k, 3); arguments as of `derived`."""
+    """Return ln of what inclusions multiply the stiffness by (n, k) at places (k, 3); arguments as in `derived`."""
     found = derived(inclusions, parameters, points, places)
     columns = [values for path, values in found.items() if path.startswith("stiffness.")]
     return np.log(np.column_stack(columns)) if inclusions else np.zeros((len(points), len(places)))

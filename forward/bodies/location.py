@@ -1,8 +1,8 @@
 """Which cell of a mesh a point lies in, and where in it.
 
-Every point has a cell: that in which it lies or, where it lies in none, the one that it is nearest to, with the place
-there. So rounding, of coordinates that were written with few digits or of nodes that were computed, loses no point; how
-far a point was from the mesh is told, and the caller says how far is too far.
+Every point gets a cell: the one in which it lies or else the nearest one, with the nearest place in it. So no point is
+lost by rounding, of coordinates written with few digits or of computed nodes; the distance of a point from the mesh is
+returned, and the caller decides how far is too far.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from forward.bodies.mesh_file import nearest_of
 from forward.model import FloatArray
 
-ROUNDING = 1e-12  # of the extent of the mesh: distance that is none
+ROUNDING = 1e-12  # of the extent of the mesh: distance that counts as rounding
 STEPS = 30  # of Newton's method in a hexahedron
-NEAREST = 8  # cells that are looked at for a point in none
+NEAREST = 8  # cells that are tried for a point in no cell
 AT_ONCE = 2048  # points
 FACES = ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])  # of a tetrahedron
 
@@ -33,7 +33,7 @@ class Located:
     local
         Coordinates (n, 3) in the reference cell, never outside.
     distances
-        How far (n,) the place there is from the point (m); zero for rounding, infinite where there are no cells.
+        Distance (n,) of that place from the point (m); zero for rounding, infinite if there are no cells.
     """
 
     cells: NDArray[np.int64]
@@ -42,7 +42,7 @@ class Located:
 
 
 def locate(corners: FloatArray, points: FloatArray) -> Located:
-    """Find the cells that points lie in, or else are nearest to.
+    """Find the cells in which points lie, or else the nearest ones.
 
     Parameters
     ----------

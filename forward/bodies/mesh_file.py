@@ -2,10 +2,10 @@
 
 Meshes that are refined here are files of NumPy's (.npz), written by `forward.bodies.tetrahedra`.
 
-A study keeps, beside the name of the file, what it needs to know of it (`Contents`), so that results can be read where
-the file is not; a hash says whether it is the same file.
+A study stores, beside the name of the file, what it needs to know about it (`Contents`), so that results can be read
+without the file; a hash tells whether it is the same file.
 
-Most of its length is what may be wrong with a file, each mistake in words.
+Most of the module describes what may be wrong with a file, each mistake in words.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
 LARGE, SMALL = 2.0, 1e-3  # m: bodies of tissue are between these
-FLAT = 1e-10  # volume of a cell over the cube of its longest edge that is none
+FLAT = 1e-10  # volume of a cell over the cube of its longest edge that counts as zero
 MOST_LEVELS = 6  # 262 144 cells for each of the file
 MOST_NODES = 20_000_000
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
-CLOSE = 1e-9  # distance of points, over the extent of the body, that are one
+CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
 ALL, SURFACE = "body", "surface"  # names of the only region and of the only boundary, where the file has no numbers
 BOUNDARY = "boundary "  # before the name of a boundary, in a mesh of our own
 _SURFACES = {"tetrahedron": "triangle", "hexahedron": "quad"}
@@ -142,27 +142,27 @@ class MeshFile(Settings):
 
     Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
     the numbers that an array of the cells gives to triangles or quadrilaterals (boundaries) and to cells (regions).
-    A triangle may be in several groups, a cell in one only.
+    A triangle may be in several groups, a cell in only one.
 
     Parameters
     ----------
     file
-        The file (.msh, .xdmf, .vtk, .vtu, and what else meshio reads), beside the study.
+        The file (.msh, .xdmf, .vtk, .vtu, or whatever else meshio reads), beside the study.
     unit
         Length (m) of one unit of its coordinates: 1e-3 for millimetres.
     degree
         Polynomial degree of the displacement.
     quadrature_degree
-        Degree that the integrals are exact for, as of other bodies.
+        Degree of quadrature, as for other bodies.
     names
         Names for numbers of boundaries and regions: ``{ vessel = 3 }``.
     tags
-        Name of the array with the numbers, where it is not a usual one and not the only one.
+        Name of the array with the numbers, if it is neither a usual name nor the only array.
     levels
-        Divide every tetrahedron into eight so many times. Faces that are plane in the file stay so: of a curved body
-        this is no finer surface.
+        Divide every tetrahedron into eight this many times. Faces that are plane in the file stay plane: the surface of
+        a curved body does not become more accurate.
     divide
-        Then divide every tetrahedron into eight, with thinner ones at these boundaries (``[]``: equally everywhere).
+        Then divide every tetrahedron into eight once more, with thinner ones at these boundaries (``[]``: uniformly).
     contents
         What the file holds; it need not be given.
     """
@@ -198,7 +198,7 @@ class MeshFile(Settings):
         Raises
         ------
         ModelError
-            If that is not possible, or it is another file than the study was made for.
+            If that is not possible, or if the file is not the one that the study was made for.
         """
         digest = _digest(self.file)
         if self.contents is not None and digest != self.contents.digest:
@@ -301,7 +301,7 @@ class MeshFile(Settings):
 
     @property
     def warnings(self) -> Iterator[str]:
-        """What is odd about it, without being wrong."""
+        """What is unusual about it without being wrong."""
         extent = max(high - low for low, high in self.bounds)
         if not SMALL <= extent <= LARGE:
             yield (
@@ -370,7 +370,7 @@ class MeshFile(Settings):
 
 
 def _digest(file: str) -> str:
-    """Return the hash of a file, and of those that an XDMF file keeps its numbers in."""
+    """Return the hash of a file, including the files in which an XDMF file stores its numbers."""
     try:
         whole = Path(file).read_bytes()
         if file.endswith(".xdmf"):
@@ -462,7 +462,7 @@ def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:
 
 
 def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]:
-    """Return the numbers that the file gives to the cells of each block; zeros where it gives none."""
+    """Return the numbers that the file gives to the cells of each block; zeros if it gives none."""
     arrays = {
         name: [v[:, 0] if v.ndim == 2 and v.shape[1] == 1 else v for v in values]  # as VTK's old format has them
         for name, values in mesh.cell_data.items()
@@ -487,7 +487,7 @@ def _numbers(mesh: meshio.Mesh, tags: str | None, refuse: Any) -> list[IntArray]
 def _words(
     mesh: meshio.Mesh, file: str, names: tuple[tuple[str, int], ...], numbers: list[IntArray], refuse: Any
 ) -> dict[tuple[int, int], str]:
-    """Return names by dimension and number: those of the file, and those that are given."""
+    """Return names by dimension and number: those of the file, and the given ones."""
     words = {(int(dim), int(number)): _word(name) for name, (number, dim) in _named_groups(mesh)}
     if file.endswith(".msh"):  # where a name stands twice, as of a volume and of its surface, meshio keeps one
         section = Path(file).read_bytes().partition(b"$PhysicalNames")[2].partition(b"$EndPhysicalNames")[0]
@@ -519,7 +519,7 @@ def _sets(mesh: meshio.Mesh, kind: str) -> dict[str, NDArray[np.bool_]]:
 
 
 def _check_groups(mesh: meshio.Mesh, refuse: Any) -> None:
-    """Refuse cells in several groups: no one could say which constants they have."""
+    """Refuse cells in several groups: their constants would be ambiguous."""
     for kind in _MESHIO:
         groups = _sets(mesh, kind)
         shared = sum((member.astype(int) for member in groups.values()), np.zeros(1, dtype=int)) > 1
@@ -533,19 +533,19 @@ def _named_groups(mesh: meshio.Mesh) -> list[tuple[str, Any]]:
 
 
 def _gathered(mesh: meshio.Mesh, numbers: list[IntArray], kind: str, refuse: Any) -> tuple[IntArray, IntArray]:
-    """Put the cells of a kind together, with their numbers."""
+    """Collect the cells of a kind, with their numbers."""
     parts = [(block.data, n) for block, n in zip(mesh.cells, numbers, strict=True) if block.type == kind]
     if not parts:
         return np.zeros((0, 4 if kind == "quad" else 3), dtype=np.int64), np.zeros(0, dtype=np.int64)
     blocks, found = zip(*parts, strict=True)
     cells = np.concatenate(blocks).astype(np.int64)
     if cells.size and not 0 <= cells.min() <= cells.max() < len(mesh.points):
-        refuse(f"has cells with corners that are none of its {len(mesh.points)} points")
+        refuse(f"has cells with corners that are not among its {len(mesh.points)} points")
     return cells, np.concatenate(found)
 
 
 def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
-    """Refuse cells without volume, and parts that only seem to be joined."""
+    """Refuse cells without volume, and parts that only appear to be joined."""
     corners = [[0, 1, 2, 3]] if cell == "tetrahedron" else _CORNERS
     edges = points[cells[:, corners]]  # cells, corners, 4, 3
     sides = edges[:, :, 1:] - edges[:, :, :1]
@@ -561,7 +561,7 @@ def _check_geometry(points: FloatArray, cells: IntArray, cell: str, refuse: Any)
 
 
 def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -> None:
-    """Refuse cells that lie over each other, and bodies in several parts: only faces that are shared join cells."""
+    """Refuse overlapping cells, and bodies in several parts: cells are joined only by shared faces."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -588,7 +588,7 @@ def _check_joints(points: FloatArray, cells: IntArray, cell: str, refuse: Any) -
 
 
 def _outer(facets: IntArray, groups: dict[str, NDArray[np.bool_]], cells: IntArray, cell: str) -> dict[str, IntArray]:
-    """Return the facets of each group that belong to one cell only: those on the surface of the body."""
+    """Return the facets of each group that belong to only one cell: those on the surface of the body."""
     faces = np.sort(cells[:, _FACES[cell]].reshape(-1, facets.shape[1]), axis=1)
     sorted_facets = np.sort(facets, axis=1)
     unique, which = np.unique(np.concatenate([faces, sorted_facets]), axis=0, return_inverse=True)
@@ -677,7 +677,7 @@ def _divided_contents(found: Contents) -> Contents:
 
 
 def contents(mesh: Loaded, digest: str) -> Contents:
-    """Say what a study needs to know of a mesh."""
+    """Return what a study needs to know about a mesh."""
     points, cells = mesh.points, mesh.cells
     edges = np.unique(np.sort(cells[:, _EDGES[mesh.cell]].reshape(-1, 2), axis=1), axis=0)
     faces = np.unique(
@@ -732,7 +732,7 @@ def nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _spanning(points: FloatArray) -> tuple[Point, ...]:
-    """Return up to four points, each as far as possible from what those before it span."""
+    """Return up to four points, each as far as possible from the span of those before it."""
     chosen = [points[0]]
     directions: list[FloatArray] = []
     extent = np.ptp(points, axis=0).max()

@@ -1,11 +1,11 @@
-"""Log-normal random fields over a body: their specification, and the Gaussian Matérn field that they are made of.
+"""Log-normal random fields over a body: their specification, and the Gaussian Matérn field behind them.
 
 The Gaussian field m solves (κ² − Δ)^{α/2} m = white noise on the vertices of the mesh, which makes it a Matérn field of
 smoothness ν = α − 3/2 in unbounded space: F. Lindgren, H. Rue, J. Lindström, J. R. Stat. Soc. B 73 (2011) 423–498. On a
-body its variance depends on the place (near faces, and in thin bodies above all), so that it is divided by its point
-standard deviation, which is computed. What remains of the boundary is in the correlation.
+body its variance depends on position (near faces, and above all in thin bodies), so the field is divided by its
+computed pointwise standard deviation. The boundary then only affects the correlation.
 
-Vertices stand in the canonical order (`forward.fem.layout`). Nothing here depends on the number of ranks.
+Vertices are in canonical order (`forward.fem.layout`). Nothing here depends on the number of ranks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PositiveFloat = Annotated[float, Gt(0)]
 Smoothness = Literal[2, 4]
 ROBIN = 1 / 1.42  # coefficient over κ: Y. Daon, G. Stadler, Inverse Probl. Imaging 12 (2018) 1083–1102
 BATCH = 128  # right-hand sides that are solved together
-EQUAL = 1e-6  # relative distance of eigenvalues below which rounding decides on their eigenvectors
+EQUAL = 1e-6  # relative distance of eigenvalues below which rounding determines their eigenvectors
 
 
 class RandomField(Settings):
@@ -38,16 +38,16 @@ class RandomField(Settings):
     The factor is exp(ln mean − v/2 + m) with a Gaussian Matérn field m of variance v at the vertices, and the
     exponential of what is linear between them: at the vertices its expected value is `mean` (also with few modes,
     where v is that of the modes). Its coefficients are d independent standard normal parameters, ``fields.NAME.0`` and
-    so on, which every study of this model has without naming them.
+    so on, which every study of this model has implicitly.
 
     Parameters
     ----------
     of
         What is multiplied: the energy density, or the density of the body under gravity.
     name
-        In paths of parameters; by default what it is a factor of.
+        Used in parameter paths; by default the quantity that it multiplies.
     length
-        Correlation length (m): where the correlation has fallen to about 0.14.
+        Correlation length (m): the distance at which the correlation has fallen to about 0.14.
     std
         Point standard deviation of the factor.
     mean
@@ -55,11 +55,11 @@ class RandomField(Settings):
     smoothness
         α of the operator: 2 (correlation exp(−2r/length), continuous realisations) or 4 (smooth ones, ν = 5/2).
     basis
-        "modes": the leading Karhunen–Loève modes. "noise": the white noise at every vertex, nothing is cut off.
-        "nodes": the values of m at the vertices are the parameters themselves, for inversion; they are correlated, and
-        no study has them.
+        "modes": the leading Karhunen–Loève modes. "noise": white noise at every vertex, without truncation.
+        "nodes": the values of m at the vertices are the parameters, for inversion; they are correlated, so other
+        studies cannot use them.
     modes
-        Number of modes; of "modes" only.
+        Number of modes; only for "modes".
     """
 
     of: Literal["stiffness", "density"]
@@ -95,7 +95,7 @@ class RandomField(Settings):
         return self
 
     def prior(self, body: Body) -> NodalPrior:
-        """Return the distribution of the values at the vertices of a body: what `basis` "nodes" has as parameters."""
+        """Return the distribution of the values at the vertices of a body: the parameters of `basis` "nodes"."""
         return NodalPrior(Matern.on(body, self.length, self.smoothness), self.log_std)
 
     def on(self, body: Body) -> Expansion:
@@ -124,13 +124,13 @@ class Expansion(Protocol):
 
     @property
     def kept(self) -> float:
-        """Fraction of the variance of the field, averaged over the body, that the coefficients make."""
+        """Fraction of the variance of the field, averaged over the body, that the coefficients represent."""
 
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Return the linear part (N,) at coefficients (k,)."""
 
     def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return derivatives (k,) by the coefficients from those (N,) by the values at the vertices."""
+        """Return derivatives (k,) with respect to the coefficients from those (N,) with respect to vertex values."""
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,8 @@ class Matern:
     """A Gaussian field on the vertices of a mesh, of variance one at every vertex.
 
     With A = κ²M + K + βB, the covariance of the solution of the SPDE is A⁻¹MA⁻¹ for α = 2, and A⁻¹MA⁻¹MA⁻¹MA⁻¹ for
-    α = 4; B acts on the boundary, where ∂m/∂n + βm = 0. (A lumped M would leave the checkerboards of trilinear
-    elements, which K hardly sees, with far too much variance.)
+    α = 4; B acts on the boundary, where ∂m/∂n + βm = 0. (With a lumped M, checkerboard modes of trilinear elements,
+    which K hardly sees, would have far too much variance.)
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ class Matern:
 
     @classmethod
     def on(cls, body: Body, length: float, smoothness: Smoothness = 2, robin: float = ROBIN) -> Matern:
-        """Return the field on the mesh of a body, made in this process alone."""
+        """Return the field on the mesh of a body, computed in this process alone."""
         from forward.fem.layout import vertex_matrices
 
         return cls(*vertex_matrices(body), length, smoothness, robin)
@@ -313,11 +313,11 @@ class Matern:
     def modes(self, count: int) -> FloatArray:
         """Return the leading Karhunen–Loève modes (N, count), each times the square root of its eigenvalue.
 
-        Eigenfunctions are orthogonal over the body (with the lumped mass); their signs, and the choice among those of
-        one eigenvalue, are conventions that rounding does not touch. The sum of the eigenvalues is the volume.
+        Eigenfunctions are orthogonal over the body (with the lumped mass); their signs, and the choice within the space
+        of one eigenvalue, follow conventions that rounding does not affect. The sum of the eigenvalues is the volume.
         """
         n, root = len(self.mass), np.sqrt(self.mass)
-        more = min(count + 8, n)  # eigenvalues that a cut would separate from their equals
+        more = min(count + 8, n)  # eigenvalues that truncation would separate from equal ones
         if more > n // 2:
             values, vectors = np.linalg.eigh(self._symmetric(np.eye(n)))
         else:

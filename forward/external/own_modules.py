@@ -1,7 +1,7 @@
-"""The modules of a user's Python model: their files, found without running them, and whether these have changed.
+"""The modules of a user's Python model: their files, found without running them, and whether they have changed.
 
-What a module imports is read from its text, also where it imports inside a function; what it loads by a name that it
-computes is known once it is loaded. Files of data that it reads cannot be known.
+Imports are read from a module's source, including those inside functions; modules loaded by a computed name are known
+once they are loaded. Data files that it reads cannot be known.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from typing import Any
 
 from forward.model import ModelError
 
-_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of what they held
+_texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
 _TISSUQ = ("forward", "uq", "inverse", "workflows")
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a model's answers follow from, besides its parameters.
+    """What a model's answers depend on besides its parameters.
 
     Attributes
     ----------
     files
-        (path, SHA-256) of the modules that are neither of Python's standard library nor installed, by module.
+        (path, SHA-256) of the modules that are neither in Python's standard library nor installed, by module.
     versions
-        Versions of the installed distributions that these modules import, or that the model is of.
+        Versions of the installed distributions that these modules import, or to which the model belongs.
     """
 
     files: dict[str, tuple[str, str]]
@@ -49,12 +49,12 @@ class Sources:
         return hashlib.sha256(repr(contents).encode()).hexdigest()
 
     def with_files(self, more: Mapping[str, tuple[str, str]]) -> Sources:
-        """Add files of modules that were loaded otherwise."""
+        """Add files of modules that were loaded in other ways."""
         return Sources({**more, **self.files}, self.versions)
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Where these modules were found, those of packages in the folder that the package is in."""
+        """Where these modules were found; for packages, the folder that contains the package."""
         found = (
             Path(path).parents[name.count(".") + (Path(path).stem == "__init__")]
             for name, (path, _) in self.files.items()
@@ -67,12 +67,12 @@ class Sources:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Sources:
-        """Return what `document` has returned."""
+        """Make sources from what `document` has returned."""
         files = {str(name): (str(path), str(text)) for name, (path, text) in document["files"].items()}
         return cls(files, {str(name): str(version) for name, version in document["versions"].items()})
 
     def change(self, now: Sources) -> str | None:
-        """Say what is no longer as it was here, or None if all is."""
+        """Say what has changed since, or None if nothing has."""
         for module, (path, text) in self.files.items():
             file, found = now.files.get(module) or (path, hashed(Path(path)))
             if found != text:
@@ -87,7 +87,7 @@ class Sources:
 
 
 def sources(modules: Iterable[str]) -> Sources:
-    """Return what modules, by their dotted names, are made of; nothing of it is run."""
+    """Return the sources of modules, by their dotted names, without running them."""
     files: dict[str, tuple[str, str]] = {}
     versions: dict[str, str] = {}
     for name, spec, _ in _walk(modules):
@@ -106,12 +106,12 @@ def sources(modules: Iterable[str]) -> Sources:
 
 
 def other_code(change: str) -> str:
-    """Say that results in a directory are of code that has changed."""
+    """Say that results in a directory come from code that has changed."""
     return f"holds results of other code: {change}; choose another --out"
 
 
 def hashed(file: Path) -> str:
-    """Return the SHA-256 of a file; empty where it cannot be read."""
+    """Return the SHA-256 of a file; empty if it cannot be read."""
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError:
@@ -119,7 +119,7 @@ def hashed(file: Path) -> str:
 
 
 class Loaded:
-    """The user's modules that were loaded since this was made, with the hashes that they had when they were seen."""
+    """The user's modules that were loaded since this was made, with the hashes of their files when first seen."""
 
     def __init__(self) -> None:
         self._before = frozenset(sys.modules)
@@ -136,33 +136,33 @@ class Loaded:
         return self._files
 
     def note(self) -> str:
-        """Say what they are, to be kept with what follows from them; empty if there are none."""
+        """Describe them, to be stored with the results that depend on them; empty if there are none."""
         files = self()
         return json.dumps(files, sort_keys=True) if files else ""
 
     def objection(self, note: str) -> str | None:
-        """Say which of the files of a note is no longer as it was, if one is not."""
+        """Say which of the files in a note has changed, if any."""
         change = Sources.of({"files": json.loads(note or "{}"), "versions": {}}).change(Sources({}, {}))
         return None if change is None else other_code(change)
 
 
 def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "model.function") -> None:
-    """Have modules found in some folders too, after all other places.
+    """Let Python find modules in some folders too, after all other places.
 
     Parameters
     ----------
     modules
         Their dotted names.
     folders
-        Where they may be.
+        Where they may be found.
     place
         Where the study names them, for the message.
 
     Raises
     ------
     ModelError
-        If one of them, or one that is imported by a module in these folders, is also a module that is found elsewhere:
-        which one is meant cannot be known.
+        If one of them, or a module imported from these folders, has the same name as a module found elsewhere, so that
+        it is ambiguous.
     """
     names = [str(folder) for folder in folders]
     elsewhere = [entry for entry in sys.path if str(Path(entry or ".").resolve()) not in names]
@@ -182,7 +182,7 @@ def make_visible(modules: Iterable[str], folders: Iterable[Path], place: str = "
 
 
 def imported(module: str) -> ModuleType:
-    """Import a module, again if it or what it imports is another file, or another text, than when it was imported."""
+    """Import a module, again if its file or source, or those of its imports, have changed since the last import."""
     importlib.invalidate_caches()
     now = sources([module]).files
     for name, (file, _) in now.items():
@@ -192,7 +192,7 @@ def imported(module: str) -> ModuleType:
                 del sys.modules[changed]
             break
     _texts.update(now)
-    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes within a second
+    kept, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # it would hide changes made within a second
     try:
         return importlib.import_module(module)
     finally:
@@ -200,7 +200,7 @@ def imported(module: str) -> ModuleType:
 
 
 def find(module: str) -> ModuleSpec | None:
-    """Find a module by its dotted name as it would be found now, without importing the packages that it is in."""
+    """Find a module by its dotted name as Python would now, without importing its packages."""
     top, *rest = module.split(".")
     spec, name = _found(top), top
     for step in rest:
@@ -212,7 +212,7 @@ def find(module: str) -> ModuleSpec | None:
 
 
 def _found(top: str) -> ModuleSpec | None:
-    """Find a module or package that is in no other one."""
+    """Find a top-level module or package."""
     for finder in sys.meta_path:
         try:
             spec = finder.find_spec(top, None)
@@ -224,7 +224,7 @@ def _found(top: str) -> ModuleSpec | None:
 
 
 def _elsewhere(top: str, path: list[str], beside: Path) -> str | None:
-    """Say what else a module is that stands beside a study, if it is: on a path, or of this program."""
+    """Say what else has the name of a module beside a study, if anything: on the path, or in this program."""
     if top in sys.builtin_module_names or top in sys.stdlib_module_names:
         return "a module of Python's standard library"
     if top in _TISSUQ:
@@ -234,7 +234,7 @@ def _elsewhere(top: str, path: list[str], beside: Path) -> str | None:
 
 
 def _walk(modules: Iterable[str]) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
-    """Go through modules and what they import, as far as it is the user's own: name, where it is, what it imports."""
+    """Walk through modules and their imports, as far as they are the user's own: name, location, imports."""
     waiting, seen = list(modules), set[str]()
     while waiting:
         parts = waiting.pop().split(".")
@@ -252,7 +252,7 @@ def _walk(modules: Iterable[str]) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
 
 
 def _imports(name: str, spec: ModuleSpec, file: Path) -> set[str]:
-    """Read from the text of a module what it may import; whoever imports it says what is wrong with it."""
+    """Read from the source of a module what it may import; errors in it are reported when it is imported."""
     try:
         tree = ast.parse(file.read_bytes())
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
@@ -303,7 +303,7 @@ def _is_own(file: Path) -> bool:
 
 @cache
 def _distribution(top: str) -> str | None:
-    """Return the name of the distribution that a module or package is of."""
+    """Return the name of the distribution to which a module or package belongs."""
     try:
         importlib.metadata.version(top)
     except importlib.metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""A limit of time on Python code that may never end."""
+"""A time limit on Python code that may never end."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ AGAIN = 0.5  # seconds after which code that swallowed the exception is interrup
 
 
 class TimeLimitError(BaseException):
-    """Code took too long. It is no Exception, so that `except Exception` in that code does not swallow it."""
+    """Code took too long. It is not an Exception, so that `except Exception` in that code does not swallow it."""
 
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Interrupt the code of this context after so many seconds; code outside Python, when it comes back.
+    """Interrupt the code in this context after so many seconds; code outside Python, when it returns.
 
-    Nothing is limited where `seconds` is None, nor outside the main thread, which alone can be interrupted.
+    There is no limit if `seconds` is None, or outside the main thread, since only that can be interrupted.
 
     Raises
     ------

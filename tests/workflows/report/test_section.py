@@ -80,7 +80,7 @@ def test_a_finished_study_gets_a_section_and_repeats_nothing(folder, capsys):
             "other.Limit",
             "the section 'other.Limit' cannot be imported: No module named 'other'; expected in other.py in ",
         ),
-        ("my_sections.Heading", "is no section: expected a subclass of Section"),
+        ("my_sections.Heading", "cannot be used as section: expected a subclass of Section"),
         ("Limit", "report.sections[0]: "),
     ],
 )

@@ -210,7 +210,7 @@ def test_corners_that_are_no_points(tmp_path, corner):
     whole = numbered(box())
     whole.cells[0].data[0, 0] = corner
     meshio.write(tmp_path / "a.vtk", whole)
-    with pytest.raises(ValidationError, match="corners that are none of its"):
+    with pytest.raises(ValidationError, match="corners that are not among its"):
         MeshFile(file=str(tmp_path / "a.vtk"))
 
 
