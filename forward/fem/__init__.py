@@ -1,1 +1,1 @@
-"""Finite elements: equations, their solution and derivatives, and what both cost."""
+"""Finite elements: equations, their solution and derivatives, and the cost of both."""

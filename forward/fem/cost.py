@@ -19,13 +19,13 @@ from forward.machine import MIB
 
 ENTRIES = 1.4  # of MUMPS over those of the model
 OPERATIONS = 1.6
-# Displacements that one is coupled with on average, inside a large body.
+# Displacements coupled with each one, on average, inside a large body.
 ROW = {("hexahedron", 1): 81.0, ("hexahedron", 2): 192.0, ("tetrahedron", 1): 45.0, ("tetrahedron", 2): 84.0}
-SMALLEST = 3.0  # nodes across a part of the lattice that is not cut any more
-BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, with the room that pivoting may want
+SMALLEST = 3.0  # nodes across a part of the lattice that is not cut further
+BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, including room for pivoting
 BYTES_PER_NONZERO = 16.0  # of the matrix
 BYTES_PER_UNKNOWN = 3e3  # mesh, spaces, vectors
-SPARE = 64 * MIB  # for what libraries allocate without looking
+SPARE = 64 * MIB  # for allocations of libraries that do not check
 BYTES_OF_PROGRAM = 2.5e8  # Python with all libraries
 ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never touched
 # Processor times (s).
@@ -44,7 +44,7 @@ TOGETHER = 0.65  # of a back-substitution for one of many right-hand sides over 
 START = 3.0  # of the program, with all that it imports
 COMPILATION = 6.0  # of the forms of a body that are not compiled yet, one second each
 REPORT = 3.5  # of results and their report
-CALL = 2e-4  # of any of them on a body of no size
+CALL = 2e-4  # of any of these on a vanishingly small body
 # Counts, in bodies that are slender (and turn as they bend) and in others.
 SLENDER = 3.0  # longest extent over the shortest
 NEWTON = {True: 5.5, False: 4.0}  # factorisations from zero
@@ -53,11 +53,11 @@ ACTIONS = 7  # products with the stiffness for the screen of a sample, each like
 DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
 SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
-FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and corrections that they take then
+FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
 class Meshed(Protocol):
-    """What is asked of a body."""
+    """What a body must tell."""
 
     @property
     def cell(self) -> str:
@@ -86,7 +86,7 @@ class Meshed(Protocol):
 
 @dataclass(frozen=True)
 class Factor:
-    """The factor of a stiffness: its entries, the operations that it takes, and the non-zeros of the matrix."""
+    """The factor of a stiffness: its entries, its operations, and the non-zeros of the matrix."""
 
     entries: float
     operations: float
@@ -94,7 +94,7 @@ class Factor:
 
     @property
     def bytes(self) -> float:
-        """Memory while and after it is made, with that of the matrix."""
+        """Memory during and after factorisation, with that of the matrix."""
         return BYTES_PER_ENTRY * self.entries + BYTES_PER_NONZERO * self.nonzeros
 
 
@@ -113,7 +113,7 @@ class Times:
     slender
         Whether the body is.
     predicted
-        Whether samples are solved from predictions, and not by the textbook.
+        Whether samples are solved from predictions rather than by the textbook solver.
     bytes
         Memory of mesh, matrices and factors.
     """
@@ -155,7 +155,7 @@ class Times:
         return self.setup + self.assembly + self.factorisation + vectors
 
     def tangents(self, parameters: int) -> float:
-        """All derivatives of outputs and state of a solution whose factor is at hand."""
+        """All derivatives of outputs and state of a solution whose factor is available."""
         return 15 * CALL + parameters * (2 * TOGETHER * self.substitution + self.residual)
 
     def tangents_of_sample(self, parameters: int) -> float:
@@ -166,9 +166,9 @@ class Times:
 
 
 def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool = True, factors: int = 1) -> Times:
-    """Predict what solves of a body take, with some factors.
+    """Predict the cost of solves of a body, with a given number of factors.
 
-    Where the stiffness is not symmetric, each has beside it a factor of the symmetric part, for the test of stability.
+    If the stiffness is not symmetric, each comes with a factor of the symmetric part, for the stability test.
     """
     extents = [high - low for low, high in body.bounds]
     kind, more = (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
@@ -187,7 +187,7 @@ def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool 
 
 
 def sum_of(parts: Sequence[Times]) -> Times:
-    """Predict what several bodies take that are solved one after the other."""
+    """Predict the cost of several bodies that are solved one after the other."""
     totals = {f.name: sum(getattr(part, f.name) for part in parts) for f in fields(Times) if f.type == "float"}
     return replace(parts[0], **totals)
 

@@ -30,16 +30,16 @@ from forward.solvers.system import Residual
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
-VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that is rounding, over displacements as a part of the body
+VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that counts as rounding, over displacements relative to the body
 
 
 class Discretisation(Linearisation):
     """The discrete equations of a body, set to one state and one parameter vector at a time.
 
-    It is the `System` that Newton's method works on. Meshes, compiled forms and solver objects are made once.
+    It is the `System` on which Newton's method works. Meshes, compiled forms and solver objects are made once.
     """
 
-    _deadline: tuple[float, float] | None = None  # end of the time of a solve, and its length
+    _deadline: tuple[float, float] | None = None  # when the time of a solve ends, and its length
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
@@ -49,7 +49,7 @@ class Discretisation(Linearisation):
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
     def set_parameters(self, parameters: FloatArray) -> None:
-        """Give the parameters (d,) their values."""
+        """Set the values (d,) of the parameters."""
         self.latest.rounding = None
         if self.latest.parameters is not None and np.array_equal(parameters, self.latest.parameters):
             return
@@ -63,15 +63,17 @@ class Discretisation(Linearisation):
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
         external = np.zeros(self.size) if self._proportional else self._forces_at_rest()
-        with np.errstate(invalid="ignore"):  # a load that is not finite has no finite residual, which the solver says
+        with np.errstate(
+            invalid="ignore"
+        ):  # a load that is not finite has no finite residual, which the solver reports
             for path, force in self._unit_loads.items() if self._proportional else ():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)
-        for field in self.fields:  # the size of the loads is that without fluctuations
+        for field in self.fields:  # the size of the loads is their size without random fluctuations
             field.set(parameters)
 
     def _forces_at_rest(self) -> FloatArray:
-        """Forces (U_local,) on the undeformed body, of whole loads."""
+        """Forces (U_local,) on the undeformed body due to the complete loads."""
         kept = self._load.value.copy()
         self._load.value = 1.0
         forces = self._imbalance(np.zeros(self.size))
@@ -117,7 +119,7 @@ class Discretisation(Linearisation):
         return self._residual()
 
     def imbalance(self) -> FloatArray:
-        """Imbalance (U_local,) at the state that is set; on prescribed unknowns, the reactions."""
+        """Imbalance (U_local,) at the current state; on prescribed unknowns, the reactions."""
         return self._residual()
 
     def residual(self, u: FloatArray) -> Residual:
@@ -144,7 +146,7 @@ class Discretisation(Linearisation):
 
     @contextmanager
     def time_limit(self, seconds: float | None) -> Iterator[None]:
-        """Within this context, residuals are refused after so many seconds."""
+        """In this context, residuals are refused after so many seconds."""
         self._deadline = None if seconds is None else (time.monotonic() + seconds, seconds)
         try:
             yield
@@ -162,7 +164,7 @@ class Discretisation(Linearisation):
     def curvature(self, move: FloatArray, change: FloatArray) -> float:
         """Second difference of the energy along a move (U_local,), from the change of the imbalance.
 
-        The energy of displacements and pressures is a saddle, so that the pressures count with the other sign.
+        The energy has a saddle in displacements and pressures, so the pressures count with the opposite sign.
         """
         n = 3 * self.nodes_owned
         return float(self.total(np.array([move[:n] @ change[:n] - move[n:] @ change[n:]]))[0])
@@ -186,19 +188,19 @@ class Discretisation(Linearisation):
         return products
 
     def weights(self) -> FloatArray:
-        """What turns an imbalance (U_local,) into forces (N): one on displacements."""
+        """Weights that turn an imbalance (U_local,) into forces (N): one on displacements."""
         weights = np.ones(self.size)
         if self.p is not None:
             weights[3 * self.nodes_owned :] = self._force_per_volume()
         return weights
 
     def rounding(self, u: FloatArray, scale: float) -> float:
-        """What the size of a residual with this scale (N) cannot be expected to fall below at u (U_local,).
+        """Size below which a residual with this scale (N) cannot be expected to fall at u (U_local,).
 
-        Measures keep their digits however small u is, so that what its last digits weigh is what rounding leaves:
-        ‖F(u (1 ± ε)) − F(u)‖, of which so much counts as still leaves four digits of the loads. A body without loads
-        has no such scale; there, stresses of the size of the stiffness round: a few ε ‖F(δX)‖/δ, where δX is a small
-        stretch (more of them where it is along one axis only).
+        Measures keep their digits however small u is, so the rounding error is that due to the last digits of u:
+        ‖F(u (1 ± ε)) − F(u)‖, limited so that four digits of the loads remain. A body without loads has no such scale;
+        there, stresses of the size of the stiffness are rounded: a few ε ‖F(δX)‖/δ, where δX is a small stretch (more
+        of them if it is along one axis only).
         """
         if scale == 0:
             return self._rounding_without_loads()
@@ -206,7 +208,7 @@ class Discretisation(Linearisation):
         change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
         change[self.fixed] = 0
         left = 2 * self.norm(change)
-        # A body that is moved as if it were rigid has no forces but those of rounding.
+        # A body that moves as a rigid body has no forces except from rounding.
         return min(left, 1e-4 * scale) if self._external > 0 else left
 
     def _rounding_without_loads(self) -> float:
@@ -221,7 +223,7 @@ class Discretisation(Linearisation):
         return self.latest.rounding
 
     def _small_stretch(self) -> FloatArray:
-        """Stretch the body a little; in the mixed form along x only, since without pressure nothing else resists."""
+        """Stretch the body a little; in the mixed form only along x, since without pressure nothing else resists."""
         places = STRETCH * spaces.node_coordinates(self.space)
         if self.p is not None:
             places[:, 1:] = 0
@@ -229,7 +231,7 @@ class Discretisation(Linearisation):
 
     @cached_property
     def _extent(self) -> float:
-        """Norm of the distances (m) of the nodes from their mean: what displacements are compared with."""
+        """Norm of the distances (m) of the nodes from their mean, with which displacements are compared."""
         places = spaces.node_coordinates(self.space)
         count, *sums = self.total(np.array([len(places), *places.sum(axis=0)])).tolist()
         return self.norm(self.with_pressures((places - np.array(sums) / count).ravel()))
@@ -249,19 +251,19 @@ class Discretisation(Linearisation):
 
     @cached_property
     def _distance(self) -> float:
-        """Edge (m) of a cube that is the part of the body for each pressure."""
+        """Edge (m) of a cube with the share of the body's volume for each pressure."""
         return float((self.total(np.array([self._volumes.sum()]))[0] / self.unknowns.pressures) ** (1 / 3))
 
     def _force_per_volume(self) -> float:
-        """What turns volumes v (m³) that are out of balance into forces (N): κ v/h³ is the pressure that they cost.
+        """Factor that turns residual volumes v (m³) into forces (N): κ v/h³ is the pressure that they cause.
 
-        It acts on an area h². A body whose boundary is held altogether is so far from its pressure; others are nearer.
+        It acts on an area h². If the whole boundary is held, the pressure is off by this much; otherwise by less.
         """
         values = {name: self._values[f"material.{name}"] for name in constants(self.spec.energy)}
         return float(moduli(self.spec.energy, values)[1] / self._distance)
 
     def _force_of(self, lacking: float, u: FloatArray) -> float:
-        """Force (N) of volumes (m³) that are out of balance; volumes that are rounding have none."""
+        """Force (N) of residual volumes (m³); zero if they are rounding."""
         if self.p is None:
             return 0.0
         strained = min(1.0, self.norm(u) / self._extent)

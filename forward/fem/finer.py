@@ -1,8 +1,8 @@
-"""A specimen on a finer mesh: what error its own mesh makes of what is observed.
+"""A specimen on a finer mesh: the error of its own mesh in the observations.
 
-Cells are smaller everywhere, and smaller still at the faces that are held, where stresses are singular along the rim: a
-mesh that is refined equally shares most of the error there. Random fields are those of the mesh itself, interpolated.
-One solve tells the difference; it is an estimate of the error from below, since the finer mesh errs too.
+Cells are smaller everywhere, and smaller still at the held faces, where stresses are singular along the rim: a
+uniformly refined mesh has most of the same error there. Random fields are those of the mesh itself, interpolated. One
+solve gives the difference; it underestimates the error, since the finer mesh has an error too.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from forward.specimen import Specimen
 
 TIMES = 1.5  # cells along an edge, over those of the specimen
-# Of the error of configs/inclusion.toml at 120 points, as 14³ graded cells have it, this mesh tells 83 %; without the
-# grading of the faces beside 66 %, and 10³ equal cells tell 53 %.
-HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
+# Of the error of configs/inclusion.toml at 120 points, relative to 14³ graded cells, this mesh shows 83 %; without the
+# grading of the adjacent faces 66 %, and 10³ equal cells 53 %.
+HELD, BESIDE = 8.0, 4.0  # grading at the held faces, and at those that meet them in a rim
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
@@ -71,7 +71,7 @@ class FinerMesh:
 
     @cached_property
     def _scalars(self) -> list[int]:
-        """Places of the parameters that are no coefficients of fields."""
+        """Positions of the parameters that are not coefficients of fields."""
         return [i for i, path in enumerate(self._coarse.parameters) if path in self.spec.scalars]
 
     @cached_property
@@ -85,7 +85,7 @@ class FinerMesh:
         return cells[found.cells], shapes(found.local, cells.shape[1])
 
     def outputs(self, observed: SpecimenModel, point: FloatArray) -> FloatArray:
-        """Solve at parameters (d,) of the specimen, and return what is `observed` of it; collective.
+        """Solve at parameters (d,) of the specimen, and return the observations; collective.
 
         Raises
         ------

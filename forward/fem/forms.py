@@ -24,12 +24,12 @@ from forward.terms.term import Place, Term
 class Forms:
     """What is integrated over a body, as functions of its state, its parameters and directions of both.
 
-    Forms that only derivatives need are compiled when they are first used.
+    Forms needed only for derivatives are compiled on first use.
 
     Parameters
     ----------
     spec, comm, parameters
-        As of `HyperelasticModel`.
+        As in `HyperelasticModel`.
     beside
         Forms of the same body in other elements, whose mesh and random fields these share.
     """
@@ -84,13 +84,13 @@ class Forms:
 
     @cached_property
     def energy(self) -> Any:
-        """Energy density; in the mixed form, without that of the change of volume."""
+        """Energy density; in the mixed form, without its volumetric part."""
         energy = energy_of(self.spec.energy) if self.p is None else isochoric(self.spec.energy)
         return self.stiffness_factor * energy(OPS, *self._invariants.measures.values(), **self._material)
 
     @cached_property
     def _regions(self) -> dict[str, Any]:
-        """Indicators of the regions that have numbers of their own."""
+        """Indicators of the regions that have their own numbers."""
         if not self.spec.regions or not isinstance(self.spec.body, MeshFile):
             return {}
         found = spaces.region_indicators(self.comm, self.spec.body, self.mesh)
@@ -98,7 +98,7 @@ class Forms:
 
     @property
     def _material(self) -> dict[str, Any]:
-        """Constants of the material, by their names, each as an expression of the place."""
+        """Constants of the material, by name, each as an expression of position."""
         values = self._numbers("material")
         for region, inside in self._regions.items():
             for name, number in self._numbers(f"regions.{region}").items():
@@ -108,7 +108,7 @@ class Forms:
 
     @cached_property
     def stiffness_factor(self) -> Any:
-        """What regions, inclusions and fields multiply every modulus by, by the place, in UFL; 1 without any."""
+        """Factor of regions, inclusions and fields on every modulus, as a UFL expression of position; 1 without any."""
         factor = 1  # UFL drops it from products: a body without inclusions keeps its forms
         for region, inside in self._regions.items():
             if CONTRAST in self.spec.regions[region]:
@@ -164,7 +164,7 @@ class Forms:
 
     @cached_property
     def volume(self) -> float:
-        """Volume (m³) of the undeformed mesh, which is not that of the body where linear tetrahedra cut its faces."""
+        """Volume (m³) of the undeformed mesh; smaller than that of the body if linear tetrahedra cut its faces."""
         return self.scalar(spaces.constant(self.mesh, 1.0) * self.dx)()
 
     def surface(self, boundary: str) -> Any:
@@ -184,7 +184,7 @@ class Forms:
         return assembly.ScalarAssembler(self._invariants.inserted(form), self.comm)
 
     def at_points(self, expression: Any) -> assembly.PointValues:
-        """Compile an expression that is wanted at the quadrature points."""
+        """Compile an expression for evaluation at the quadrature points."""
         points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
         return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
 
@@ -192,9 +192,9 @@ class Forms:
         return compile.compile_form(self._invariants.inserted(form), self.comm)
 
     def _virtual_works(self) -> list[Any]:
-        """Forms of the virtual works of the loads, with the sign of forces that are out of balance.
+        """Forms of the virtual works of the loads, with the sign of the imbalance.
 
-        In load steps the numbers of a load are scaled where it is linear in them, else the whole load.
+        In load steps the numbers of a load are scaled if it is linear in them, otherwise the whole load.
         """
         works = []
         for load in self.spec.loads:
@@ -253,7 +253,7 @@ class Forms:
 
     @cached_property
     def _field_forces(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
-        """The fields that forces depend on, each with ∂(wᵀF)/∂m by its values m at the vertices, w being `_along`."""
+        """The fields on which forces depend, each with ∂(wᵀF)/∂m by its values m at the vertices, with w = `_along`."""
         found = []
         for field in self.fields:
 
@@ -284,7 +284,7 @@ class Forms:
 
     @cached_property
     def gradients(self) -> assembly.NodalGradients:
-        """Deformation gradients at the nodes, at the state that is set."""
+        """Deformation gradients at the nodes, at the current state."""
         return assembly.NodalGradients(self.F, self.space, self.comm)
 
 

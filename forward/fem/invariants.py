@@ -1,9 +1,9 @@
-"""Strain energies in forms of UFL: what they are functions of, the stress, and derivatives by the state.
+"""Strain energies in UFL forms: their arguments, the stress, and derivatives by the state.
 
-Energies of principal stretches are long expressions of two invariants (`kinematics.Shape`). UFL would carry each of
-their derivatives by the state through the whole of them, nine components wide; so in such an energy two symbols stand
-for the invariants, its derivatives by these are numbers, and the chain rule is written here. `inserted` puts the
-invariants in their place, in what is compiled. (A stiffness of Ogden's energy takes C compilers seconds rather than
+Energies of principal stretches are long expressions of two invariants (`kinematics.Shape`). UFL would propagate each of
+their derivatives by the state through these expressions, in nine components. So such an energy has two symbols instead
+of the invariants, its derivatives by these are scalars, and the chain rule is written here. `inserted` replaces the
+symbols by the invariants before compilation. (A stiffness of Ogden's energy takes C compilers seconds rather than
 minutes.)
 """
 
@@ -44,7 +44,7 @@ POINTS = 8
 
 
 class Invariants:
-    """What a strain energy is a function of, on a mesh.
+    """The arguments of a strain energy on a mesh.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Invariants:
     u
         Displacements, in UFL.
     displacement_of
-        Displacements of a direction in which derivatives are taken.
+        Displacements of the direction of derivatives.
     fibres
         Unit vectors along the families of fibres, in UFL.
 
@@ -66,7 +66,7 @@ class Invariants:
     deformation
         Parts of the deformation.
     measures
-        Arguments of the energy by their names, as variables of forms (or functions of such).
+        Arguments of the energy by name, as variables of forms (or functions of variables).
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Invariants:
         return sum((slopes[name] * self._shape.slopes[name] for name in self._symbols), P)
 
     def volume(self, factor: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return the bulk modulus κ (Pa) and g(J) of the volumetric part U = κ/2 g², by which the mixed form knows it.
+        """Return the bulk modulus κ (Pa) and g(J) of the volumetric part U = κ/2 g², used in the mixed form.
 
         Of D1 (J−1)² that is J−1. Of a part U that is stated, Taylor's theorem with the rest as an integral gives
         U = κ/2 g² with κ = U''(1) and
@@ -118,7 +118,7 @@ class Invariants:
         Parameters
         ----------
         factor
-            What multiplies every modulus.
+            Factor on every modulus.
         values
             Constants of the energy.
         """

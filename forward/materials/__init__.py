@@ -1,1 +1,1 @@
-"""Strain energies, measures of deformation, and what a material is at a point."""
+"""Strain energies, measures of deformation, and the response of a material point."""

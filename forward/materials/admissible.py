@@ -1,10 +1,10 @@
-"""Which constants make a material: those with which it is stable at rest.
+"""Which constants are admissible: those with which the material is stable at rest.
 
-The undeformed body resists every small strain where its shear modulus μ and its bulk modulus κ are positive (G. A.
+The undeformed body resists every small strain if its shear modulus μ and its bulk modulus κ are positive (G. A.
 Holzapfel, Nonlinear Solid Mechanics (2000), section 6.1). That is asked of the constants together, not of each: C2 of a
 Mooney–Rivlin material may be negative as long as C1 + C2 is not, and so may be a term of an Ogden material, or C20 of a
-Yeoh material. Besides, constants have the ranges in which their energy is one at all (`forward.materials.energies`: the
-chains of a Gent material have some length). What happens at large strains is found there, by the solve.
+Yeoh material. Besides, constants have ranges outside which the energy makes no sense (`forward.materials.energies`: the
+chains of a Gent material have a positive length). Stability at large strains is found by the solve.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ _VOLUME = _AtRest("2 D1", lambda v: 2 * v["D1"])  # of the program's own that sp
 def moduli(energy: str, values: Values) -> tuple[Any, Any]:
     """Return the shear and the bulk modulus (Pa) at rest of a kind of material.
 
-    κ is infinite where the constants of the volume are left out. Of energies that are none of the program's own they
-    are found by numerical derivatives.
+    κ is infinite if the volumetric constants are left out. For energies from outside the program the moduli are found
+    by numerical derivatives.
     """
     if energy not in _SHEAR:
         return small_strain_moduli(energy, values)
@@ -68,7 +68,7 @@ def moduli(energy: str, values: Values) -> tuple[Any, Any]:
 
 
 def objection(energy: str, values: Mapping[str, float]) -> str | None:
-    """Say why these constants are of no material, or None if they are."""
+    """Say why these constants are inadmissible; None if they are admissible."""
     for limit in _limits(energy_of(energy)):
         if limit.name in values and not limit.holds(values[limit.name]):
             return f"{limit.name} = {values[limit.name]:.6g}, expected {limit.words}"
@@ -84,7 +84,7 @@ def objection(energy: str, values: Mapping[str, float]) -> str | None:
 
 
 def admissible(energy: str, values: Values) -> NDArray[np.bool_]:
-    """Return which constants, numbers or arrays (n,), are of a material (n,)."""
+    """Return which constants, numbers or arrays (n,), are admissible (n,)."""
     shear, bulk = moduli(energy, values)
     good = (np.asarray(shear) > 0) & (np.asarray(bulk) > 0)
     for limit in _limits(energy_of(energy)):
@@ -94,7 +94,7 @@ def admissible(energy: str, values: Values) -> NDArray[np.bool_]:
 
 
 class _Limit(NamedTuple):
-    """The range in which a constant makes an energy."""
+    """The range in which an energy is defined for a constant."""
 
     name: str
     least: float
@@ -128,8 +128,7 @@ class Materials:
     energy
         Kind of all of them.
     constants
-        By the place of each material in the model: values of its constants, or the names of the parameters that they
-        are.
+        For each place of a material in the model: values of its constants, or names of the corresponding parameters.
     """
 
     energy: str
@@ -137,25 +136,25 @@ class Materials:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters that are constants."""
+        """Names of the parameters that are material constants."""
         found = (value for of in self.constants.values() for value in of.values() if isinstance(value, str))
         return tuple(dict.fromkeys(found))
 
     def objection(self, values: Mapping[str, float]) -> str | None:
-        """Say where and why parameters are of no material, or None if they are."""
+        """Say where and why parameters are inadmissible; None if they are admissible."""
         return next((f"{place}: {said}" for place, said in self.objections(values)), None)
 
     def objections(self, values: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-        """Say of each place whose parameters are of no material why."""
+        """Say for each place with inadmissible parameters why they are."""
         for place, own in self._at(values):
             said = objection(self.energy, own)
             if said is not None:
                 yield place, said
 
     def admissible(self, values: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
-        """Return which parameters, arrays (n,) by name, are of materials (n,)."""
+        """Return which parameters, arrays (n,) by name, are admissible (n,)."""
         found = [admissible(self.energy, own) for _, own in self._at(values)]
-        return np.asarray(np.all(np.broadcast_arrays(*found), axis=0))  # a place may have no parameters of its own
+        return np.asarray(np.all(np.broadcast_arrays(*found), axis=0))  # a place may have no parameters
 
     def _at(self, values: Values) -> Iterator[tuple[str, dict[str, Any]]]:
         for place, own in self.constants.items():

@@ -1,6 +1,6 @@
 """The block of settings of a material, made from the signature of its energy.
 
-So names, units and limits of the constants stand in one place.
+So names, units and limits of the constants are stated in one place.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """Strain energies of hyperelastic materials: one plain function each.
 
 A function takes the operators `ops` (``ln``, ``log1p``, ``exp``, ``expm1``, ``sinh``, ``sqrt``; ``positive``: the
-larger of x and 0; ``near``: one or another as |z| is below a limit or not), measures of the deformation by their names,
-and its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The names of the
-keyword-only arguments *are* the names of the parameters in studies and results, and their annotations are the units,
-and the values with which there is an energy; which ones together make a material that is stable at rest is said in
+larger of x and 0; ``near``: one of two expressions, depending on whether |z| is below a limit), measures of deformation
+by name, and its constants as keyword-only arguments. UFL reads it for finite elements, SymPy for closed forms. The
+names of the keyword-only arguments *are* the names of the parameters in studies and results; their annotations give the
+units and the values for which the energy is defined. Which constants together are stable at rest is stated in
 `forward.materials.admissible`. All energies are in J/m³ and vanish, with their stress, in the undeformed body.
 
-Measures vanish in the undeformed body, and `forward.materials.kinematics` computes them from ∇u without a difference of
-numbers near one. An energy is written so that it is none either: it keeps its digits however small the strains are.
+Measures vanish in the undeformed body, and `forward.materials.kinematics` computes them from ∇u without subtracting
+numbers near one. Energies are written without such differences too: they keep their digits however small the strains.
 
     i1, i2      Ī1 − 3 and Ī2 − 3, with Ī1 = J^(−2/3) I1, Ī2 = J^(−4/3) I2
     j           J − 1
@@ -17,8 +17,8 @@ numbers near one. An energy is written so that it is none either: it keeps its d
     trace       tr E, with E = (C − I)/2
     square      E:E
 
-An energy that has a constant called D1 splits into an isochoric part, of i1, i2, l1, l2 and l3, and of fibres, which it
-is with D1 = 0, and the volumetric part D1(J−1)². Other volumetric parts are stated
+An energy that has a constant called D1 splits into an isochoric part (the energy with D1 = 0, a function of i1, i2, l1,
+l2, l3 and the fibres) and the volumetric part D1(J−1)². Other volumetric parts are stated explicitly
 (`forward.materials.material.with_volume`).
 """
 
@@ -56,7 +56,7 @@ def neo_hookean(ops: Any, i1: Any, j: Any, *, C1: Number, D1: Number) -> Any:
 def neo_hookean_coupled(ops: Any, i1: Any, j: Any, *, mu: Number, lmbda: Number) -> Any:
     """Coupled compressible neo-Hookean: W = μ/2 (I1−3) − μ ln J + λ/2 (ln J)².
 
-    mu, lmbda: the Lamé constants in Pa. Written with I1 = J^(2/3) Ī1, and with what a change of volume alone leaves of
+    mu, lmbda: the Lamé constants in Pa. Written with I1 = J^(2/3) Ī1, and with the purely volumetric part of
     (I1−3)/2 − ln J: for y = J^⅓ and z = (y−1)/(y+1), by ln y = 2 artanh z, that is
     3/2 (y²−1) − 3 ln y = 3/2 (y−1)² (y+3)/(y+1) − 6 (artanh z − z).
     Source: J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), eq. 6.27.
@@ -80,8 +80,8 @@ def yeoh(ops: Any, i1: Any, j: Any, *, C10: Number, C20: Number, C30: Number, D1
 def gent(ops: Any, i1: Any, j: Any, *, mu: Number, Jm: PositiveRatio, D1: Number) -> Any:
     """Gent: W = −(μ Jm/2) ln(1 − (Ī1−3)/Jm) + D1(J−1)².
 
-    mu, D1 in Pa; Jm is what Ī1−3 stays below: there the chains are stretched out, and beyond there is no energy (finite
-    elements find NaN). Small strain: μ = mu, κ = 2 D1.
+    mu, D1 in Pa; Jm is the upper limit of Ī1−3, at which the chains are fully extended; beyond it the energy is
+    undefined (finite elements find NaN). Small strain: μ = mu, κ = 2 D1.
     Source: A. N. Gent, Rubber Chem. Technol. 69 (1996) 59–61.
     """
     # −½ ln x is −ln √x = 2 artanh((1 − √x)/(1 + √x)), whose derivatives too are no numbers where x < 0: those of ln x
@@ -104,7 +104,7 @@ def saint_venant_kirchhoff(ops: Any, trace: Any, square: Any, *, lmbda: Number, 
     """Saint Venant–Kirchhoff: W = λ/2 (tr E)² + μ E:E with E = (C − I)/2.
 
     lmbda, mu: the Lamé constants in Pa.
-    For large rotations with small strains: under compression it softens until it collapses without resistance.
+    For large rotations with small strains only: under compression it softens until it collapses without resistance.
     Source: G. A. Holzapfel, Nonlinear Solid Mechanics (2000), section 6.5.
     """
     return lmbda / 2 * trace**2 + mu * square
@@ -113,8 +113,8 @@ def saint_venant_kirchhoff(ops: Any, trace: Any, square: Any, *, lmbda: Number, 
 def blatz_ko(ops: Any, i2: Any, j: Any, *, mu: Number) -> Any:
     """Blatz–Ko foam: W = μ/2 (I2/J² + 2J − 5).
 
-    mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4. Written with I2 = J^(4/3) Ī2, and with what
-    a change of volume alone leaves: for y = J^⅓, 3/y² + 2y³ − 5 = (y−1)² (2y³ + 4y² + 6y + 3)/y².
+    mu in Pa. Small strain: μ = mu, κ = 5/3 mu, that is Poisson's ratio 1/4. Written with I2 = J^(4/3) Ī2, and with the
+    part due to a change of volume alone: for y = J^⅓, 3/y² + 2y³ − 5 = (y−1)² (2y³ + 4y² + 6y + 3)/y².
     Source: P. J. Blatz, W. L. Ko, Trans. Soc. Rheol. 6 (1962) 223–251.
     """
     y = (1 + j) ** (1 / 3)
@@ -157,10 +157,10 @@ def holzapfel_gasser_ogden(
 ) -> Any:
     """Holzapfel–Gasser–Ogden: W = c/2 (Ī1−3) + Σ_f k1/(2 k2) (exp(k2 ⟨I4_f−1⟩²) − 1) + D1(J−1)².
 
-    One or two families f of fibres along a_f in the undeformed body, I4_f = a_f·C a_f; ⟨x⟩ = max(x, 0): fibres that are
-    shortened bear nothing. I4 is not made isochoric: else fibres would swell a compressible body. c, k1, D1 in Pa; k2
-    is dimensionless. Small strain: μ = c, κ = 2 D1 of the matrix; a fibre stretched by 1 + e adds the tension 4 k1 e.
-    Source: G. A. Holzapfel, T. C. Gasser, R. W. Ogden, J. Elasticity 61 (2000) 1–48; I4 as in D. R. Nolan et al., J.
+    One or two families f of fibres along a_f in the undeformed body, I4_f = a_f·C a_f; ⟨x⟩ = max(x, 0): shortened
+    fibres carry no load. I4 is not made isochoric, since fibres would then swell a compressible body. c, k1, D1 in Pa;
+    k2 is dimensionless. Small strain: μ = c, κ = 2 D1 of the matrix; a fibre stretched by 1 + e adds the tension 4 k1
+    e. Source: G. A. Holzapfel, T. C. Gasser, R. W. Ogden, J. Elasticity 61 (2000) 1–48; I4 as in D. R. Nolan et al., J.
     Mech. Behav. Biomed. Mater. 39 (2014) 48–60.
     """
     fibres = sum(ops.expm1(k2 * ops.positive(longer) ** 2) for longer in i4)

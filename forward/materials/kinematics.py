@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
-APART = 1e-6  # gap that principal strains keep, as a part of their size
+APART = 1e-6  # relative gap kept between principal strains
 LEAST = 1e-20  # principal strains of a body without strain: far below what is computed, far above what underflows
 SMALL = 0.1  # |z| below which artanh z − z is its series
-TERMS = 7  # of it: what is left out is SMALL¹⁴/5 of it
+TERMS = 7  # of the series: the relative truncation error is SMALL¹⁴/5
 
 
 def deformation_gradient(gradient: Any, identity: Any) -> Any:
@@ -19,10 +19,10 @@ def deformation_gradient(gradient: Any, identity: Any) -> Any:
 
 
 class Deformation(NamedTuple):
-    """What measures and stresses are made of: polynomials of ∇u that vanish with it.
+    """The parts of measures and stresses: polynomials of ∇u that vanish with it.
 
-    With F = I + ∇u and C = FᵀF, none of them is a difference of numbers near one: they keep their digits however small
-    the strains are.
+    With F = I + ∇u and C = FᵀF, none of them subtracts numbers near one: they keep their digits however small the
+    strains are.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ def measure(ops: ModuleType | SimpleNamespace, name: str, at: Deformation, fibre
     Raises
     ------
     ValueError
-        For a measure that is not known, or that needs `principal_strains`.
+        For an unknown measure, or one that needs `principal_strains`.
     """
     match name:
         case "i1":
@@ -86,7 +86,7 @@ def measure(ops: ModuleType | SimpleNamespace, name: str, at: Deformation, fibre
 
 
 def excess(mean: Any, square: Any, product: Any, root: Any) -> Any:
-    """Return tr A / (det A)^⅓ − 3 of a symmetric positive A, with all its digits where A is nearly spherical.
+    """Return tr A / (det A)^⅓ − 3 of a symmetric positive A, with all its digits if A is nearly spherical.
 
     With m = tr A/3, D = dev A, q = D:D/2, r = det D and s = (det A)^⅓: det A = m³ − m q + r, and so
     3 m/s − 3 = 3 (m³ − s³) / (s (m² + m s + s²)) = 3 (m q − r) / (s (m² + m s + s²)).
@@ -100,18 +100,17 @@ def excess(mean: Any, square: Any, product: Any, root: Any) -> Any:
 
 
 class Shape(NamedTuple):
-    """What a change of shape is but for its axes: q² and θ of the eigenvalues of D = 3 dev C / tr C.
+    """Invariants of a change of shape: q² and θ of the eigenvalues of D = 3 dev C / tr C.
 
     With m = tr C/3, of which C has the eigenvalues m (1 + D_k), and r = det D/2,
 
         D_k = 2q cos(θ + 2πk/3),   q² = D:D/6,   θ = atan2(y, r)/3,   y = √(q⁶ − r²).
 
-    Where two of them are equal they have no derivatives, though symmetric functions of them do. So q² is made larger by
-    (εq)² with ε = `APART`: the D_k stay apart by about εq and have derivatives everywhere, of which what is infinite
-    for ε → 0 cancels in symmetric functions. Of an energy, the stress is wrong by a part of the order ε², and
-    ε_machine/ε of its stiffness is rounding, if dθ is formed before it is multiplied with anything. A body without
-    strain has D_k of the size of `LEAST`.
-    Source: O. K. Smith, Commun. ACM 4 (1961) 168.
+    Where two of them are equal they are not differentiable, though symmetric functions of them are. So q² is increased
+    by (εq)² with ε = `APART`: the D_k stay apart by about εq and are differentiable everywhere; the parts of the
+    derivatives that diverge for ε → 0 cancel in symmetric functions. The stress then has a relative error of order ε²,
+    and the stiffness a relative rounding error of ε_machine/ε, if dθ is formed before it is multiplied with anything.
+    In a body without strain, the D_k are of size `LEAST`. Source: O. K. Smith, Commun. ACM 4 (1961) 168.
 
     Attributes
     ----------
@@ -156,7 +155,7 @@ def nominal_stress(
     slopes: Mapping[str, Any],
     fibres: Sequence[tuple[Any, Any]] = (),
 ) -> Any:
-    """P = ∂W/∂F from the slopes of W by its measures, in a form that keeps its digits however small the strains are.
+    """P = ∂W/∂F from the derivatives of W by its measures, in a form that keeps its digits for small strains.
 
     With W₁, W₂, W_J by Ī1, Ī2 and J: F⁻ᵀ (2 J^(−2/3) W₁ dev C − 2 J^(−4/3) W₂ dev cof C + J W_J I), since
     ∂Ī1/∂F = 2 J^(−2/3) (F − I1/3 F⁻ᵀ) and F = F⁻ᵀ C. By tr E and E:E it is F (W_tr I + 2 W_sq E), by I4 of fibres along

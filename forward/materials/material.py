@@ -1,4 +1,4 @@
-"""What an energy is, what it consists of, and which ones there are.
+"""What an energy is, what it consists of, and the list of energies.
 
 An energy is a plain function, of this program (`forward.materials.energies`, which says how it is written) or from a
 module beside a study or an installed package (``kind = "my_tissue.fung"``):
@@ -27,12 +27,12 @@ Energy = Callable[..., Any]
 KNOWN = ("i1", "i2", "j", "l1", "l2", "l3", "i4", "trace", "square")  # measures of a deformation
 QUADRATIC = "D1"  # the constant of a volumetric part D1(J−1)²
 TINY = 1e-30  # step of a derivative by complex numbers
-REST = 1e-6  # of the moduli: energy and stress of the undeformed body that are none
+REST = 1e-6  # of the moduli: energy and stress of the undeformed body that count as zero
 
 
 @dataclass(frozen=True)
 class Split:
-    """An energy that is the sum of a part of the shape and a part of the volume alone; made by `with_volume`."""
+    """An energy that is the sum of an isochoric and a volumetric part; made by `with_volume`."""
 
     shape: Energy
     volume: Energy
@@ -54,15 +54,15 @@ def with_volume(volume: Energy) -> Callable[[Energy], Energy]:
     Parameters
     ----------
     volume
-        U as a function of `ops` and j = J − 1, with constants of its own, which are then those of the energy too:
-        ``def log_volume(ops, j, *, kappa: Number): return kappa / 2 * ops.log1p(j) ** 2``. It is convex near J = 1,
-        where it and its slope vanish, and positive elsewhere. The function that is decorated is the isochoric part, of
-        i1, i2, l1, l2 and l3, and of fibres.
+        U as a function of `ops` and j = J − 1, with its own constants, which become constants of the energy too: ``def
+        log_volume(ops, j, *, kappa: Number): return kappa / 2 * ops.log1p(j) ** 2``. It is convex near J = 1, where it
+        and its slope vanish, and positive elsewhere. The decorated function is the isochoric part, a function of i1,
+        i2, l1, l2, l3 and the fibres.
 
     Raises
     ------
     TypeError
-        If one of the two is a function of something else.
+        If one of the two depends on something else.
     """
     if measures(volume) != ("j",):
         message = f"the volumetric part is a function of {', '.join(measures(volume))}, expected j alone"
@@ -78,7 +78,7 @@ def with_volume(volume: Energy) -> Callable[[Energy], Energy]:
 
 
 def measures(energy: str | Energy) -> tuple[str, ...]:
-    """Return what an energy, or that of a kind of material, is a function of, by name and in its order."""
+    """Return the names of the measures on which an energy, or that of a kind of material, depends, in order."""
     return _measures(energy_of(energy))
 
 
@@ -125,7 +125,7 @@ def _quadratic(ops: Any, j: Any, *, D1: Any) -> Any:
 
 
 def volumetric(energy: str | Energy) -> Energy | None:
-    """Return the part of the volume alone of an energy, or None if it has none."""
+    """Return the volumetric part of an energy, or None if it has none."""
     energy = energy_of(energy)
     if isinstance(energy, Split):
         return energy.volume
@@ -133,7 +133,7 @@ def volumetric(energy: str | Energy) -> Energy | None:
 
 
 def isochoric(energy: str | Energy) -> Energy:
-    """Return an energy that splits without its volumetric part, as a function of all its measures and constants."""
+    """Return an energy without its volumetric part, as a function of all its measures and constants."""
     energy = energy_of(energy)
     return partial(_of_shape, energy) if isinstance(energy, Split) else partial(_without_volume, energy)
 
@@ -147,23 +147,23 @@ def _without_volume(energy: Energy, ops: Any, *measures: Any, **values: Any) -> 
 
 
 def splits(energy: str | Energy) -> bool:
-    """Whether an energy, or that of a kind of material, is an isochoric part and a part of the volume alone."""
+    """Whether an energy, or that of a kind of material, splits into an isochoric and a volumetric part."""
     return volumetric(energy) is not None
 
 
 def of_volume(energy: str | Energy) -> tuple[str, ...]:
-    """Return the constants of the volumetric part of an energy; without them it is that of an incompressible one."""
+    """Return the constants of the volumetric part of an energy; without them the material is incompressible."""
     volume = volumetric(energy)
     return () if volume is None else tuple(constants(volume))
 
 
 def incompressible(energy: str | Energy, names: Any) -> bool:
-    """Whether a material with constants of these names is incompressible: those of the volume are left out."""
+    """Whether a material with these constants is incompressible: the volumetric ones are missing."""
     return splits(energy) and not {*of_volume(energy)} & {*names}
 
 
 def small_strain_moduli(energy: str | Energy, values: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Shear and bulk modulus of the undeformed body; fibres, which bear tension only, left out.
+    """Shear and bulk modulus of the undeformed body without fibres, which carry only tension.
 
     Pure shear with stretches exp(h), exp(−h), 1 has W = 2μh² + …, so that μ = W''(h)/4 at h = 0. A dilation with all
     stretches λ has W = κ(3(λ−1))²/2 + …, so that κ = W''(λ)/9 at λ = 1. First derivatives are complex steps, which are
@@ -190,7 +190,7 @@ def small_strain_moduli(energy: str | Energy, values: Mapping[str, Any]) -> tupl
 
 
 def unfit_at_rest(energy: str | Energy, values: Mapping[str, float]) -> str | None:
-    """Say what is wrong with an energy of these constants in the undeformed body, or None if all is well."""
+    """Say what is wrong with an energy of these constants in the undeformed body, or None if nothing is."""
     energy = energy_of(energy)
     W = isochoric(energy) if incompressible(energy, values) else energy
     try:
@@ -199,7 +199,7 @@ def unfit_at_rest(energy: str | Energy, values: Mapping[str, float]) -> str | No
         pressure = float(_slope(W, energy, values, (complex(0.0, TINY),) * 3)) / 3
         size = max(abs(modulus) for modulus in small_strain_moduli(energy, values) if modulus != float("inf"))
     except Exception as error:
-        return f"the energy cannot be evaluated: {error}; it is written with the operators that it is given"
+        return f"the energy cannot be evaluated: {error}; it must use the operators that it is given"
     if not abs(at_rest) <= REST * size:
         return f"the energy of the undeformed body is {at_rest:.3g} J/m³, expected 0: its measures vanish there"
     if not abs(pressure) <= REST * size:
@@ -258,7 +258,7 @@ def _arrays() -> SimpleNamespace:
 
 
 def _objection(found: Any) -> str | None:
-    """Say why something is no energy, or None if it is one."""
+    """Say why something is not an energy, or None if it is one."""
     if isinstance(found, Split):
         return _objection(found.shape) or _objection(found.volume)
     if not inspect.isfunction(found):
@@ -279,13 +279,13 @@ def _objection(found: Any) -> str | None:
 
 
 def _of_quadratic(energy: Energy) -> str | None:
-    """Say whether the part of D1 is not D1(J−1)²."""
+    """Say so if the part with D1 is not D1(J−1)²; otherwise None."""
     at: dict[str, Any] = dict.fromkeys(KNOWN, 0.1) | {"l2": 0.05, "l3": -0.15, "i4": (0.1,)}
     given = [at[name] for name in measures(energy)]
     try:
         ends = [energy(_NUMBERS, *given, **(dict.fromkeys(constants(energy), 1.0) | {"D1": D1})) for D1 in (0.0, 1.0)]
     except Exception as error:
-        return f"it cannot be evaluated: {error}; it is written with the operators that it is given"
+        return f"it cannot be evaluated: {error}; it must use the operators that it is given"
     expected = at["j"] ** 2 if "j" in measures(energy) else None
     if expected is None or not abs(ends[1] - ends[0] - expected) <= 1e-9:
         return "D1 is the constant of a part D1(J−1)²: give another name to that of another"

@@ -11,7 +11,7 @@ that. SymPy reads the energy and differentiates it, so that stresses and their d
 are closed forms (of y, which Newton's method finds where it is not known): G. A. Holzapfel, Nonlinear Solid Mechanics
 (2000), chapter 6; R. W. Ogden, Non-Linear Elastic Deformations (1984).
 
-All modes of test are one system of equations with different unknowns, hence one file.
+All test modes are one system of equations with different unknowns, hence one file.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
 Component = Literal["P1", "P2", "P1-P2"]
-HELD: tuple[Mode, ...] = ("biaxial", "pure-shear")  # modes in which something acts across
+HELD: tuple[Mode, ...] = ("biaxial", "pure-shear")  # modes with a load across
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
 
 
 class MaterialTest(Settings):
-    """One homogeneous test of a material: what is prescribed, and which stress is read.
+    """One homogeneous test of a material: what is prescribed, and which stress is measured.
 
     Parameters
     ----------
@@ -54,10 +54,10 @@ class MaterialTest(Settings):
     stress
         "nominal" (force over undeformed area) or "cauchy".
     component
-        Which stress is read: "P1", along `at`; in "biaxial" and "pure-shear" also "P2", across, and their difference
-        "P1-P2", which of Cauchy stresses does not depend on the pressure.
+        Which stress is measured: "P1", along `at`; in "biaxial" and "pure-shear" also "P2", across, and their
+        difference "P1-P2", which for Cauchy stresses does not depend on the pressure.
     name
-        Name of the test in the names of the outputs; by default its mode, with the component where that is not P1.
+        Name of the test in output names; by default its mode, with the component unless that is P1.
     """
 
     mode: Mode
@@ -78,7 +78,7 @@ class MaterialTest(Settings):
             message = f"at: stretch {min(self.at):g}, expected positive ones (1 is undeformed)"
             raise ValueError(message)
         if (self.across is not None) != (self.mode == "biaxial"):
-            message = "across: is for mode = 'biaxial', and only for it"
+            message = "across: is only for mode = 'biaxial'"
             raise ValueError(message)
         if self.component != "P1" and self.mode not in HELD:
             message = f"component: {self.component} of a test '{self.mode}', expected P1: nothing acts across"
@@ -90,7 +90,7 @@ class MaterialTest(Settings):
 
 
 def named(test: str, component: Component) -> str:
-    """Return the name of a test with that of the stress that is read, where it is not the first one."""
+    """Return the name of a test, with that of the measured stress unless it is the first one."""
     return test if component == "P1" else f"{test} {component}"
 
 
@@ -102,14 +102,14 @@ class HomogeneousModel(OneByOne):
     energy
         Kind of the material, see `forward.materials.energies`.
     values
-        Its constants; without those of the volume (D1), an energy that has them is that of an incompressible material.
+        Its constants; without the volumetric ones (D1), the material is incompressible.
     tests
         What is measured.
     parameters
         Names of the constants that vary; the others keep their values.
     fibres
-        Directions of one or two families of fibres, where the material has them: components along the stretch x, along
-        what is prescribed across (in simple shear, x moves along the first, more so along the second), and along y.
+        Directions of one or two families of fibres, if the material has them: components along the stretch x, along the
+        direction across (in simple shear, x moves along the first, more so along the second), and along y.
 
     Raises
     ------
@@ -142,7 +142,7 @@ class HomogeneousModel(OneByOne):
         self.parameters = tuple(parameters)
         self._names = tuple(name for name in known if name in given)
         self._energy = energy
-        self._free = not incompressible(energy, given)  # faces move as they like, and where to has to be found
+        self._free = not incompressible(energy, given)  # free faces, whose displacement has to be found
         self._values = np.array([values.get(name, np.nan) for name in self._names])
         self._varied = [self._names.index(name) for name in parameters]
         self._tests = tuple(tests)
@@ -155,7 +155,7 @@ class HomogeneousModel(OneByOne):
         )
 
     def stresses(self, points: FloatArray) -> FloatArray:
-        """Return the stresses (n, m) at parameters (n, d), NaN where there is none (a Gent chain at its end)."""
+        """Return the stresses (n, m) at parameters (n, d), NaN where undefined (fully extended Gent chains)."""
         return np.concatenate([values for values, _ in self._evaluate(points, derivatives=False)], axis=1)
 
     def stresses_and_derivatives(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -180,9 +180,9 @@ class HomogeneousModel(OneByOne):
         Raises
         ------
         InadmissibleError
-            Where the constants are of no material, or an incompressible one has no energy in a test.
+            If the constants are inadmissible, or the energy of an incompressible material is undefined in a test.
         SolveError
-            Where a test of a compressible one has no stress.
+            If there is no stress in a test of a compressible material.
         """
         return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
 

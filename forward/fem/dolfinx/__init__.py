@@ -1,7 +1,7 @@
 """The only package that knows DOLFINx: compiled forms, meshes, spaces, assembly, linear solvers.
 
-Written for DOLFINx 0.5 (Debian 12) and 0.11 (the wheel `dolfinx-solver-real`); what these call differently is in
-`version`. To import any of it makes the libraries ready, in the order that they need.
+Written for DOLFINx 0.5 (Debian 12) and 0.11 (the wheel `dolfinx-solver-real`); their differences are in `version`.
+Importing any part of it initialises the libraries, in the order that they need.
 """
 
 from contextlib import suppress

@@ -67,7 +67,7 @@ class PointValues:
         self._cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
 
     def __call__(self) -> FloatArray:
-        """Return the values (n_cells, q · size of the expression) at the state that is set."""
+        """Return the values (n_cells, q · size of the expression) at the current state."""
         values = version.evaluate(self._expression, self._mesh, self._cells)
         return np.asarray(values).reshape(len(self._cells), -1)
 
@@ -93,7 +93,7 @@ class NodalGradients:
         return np.asarray(sum_ghosts(self._carrier).reshape(-1, 3).T)
 
     def __call__(self) -> FloatArray:
-        """Return F (3, 3, n_owned) at this rank's nodes, for the state that is set."""
+        """Return F (3, 3, n_owned) at this rank's nodes, for the current state."""
         values = self._values().reshape(-1, 9).T
         sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
         F = np.array([self._owned(rows) for rows in sums.reshape(3, 3, -1)])
@@ -103,7 +103,7 @@ class NodalGradients:
 def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:
     """Mesh a body in this process; return linear elements and ∫vw dX, ∫∇v·∇w dX, ∫vw dS of them.
 
-    They are on hexahedra, but for bodies that come with a mesh of tetrahedra.
+    The elements are hexahedra, except for bodies that come with a mesh of tetrahedra.
     """
     from scipy.sparse import csr_matrix
 

@@ -20,14 +20,14 @@ from forward.machine import compiled_forms
 
 T = TypeVar("T")
 
-# Sums over nodes are vectorised only where the compiler may reorder them; NaN and infinity keep their meaning, which
+# Sums over nodes are vectorised only if the compiler may reorder them; NaN and infinity keep their meaning, which
 # -ffast-math would take from them. Measured: residuals 2 to 4 times, stiffness 1.3 times faster.
 _REORDER = ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-freciprocal-math", "-fno-math-errno"]
 _FLAGS = ["-O3", "-march=native", *_REORDER]
 
 
 def _cache_directory() -> Path:
-    """Folder of what was compiled for this kind of processor, this Python and these flags."""
+    """Folder of compiled code for this kind of processor, this Python and these flags."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next(line for line in lines if line.startswith("flags"))
@@ -48,10 +48,10 @@ def options_for(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _lock(name: str) -> Iterator[None]:
-    """Let one process at a time in. The system opens the lock of a process that dies."""
+    """Let one process in at a time. The system releases the lock of a process that dies."""
     _CACHE.mkdir(parents=True, exist_ok=True)
     with (_CACHE / f"{name}.lock").open("w") as lock:
-        with suppress(OSError):  # some file systems of clusters have no locks: then more than one process compiles
+        with suppress(OSError):  # some cluster file systems have no locks: then more than one process compiles
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
@@ -59,9 +59,8 @@ def _lock(name: str) -> Iterator[None]:
 def compiled(what: Any, make: Callable[[Path], T], comm: Any) -> T:
     """Return what `make` compiles, or loads, in a folder; collective over `comm`.
 
-    Whatever the number of processes that ask for it together, one compiles: in a folder that is renamed when it is
-    complete, so that no one ever finds half of it, nor has to wait for a process that was killed. What is there is
-    loaded without any lock.
+    However many processes ask for it at the same time, one compiles: in a folder that is renamed when it is complete,
+    so that none ever finds half of it, or waits for a process that was killed. What exists is loaded without a lock.
     """
     name = ffcx.naming.compute_signature([what], "")
     folder = _CACHE / name

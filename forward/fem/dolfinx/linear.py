@@ -1,4 +1,4 @@
-"""Stiffness matrices and what solves with them (`forward.solvers.linear`)."""
+"""Stiffness matrices and their linear solvers (`forward.solvers.linear`)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from forward.model import FloatArray, SolveError
 
 ROOM = 60  # for what pivoting adds to the factor, in per cent of MUMPS's own estimate
 MOST_ROOM = 4000
-HOPELESS = 0.6  # part of the memory that a factor is expected to take, without which it is not begun
-SINGULAR = -10  # errors of MUMPS, as its guide numbers them
-TOO_LITTLE_ROOM = {-8, -9, -14, -15, -17, -20}  # more than was estimated is needed: more room helps
+HOPELESS = 0.6  # fraction of the expected memory without which a factorisation is not begun
+SINGULAR = -10  # MUMPS error codes, from its guide
+TOO_LITTLE_ROOM = {-8, -9, -14, -15, -17, -20}  # more memory is needed than estimated: retry with more
 TOO_LITTLE_MEMORY = {-5, -7, -11, -13, -18, -19, -22}
 
 
@@ -31,13 +31,13 @@ class StiffnessMatrix:
     constraints
         Prescribed unknowns.
     unknowns
-        Knows the order of vectors.
+        Defines the order of vectors.
     comm
         Communicator of the ranks that share the matrix.
     symmetric
         Whether the form is.
     expected
-        What its factor is expected to be.
+        Expected size of its factor.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class DirectSolver:
     """A `LinearSolver` that factorises a stiffness matrix by MUMPS: LDLᵀ where it is symmetric, else LU.
 
     One matrix and one solver object serve every realisation, so that the symbolic analysis is done once and no
-    communicator is created in a loop. Another that assembles the matrix takes the factor away.
+    communicator is created in a loop. If another solver assembles the matrix, the factor is lost.
     """
 
     def __init__(self, stiffness: StiffnessMatrix) -> None:
@@ -119,7 +119,7 @@ class DirectSolver:
             If there is no memory for the factor.
         """
         unknowns, ranks = self._stiffness.matrix.getSize()[0], self._ksp.comm.size
-        if not self._analysed:  # the analysis crashes where it finds no memory
+        if not self._analysed:  # the analysis crashes without memory
             hopeless = HOPELESS * self._stiffness.expected.bytes / ranks + SPARE
             require(hopeless, f"the factor of the stiffness of {unknowns:,} unknowns")
         self._stiffness.assemble()
@@ -146,7 +146,7 @@ class DirectSolver:
         raise SolveError(message)
 
     def _try(self) -> int:
-        """Factorise; return MUMPS's status, negative where it failed."""
+        """Factorise; return MUMPS's status, negative if it failed."""
         self._ksp.pc.setUp()  # the KSP's own set-up would leave it to the first solve
         return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(1))
 
@@ -164,7 +164,7 @@ class DirectSolver:
         return ksp
 
     def _renew(self) -> None:
-        """Begin with a new factor, which is analysed again."""
+        """Start with a new factor, which is analysed again."""
         self._ksp.destroy()
         self._ksp = self._new_ksp(self._stiffness.comm)
         self._analysed = False
@@ -198,7 +198,7 @@ class DirectSolver:
         return int(self._ksp.pc.getFactorMatrix().getMumpsInfog(12))
 
     def memory(self) -> int:
-        """Return the bytes of the last factor with its working memory on all ranks, to whole megabytes; 0 before."""
+        """Return the bytes of the last factor with its working memory on all ranks, in whole megabytes; 0 before."""
         if not self._factorised:
             return 0
         return 10**6 * int(self._ksp.pc.getFactorMatrix().getMumpsInfog(22))

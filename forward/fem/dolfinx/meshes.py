@@ -27,7 +27,7 @@ def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]
         return _own_mesh(comm, body)
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     version.name_variant(msh)
-    # Facets are found while boundaries are planes across an axis.
+    # Facets are found while boundaries are still planes perpendicular to an axis.
     facets = _box_facets(msh, body.meshed)
     msh.geometry.x[:] = body.place(msh.geometry.x)
     return msh, facets
@@ -59,7 +59,7 @@ def _own_mesh(comm: Any, body: MeshFile) -> tuple[Any, dict[str, NDArray[np.int3
 
 
 def _on_first(comm: Any, load: Callable[[], Any]) -> Any:
-    """Call on the first rank; what is raised there is raised on all."""
+    """Call on the first rank; exceptions raised there are raised on all ranks."""
     found, problem = None, None
     if comm.rank == 0:
         try:

@@ -99,13 +99,13 @@ def point_weights(
 ) -> tuple[list[tuple[NDArray[np.int32], FloatArray] | None], FloatArray]:
     """Return nodes and weights that interpolate at each point (n, 3), on one rank each; collective.
 
-    A point in no cell has the weights of the place of the mesh that is nearest; the other array (n,) says, on every
-    rank, how far it is from there (m). The rank that is nearest, and of several the first, has the point.
+    A point in no cell gets the weights of the nearest place of the mesh; the other array (n,) holds, on every rank, its
+    distance from there (m). The nearest rank, or the first of several, has the point.
     """
     msh, comm = space.mesh, space.mesh.comm
     found = locate(msh.geometry.x[version.corners_of_cells(msh)[: owned_cells(msh)]], points)
     every = np.array(comm.allgather(found.distances))
-    # Where an edge or a face has several nodes, DOLFINx permutes them: they stand as on the reference cell.
+    # If an edge or a face has several nodes, DOLFINx permutes them: here they are as on the reference cell.
     values = cell_element(space).tabulate(0, found.local)[0, :, :, 0]
     mine = every.argmin(axis=0) == comm.rank
     here = [
@@ -116,13 +116,13 @@ def point_weights(
 
 
 def quadrature_points(space: Any, degree: int) -> FloatArray:
-    """Reference points (q, 3) of the quadrature that the integrals use."""
+    """Reference points (q, 3) of the quadrature rule of the integrals."""
     points, _ = basix.make_quadrature(version.cell_type(space), degree)
     return np.asarray(points)
 
 
 def constant(msh: Any, value: Any) -> Any:
-    """A constant of forms whose value can change without compiling again."""
+    """A constant in forms whose value can change without compiling again."""
     return fem.Constant(msh, np.asarray(value, dtype=PETSc.ScalarType))
 
 

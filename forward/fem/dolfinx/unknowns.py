@@ -1,4 +1,4 @@
-"""The unknowns of a body as spaces and as vectors, in an order that DOLFINx does not set."""
+"""The unknowns of a body as spaces and as vectors, in an order independent of DOLFINx."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Unknowns:
     """The unknowns of a body: displacements and, in the mixed form, pressures; as spaces and as vectors.
 
     A vector (U_local,) holds the displacements of the nodes that this rank owns, interleaved, and then the pressures of
-    the vertices that it owns. DOLFINx numbers the unknowns of its mixed space in another order, which ends here.
+    the vertices that it owns. DOLFINx numbers the unknowns of its mixed space differently; only this class knows how.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Unknowns:
         The space of displacements.
     pressure
         The space of pressures, continuous and one degree lower (P. Hood, C. Taylor, Navier–Stokes equations using mixed
-        interpolation, 1974); nothing in the displacement form.
+        interpolation, 1974); None in the displacement form.
     size
         Number of unknowns that this rank owns.
     pressures
@@ -77,7 +77,7 @@ class Unknowns:
         function.x.scatter_forward()
 
     def take(self, values: FloatArray) -> FloatArray:
-        """Copy what DOLFINx or PETSc holds of the whole space into a vector (U_local,), or into rows (k, U_local)."""
+        """Copy values of DOLFINx or PETSc on the whole space into a vector (U_local,), or rows (k, U_local)."""
         return np.array(values[..., : self.size]) if self._order is None else np.asarray(values[..., self._order])
 
     def reorder(self, values: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What DOLFINx 0.5 and 0.11 call differently; no other file asks which of them is there."""
+"""Differences between DOLFINx 0.5 and 0.11; no other file asks which version it is."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def mesh_of(comm: Any, cell: str, cells: NDArray[np.int64], points: FloatArray) 
 def name_variant(msh: Any) -> None:
     """Say which Lagrange elements a box has its coordinates in.
 
-    FFCx names this variant when it first compiles a form, which changes the look of all later ones. With the name from
-    the start, a form that was compiled in one run is found by the next.
+    FFCx names this variant when it first compiles a form, which changes the signatures of all later ones. With the name
+    set from the start, a form that was compiled in one run is found by the next.
     """
     if FIVE:
         domain = msh.ufl_domain()

@@ -135,7 +135,7 @@ def test_moduli_are_found_of_numbers_and_arrays():
         (FUNG | {"e": 1.0}, "unknown key"),
         ({"kind": "my_tissue.not_at_rest", "c": 1e4, "D1": 1e5}, "energy of the undeformed body is -3e+04 J/m³"),
         ({"kind": "my_tissue.other_D1", "c": 1e4, "D1": 1e5}, "D1 is the constant of a part D1(J−1)²"),
-        ({"kind": "my_tissue.of_math", "c": 1e4, "D1": 1e5}, "is written with the operators that it is given"),
+        ({"kind": "my_tissue.of_math", "c": 1e4, "D1": 1e5}, "must use the operators that it is given"),
         ({"kind": "my_tissue.of_words", "c": 1e4}, "'I1' is no measure of a deformation, expected some of: i1"),
         ({"kind": "my_tissue.no_constants"}, "expected its constants as keyword-only arguments"),
         ({"kind": "my_tissue.number"}, "expected a function"),
