@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +244,19 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     if not any(found.values()):
         raise DataError(*missing)
     return list(found)
+
+
+def distinct(paths: Sequence[Path]) -> list[str]:
+    """Return a name for each of different files: without its ending; with it, and with folders, where two share one."""
+    names = [path.stem for path in paths]
+    ways = [path.relative_to(path.anchor).parts for path in paths]
+    for depth in range(1, max(map(len, ways), default=0) + 1):
+        shared = {name for name, times in Counter(names).items() if times > 1}
+        names = ["-".join(way[-depth:]) if name in shared else name for way, name in zip(ways, names, strict=True)]
+    for i, name in enumerate(names):  # a-b/c and a/b-c
+        if name in names[:i]:
+            names[i] = next(new for k in count(2) if (new := f"{name}-{k}") not in names)
+    return names
 
 
 def read(path: Path, cases: Sequence[str], unit: float = 1.0) -> Observations:

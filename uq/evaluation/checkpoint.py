@@ -112,6 +112,11 @@ class Checkpoint:
         """Read evaluations, as `has` has found them."""
         return read(self.path(key))
 
+    @property
+    def answers(self) -> bool:
+        """Whether a block that is kept has more in it than failed solves."""
+        return any(_has_answers(path) for path in self._folder.glob("*.h5"))
+
     def drop(self, keys: Iterable[str]) -> None:
         """Remove blocks that are no longer needed, since what follows from them is kept."""
         for key in keys:
@@ -176,6 +181,15 @@ def write(group: h5py.Group, block: Evaluations) -> None:
         group["tangents"] = block.tangents
     if block.fields.size:
         group["fields"] = block.fields
+
+
+def _has_answers(path: Path) -> bool:
+    """Whether a block has more in it than failed solves; what cannot be read counts as more."""
+    try:
+        with h5py.File(path, "r") as file:
+            return len(json.loads(file["failures"][()])) < len(file["points"])
+    except (OSError, KeyError, ValueError):
+        return True
 
 
 def _write(path: Path, body: bytes, key: str = "") -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import Loaded
 from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
+from forward.model import SolveError
 from uq.evaluation.evaluate import Evaluations
 from uq.findings import add
 from workflows.config.mistakes import StudyError
@@ -74,7 +75,7 @@ def run(
     Raises
     ------
     StudyError
-        If the directory holds another study or cannot be written, or if there is less work than groups of ranks.
+        If the directory holds another study or cannot be written.
     ModelError
         If the model cannot be made.
     SolveError
@@ -84,7 +85,8 @@ def run(
 
     Notes
     -----
-    Where it fails before anything is solved, the directory is left as it was.
+    Where it fails before anything is solved, or because the model has no answer that could be kept, the directory is
+    left as it was.
     """
     try:
         return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report)
@@ -122,8 +124,10 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
         dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
-    except BaseException:
+    except BaseException as error:
         if world.rank == 0:
+            if isinstance(error, SolveError) and not checkpoint.answers:
+                checkpoint.clear()
             _withdraw(directory)
         raise
     if dataset is None:
@@ -212,16 +216,11 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
         message = f"parallel.ranks_per_model: {ranks} ranks were started, expected a multiple of {share}"
         raise StudyError(message)
     rank_groups, blocks = ranks // share, min(max(study.planned - 1, 1), study.parallel.blocks)
-    if rank_groups > blocks and study.patient:
+    if rank_groups > blocks:
         _note(
-            f"{rank_groups} groups of ranks were started for {blocks} tasks: {rank_groups - blocks} have nothing to do"
+            f"{rank_groups} groups of ranks were started for {blocks} task{'s' * (blocks > 1)}: {rank_groups - blocks} "
+            "of them will be idle; parallel.ranks_per_model makes groups larger"
         )
-    elif rank_groups > blocks:
-        message = (
-            f"{ranks} ranks were started as {rank_groups} groups, but the study has work for {blocks} only: "
-            f"start mpirun -n {blocks * share}, or set parallel.blocks or parallel.ranks_per_model"
-        )
-        raise StudyError(message)
     kept = directory / "study.toml"
     try:
         if kept.exists():

@@ -17,7 +17,7 @@ from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
 from forward.specimen import Specimen
-from inverse.data.observations import DataError, files
+from inverse.data.observations import DataError, distinct, files
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
@@ -198,9 +198,7 @@ class InversionStudy(StudyKind):
         except DataError as error:
             raise StudyError(*(f"data.files: {line}" for line in error.args)) from None
         sets, found, lines = [], [], []
-        names = [path.stem for path in paths]
-        for path, stem in zip(paths, names, strict=True):
-            name = stem if names.count(stem) == 1 else path.name
+        for path, name in zip(paths, distinct(paths), strict=True):
             try:
                 measurement, wrong = self.read(path), ""
             except DataError as error:

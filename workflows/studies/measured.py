@@ -28,7 +28,7 @@ class DataSet(Settings):
     Parameters
     ----------
     name
-        The name of the file without its ending.
+        The name of the file without its ending; with it, and with folders, where two files share one.
     file
         The name of the file.
     digest

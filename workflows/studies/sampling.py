@@ -53,7 +53,6 @@ class Study(StudyKind):
 
     stopped: ClassVar[str] = "one linearisation"
     explains: ClassVar[bool] = False
-    patient: ClassVar[bool] = False
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     parameters: dict[str, Distribution] = Field(default={})

@@ -35,13 +35,10 @@ class StudyKind(Settings):
         Why it ends, in words, where the results do not say it.
     explains
         Whether data are explained: then parameters without a model have no likelihood, which is an answer too.
-    patient
-        Whether groups of ranks may be more than there is work for: tasks that each take minutes.
     """
 
     stopped: ClassVar[str] = ""
     explains: ClassVar[bool] = True
-    patient: ClassVar[bool] = True
 
     if TYPE_CHECKING:  # fields of every kind
 

@@ -1,10 +1,12 @@
 """Files of measured displacements: what they hold, and one line for what is wrong with them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from forward.bodies.geometry import Block, Box
-from inverse.data.observations import DataError, files, read
+from inverse.data.observations import DataError, distinct, files, read
 
 pytestmark = pytest.mark.unit
 
@@ -28,6 +30,22 @@ def table(tmp_path):
         return path
 
     return write
+
+
+def test_different_files_have_different_names():
+    """Results, and what is kept of solves, are by these."""
+    for paths, names in (
+        (["a/1.csv", "b/2.csv"], ["1", "2"]),
+        (["a/1.csv", "a/1.vtu", "2.csv"], ["1.csv", "1.vtu", "2"]),
+        (["a/1.csv", "b/1.csv", "2.csv"], ["a-1.csv", "b-1.csv", "2"]),
+        (["/a/1.csv", "/b/a/1.csv"], ["a-1.csv", "b-a-1.csv"]),
+        (["a/1.csv", "b/1.csv", "a/1.vtu"], ["a-1.csv", "b-1.csv", "1.vtu"]),
+        (["a-b/1.csv", "a/b-1.csv", "b/1.csv", "x/b-1.csv"], ["a-b-1.csv", "a-b-1.csv-2", "b-1.csv", "x-b-1.csv"]),
+        (["1.csv", "1.vtu", "1.csv.csv"], ["1.csv", "1.vtu", "1.csv-2"]),
+    ):
+        found = distinct([Path(path) for path in paths])
+        assert len(set(found)) == len(paths)
+        assert found == names
 
 
 def test_a_table_is_read_component_by_component(table):

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -132,6 +133,20 @@ def test_tables_are_data_sets_side_by_side(folder):
     table = (folder / "batch" / "batch.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
     assert "All data sets" in (folder / "batch" / "report.html").read_text()
+
+
+def test_files_of_one_name_in_different_folders_are_different_data(folder):
+    """In all that is called after a data set: results, rows, solves that are kept."""
+    for place, name in (("monday", "one"), ("tuesday", "two")):
+        (folder / place).mkdir()
+        (folder / place / "scan.csv").write_text((folder / "data" / f"{name}.csv").read_text())
+    files = "data={files='*day/scan.csv', noise={relative=0.1}}"
+    assert ran(folder / "stated.toml", folder / "days", files) == 0
+    found, apart = results(folder / "days"), results(folder / "batch")
+    assert [str(name) for name in found["data_set"].values] == ["monday-scan.csv", "tuesday-scan.csv"]
+    np.testing.assert_allclose(found["mode"], apart["mode"][:2], rtol=1e-8)
+    evaluations = h5py.File(folder / "days" / "evaluations.h5")
+    assert set(evaluations) == {"monday-scan.csv", "tuesday-scan.csv"}
 
 
 @pytest.mark.mpi
