@@ -18,7 +18,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
-from forward.fem.cost import Times, times
+from forward.fem.cost import Estimate, Times, estimate, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials
 from forward.materials.block import Material
@@ -290,6 +290,11 @@ class Hyperelastic(ModelSpec):
         """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
         predicted = self.solver.kind != "newton"
         return times(self.body, mixed=self.mixed, symmetric=self.symmetric, predicted=predicted, factors=factors)
+
+    def mesh_error_cost(self) -> Estimate:
+        """Predict what an estimate of the error of the mesh takes."""
+        enriched = self.enriched()
+        return estimate(self.body, enriched.body, mixed=self.mixed, symmetric=self.symmetric)
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, and how many unknowns there are of which kind."""

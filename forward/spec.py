@@ -17,6 +17,7 @@ from forward.settings import Settings
 from forward.words import named
 
 if TYPE_CHECKING:
+    from forward.fem.cost import Estimate
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
     from forward.fem.locking import Ranges
     from forward.materials.admissible import Materials
@@ -131,13 +132,9 @@ class ModelSpec(Settings):
         message = f"a model of kind '{self.kind}' has no meshes"
         raise ModelError(message)
 
-    def enriched(self) -> Self:
-        """Return the same model on the same mesh with elements of one degree higher, to estimate its mesh error.
-
-        Only what this costs is asked of it; solutions estimate the error (`Solution.mesh_error`).
-        """
-        message = f"a model of kind '{self.kind}' has no meshes"
-        raise ModelError(message)
+    def mesh_error_cost(self) -> Estimate | None:
+        """Predict what an estimate of the error of its mesh takes (`Solution.mesh_error`); None without a mesh."""
+        return None
 
     def textbook(self) -> Self:
         """Return the same model with the textbook solver, against which the gain of a better solver is measured."""

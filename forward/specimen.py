@@ -12,7 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.bodies.geometry import AXES, Body, Vector, holds
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
-from forward.fem.cost import Times, sum_of
+from forward.fem.cost import Estimate, Times, sum_of
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.hyperelastic import Hyperelastic, materials
 from forward.materials.admissible import Materials
@@ -147,11 +147,6 @@ class Specimen(ModelSpec):
         """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)
 
-    def enriched(self) -> Self:
-        """Return the same specimen on the same mesh with elements of one degree higher, in the same formulation."""
-        formulation = "mixed" if self.decision({}).mixed else "displacement"
-        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
-
     @property
     def mixable(self) -> bool:
         """Whether it can have pressures as unknowns."""
@@ -226,6 +221,10 @@ class Specimen(ModelSpec):
     def cost(self) -> Times:
         """Predict the cost of a solve of all load cases, each with its own factor."""
         return sum_of([self.loaded(case).cost(factors=1) for case in self.cases])
+
+    def mesh_error_cost(self) -> Estimate:
+        """Predict what an estimate of the error of the mesh takes in all load cases."""
+        return sum_of([self.loaded(case).mesh_error_cost() for case in self.cases])
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, which load cases there are, and which unknowns they have."""

@@ -12,15 +12,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 from functools import cache
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from forward.machine import MIB
 
 ENTRIES = 1.4  # of MUMPS over those of the model
 OPERATIONS = 1.6
 # Displacements coupled with each one, on average, inside a large body.
-ROW = {("hexahedron", 1): 81.0, ("hexahedron", 2): 192.0, ("tetrahedron", 1): 45.0, ("tetrahedron", 2): 84.0}
+ROW = {
+    ("hexahedron", 1): 81.0,
+    ("hexahedron", 2): 192.0,
+    ("hexahedron", 3): 380.0,
+    ("tetrahedron", 1): 45.0,
+    ("tetrahedron", 2): 84.0,
+    ("tetrahedron", 3): 140.0,
+}
 SMALLEST = 3.0  # nodes across a part of the lattice that is not cut further
 BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, including room for pivoting
 BYTES_PER_NONZERO = 16.0  # of the matrix
@@ -32,10 +40,20 @@ ADDRESSES_OF_PROGRAM = 8e8  # the same in addresses, most of which are never tou
 ASSEMBLY = {
     ("hexahedron", 1): 1.4e-5,
     ("hexahedron", 2): 2.4e-4,
+    ("hexahedron", 3): 1.7e-3,
     ("tetrahedron", 1): 2.9e-6,
     ("tetrahedron", 2): 2.3e-5,
+    ("tetrahedron", 3): 1.1e-4,
 }
-RESIDUAL = {("hexahedron", 1): 1.2e-6, ("hexahedron", 2): 5e-6, ("tetrahedron", 1): 2e-7, ("tetrahedron", 2): 8e-7}
+RESIDUAL = {
+    ("hexahedron", 1): 1.2e-6,
+    ("hexahedron", 2): 5e-6,
+    ("hexahedron", 3): 1.3e-5,
+    ("tetrahedron", 1): 2e-7,
+    ("tetrahedron", 2): 8e-7,
+    ("tetrahedron", 3): 2e-6,
+}
+HIGHEST = 3  # degree of these; of higher ones they are taken
 OF_PRESSURES = 1.25  # of an assembly with pressures over one without
 PER_ENTRY, PER_OPERATION = 1.6e-8, 4.4e-11  # of a factorisation
 PER_NONZERO = 6e-8  # of the matrix and the analysis before the first factorisation
@@ -53,6 +71,9 @@ ACTIONS = 7  # products with the stiffness for the screen of a sample, each like
 DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
 SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
+MOST_BYTES = 4e9  # of factors for estimates, where there is another way
+ACTION = 2  # a product with the stiffness, over a residual
+SMOOTHING, ROUGHLY = 12, 5  # steps in the enriched space, and solves with a factor of the body, of an estimate
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
@@ -171,7 +192,7 @@ def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool 
     If the stiffness is not symmetric, each comes with a factor of the symmetric part, for the stability test.
     """
     extents = [high - low for low, high in body.bounds]
-    kind, more = (body.cell, min(body.degree, 2)), OF_PRESSURES if mixed else 1.0
+    kind, more = (body.cell, min(body.degree, HIGHEST)), OF_PRESSURES if mixed else 1.0
     found = factor(body, mixed=mixed, symmetric=symmetric)
     size = found.bytes if symmetric else found.bytes + factor(body, mixed=mixed).bytes
     return Times(
@@ -186,9 +207,61 @@ def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool 
     )
 
 
-def sum_of(parts: Sequence[Times]) -> Times:
+class Way(StrEnum):
+    """How the enriched equations are solved."""
+
+    FACTOR = "a factor of their own"
+    REFERENCE = "the factor of a reference, or one of their own where there is none"
+    SMOOTHING = "steps of conjugate gradients and the factor of the body"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one estimate of the error of a mesh takes, in elements of one degree more.
+
+    Attributes
+    ----------
+    way
+        How; by sizes, form and degree only.
+    seconds
+        Predicted processor time (s).
+    once
+        What comes once for many, before the first (s): a factor, or what the steps are preconditioned by.
+    bytes
+        Memory.
+    """
+
+    way: Way
+    seconds: float
+    once: float
+    bytes: float
+
+
+def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) -> Estimate:
+    """Predict an estimate for a body, and the same in elements of one degree more.
+
+    Steps of conjugate gradients miss too much of the error of linear elements, which may lock, and of a mixed form.
+    """
+    coarse, fine = (times(one, mixed=mixed, symmetric=symmetric) for one in (body, enriched))
+    forces = 2 * fine.residual  # in the enriched space, with the outputs
+    factored = fine.assembly + fine.factorisation
+    one = forces + factored + fine.substitution
+    near = forces + ROUGHLY * (fine.substitution + ACTION * fine.residual)
+    smoothed = forces + SMOOTHING * ACTION * fine.residual + ROUGHLY * (coarse.substitution + ACTION * coarse.residual)
+    held = 2 * fine.bytes
+    if one <= min(near, smoothed):
+        return Estimate(Way.FACTOR, one, fine.setup, held)
+    if mixed or (body.degree == 1 and held <= MOST_BYTES):
+        return Estimate(Way.REFERENCE, near, fine.setup + factored, held)
+    return Estimate(Way.SMOOTHING, smoothed, fine.assembly, BYTES_PER_UNKNOWN * 3 * enriched.nodes)
+
+
+Summed = TypeVar("Summed", Times, Estimate)
+
+
+def sum_of(parts: Sequence[Summed]) -> Summed:
     """Predict the cost of several bodies that are solved one after the other."""
-    totals = {f.name: sum(getattr(part, f.name) for part in parts) for f in fields(Times) if f.type == "float"}
+    totals = {f.name: sum(getattr(part, f.name) for part in parts) for f in fields(parts[0]) if f.type == "float"}
     return replace(parts[0], **totals)
 
 
@@ -207,7 +280,7 @@ def factor(body: Meshed, *, mixed: bool, symmetric: bool = True) -> Factor:
     return Factor(
         triangles * ENTRIES * entries,
         triangles * OPERATIONS * operations,
-        ROW[body.cell, min(body.degree, 2)] * 3 * body.nodes * (1 + pressures / 3) ** 2,
+        ROW[body.cell, min(body.degree, HIGHEST)] * 3 * body.nodes * (1 + pressures / 3) ** 2,
     )
 
 

@@ -9,26 +9,51 @@ Prescribed unknowns stay what they are on V_h. Elements of V⁺ err too: what e 
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from forward.fem.cost import Way, estimate
 from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.equations import Discretisation
-from forward.model import FloatArray, Work
+from forward.fem.reference import ReferenceFactor
+from forward.model import FloatArray, ReferenceSolution, Work
 from forward.observables.observable import Functional
+from forward.solvers.anderson import block_galerkin
+from forward.solvers.smoothing import smoothed
 
 if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
 
 
+ROUGH = 0.01  # of solves with the stiffness of the body, relative to the size of what is solved for
+SETTLED = 0.01  # part of the energy of e that a few steps may miss
+STEPS = 100  # of these, at most
+ORTHOGONAL = 1e-6  # part of forces that is nothing to the body
+ITERATIONS = 30  # of these, at most
+CLOSE = 1e-3  # of solves with the factor of a reference in the enriched space
+
+
 class Solved(Protocol):
-    """A solution of the body: its parameters (d,) and this rank's part (U_local,) of its state."""
+    """A solution of the body.
+
+    Attributes
+    ----------
+    parameters, state
+        Parameters (d,) and this rank's part (U_local,) of the state.
+    reference
+        The solution nearby with whose factor it was found.
+    """
 
     parameters: FloatArray
     state: FloatArray
+    reference: ReferenceSolution | None
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
+        """Solve with the stiffness of the body at this state, or its transpose, for rows (k, U_local)."""
 
 
 class EnrichedState(NamedTuple):
@@ -77,6 +102,8 @@ class Enriched:
     ----------
     equations
         The equations of the body in the enriched space.
+    way
+        How they are solved, which depends on sizes, form and degree only.
     """
 
     def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
@@ -91,6 +118,8 @@ class Enriched:
             output.functional(self.equations) if output.estimable else None for output in spec.outputs
         ]
         self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
+        self.way = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric).way
+        self._blocks: tuple[ReferenceSolution | Solved, FloatArray | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
         """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
@@ -136,13 +165,107 @@ class Enriched:
         equations = self.equations
         equations.work = Work()
         forces = -self.imbalance(solution)
-        self._factorise(solution)
-        change = equations.back_substitute(forces)
+        (change,) = self._solve(solution, forces[None])
         start = self.up(solution.state)
         # In the mixed form the energy is a saddle, in which the pressures count with the other sign.
         energy = 0.5 * equations.curvature(change, forces)
         equations.set_state(start)
         return EnrichedState(start + change, change, energy, float(self._stored()), equations.work)
+
+    def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+        """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
+
+        To rounding with a factor of its own, or roughly in one of the other ways.
+        """
+        found = None
+        if self.way == Way.SMOOTHING:
+            found = self._solve_by_smoothing(solution, right, transpose=transpose)
+        elif self.way == Way.REFERENCE and solution.reference is not None:
+            found = self._solve_near(solution, solution.reference, right, transpose=transpose)
+        if found is None:
+            self._factorise(solution)
+            found = self.equations.back_substitute(right, transpose=transpose)
+        return found
+
+    def _solve_by_smoothing(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray | None:
+        """Solve by steps of conjugate gradients and, before and after, with the stiffness of the body.
+
+        The last of these sets right what outputs see most: the residual is orthogonal to V_h then.
+        """
+        inverse = self._inverse_blocks(solution)
+        if inverse is None:
+            return None
+        equations, fixed = self.visit(solution), self.equations.fixed
+
+        def multiply(x: FloatArray) -> FloatArray:
+            y = equations.stiffness_times(x, transpose=transpose)
+            y[fixed] = 0
+            return y
+
+        def precondition(r: FloatArray) -> FloatArray:
+            z: FloatArray = np.einsum("nij,nj->ni", inverse, r.reshape(-1, 3)).ravel()
+            z[fixed] = 0
+            return z
+
+        found = self._on_the_body(solution, right, transpose=transpose)
+        for i, b in enumerate(right):
+            residual = b - multiply(found[i]) if found[i].any() else b
+            change, _, settled = smoothed(multiply, precondition, residual, equations.total, SETTLED, STEPS)
+            if not settled:
+                return None
+            found[i] += change
+        left = right - np.array([multiply(x) for x in found])
+        return found + self._on_the_body(solution, left, transpose=transpose)
+
+    def _on_the_body(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray:
+        """Solve with the stiffness of the body for what rows (k, U⁺_local) are to it, unless that is nothing."""
+        forces = np.array([self.restrict(row) for row in right])
+        forces[:, self._coarse.fixed] = 0
+        sizes, wholes = self._coarse.norms(forces), self.equations.norms(right)
+        worth = sizes > ORTHOGONAL * wholes
+        found = np.zeros_like(right)
+        if worth.any():
+            solved = solution.solve(forces[worth], transpose=transpose, tolerance=ROUGH)
+            found[worth] = [self.up(row) for row in solved]
+            found[:, self.equations.fixed] = 0
+        self.visit(solution)
+        return found
+
+    def _inverse_blocks(self, solution: Solved) -> FloatArray | None:
+        """Inverses of the stiffness of each node at the reference of a solution, which serve all that have it."""
+        at: ReferenceSolution | Solved = solution.reference or solution
+        if self._blocks is None or not _same(self._blocks[0], at):
+            equations = self.equations
+            kept, equations.work = equations.work, Work()  # charged to none, as the factor of a reference
+            equations.set_parameters(at.parameters)
+            equations.at_load(1.0)
+            equations.set_state(self.up(at.state))
+            self._blocks = (at, equations.inverse_blocks())
+            equations.work = kept
+        return self._blocks[1]
+
+    @cached_property
+    def _reference(self) -> ReferenceFactor:
+        return ReferenceFactor(self.equations)
+
+    def _solve_near(
+        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, *, transpose: bool
+    ) -> FloatArray | None:
+        """Solve with the factor of the enriched stiffness at a reference; None if that is too far away."""
+        equations = self.equations
+        known = ReferenceSolution(reference.parameters, self.up(reference.state))
+        self._reference.prepare(known)
+        R = self._reference.rotation(self.up(solution.state))
+        self.visit(solution)
+        return block_galerkin(
+            lambda x: equations.free_stiffness_times(x, transpose=transpose),
+            self._reference.inverse(R, transpose=transpose),
+            right,
+            equations.total,
+            equations.norms,
+            CLOSE,
+            ITERATIONS,
+        )
 
     def _factorise(self, solution: Solved) -> None:
         equations = self.visit(solution)
@@ -167,12 +290,11 @@ class Enriched:
         if np.delete(weights, known, axis=1).any():
             message = "an output is weighted of which no error of the mesh is estimated"
             raise ValueError(message)
-        self._factorise(solution)
         self.visit(solution)
         gradients = np.array([f.gradient() for f in self._functionals if f is not None])
         loads = weights[:, known] @ gradients
         loads[:, self.equations.fixed] = 0
-        return self.equations.back_substitute(loads, transpose=True)
+        return self._solve(solution, loads, transpose=True)
 
     def indicators(self, solution: Solved, weights: FloatArray) -> FloatArray:
         """Return what each of this rank's cells (k, n_cells) adds to the error of outputs weighted by (k, m); ≥ 0.
@@ -189,6 +311,12 @@ class Enriched:
             sizes = np.abs(equations.imbalance_by_vertices(z - self.up(self.down(z))))
             found.append(shared_by_cells(sizes, equations))
         return np.array(found)
+
+
+def _same(one: ReferenceSolution | Solved, other: ReferenceSolution | Solved) -> bool:
+    if isinstance(one, ReferenceSolution) and isinstance(other, ReferenceSolution):
+        return one.same(other)
+    return one is other
 
 
 def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:

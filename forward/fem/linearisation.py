@@ -35,8 +35,29 @@ class Linearisation(Forms):
         self._prescribe()
         trial = ufl.TrialFunction(self.unknowns.whole)
         self._stiffness = self._bilinear(self.derivative(imbalance, trial))
-        self._matrix = self._new_matrix(self._stiffness, symmetric=self.symmetric)
-        self._solver: LinearSolver = linear.DirectSolver(self._matrix)
+        if beside is None:
+            assert self._solver  # so that memory is looked at before anything else is made
+
+    @cached_property
+    def _matrix(self) -> linear.StiffnessMatrix:
+        return self._new_matrix(self._stiffness, symmetric=self.symmetric)
+
+    @cached_property
+    def _solver(self) -> LinearSolver:
+        return linear.DirectSolver(self._matrix)
+
+    @cached_property
+    def _nodal_blocks(self) -> linear.NodalBlocks:
+        return linear.NodalBlocks(self._stiffness, self._constraints, self.space, self.comm)
+
+    def inverse_blocks(self) -> FloatArray | None:
+        """Inverses (nodes_owned, 3, 3) of the stiffness of each node at the state that is set, without pressures.
+
+        None where one of all ranks is not positive. This costs an assembly, and no matrix.
+        """
+        self.work.assemblies += 1
+        found = self._nodal_blocks.inverted()
+        return found if ranks.smallest(self.comm, -1.0 if found is None else 1.0) > 0 else None
 
     def _prescribe(self) -> None:
         """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""

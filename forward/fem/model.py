@@ -226,7 +226,7 @@ class FiniteElementSolution:
         self.work = work
         for array in (self.parameters, self.state):
             array.flags.writeable = False
-        self._reference = None if way is None else way.reference
+        self.reference = None if way is None else way.reference
         self._rotation = None if way is None else way.rotation
         model.visit(self)
         self.outputs = np.array([f.value() for f in model._functionals])
@@ -248,12 +248,26 @@ class FiniteElementSolution:
         self._model.visit(self)
         return np.array([f.partial() for f in self._model._functionals])
 
-    def _solve(self, right: FloatArray, *, transpose: bool = False, directions: FloatArray | None = None) -> FloatArray:
-        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); those of tangents belong to `directions` (k, d)."""
+    def solve(
+        self,
+        right: FloatArray,
+        *,
+        transpose: bool = False,
+        directions: FloatArray | None = None,
+        tolerance: float | None = None,
+    ) -> FloatArray:
+        """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); collective.
+
+        Those of tangents belong to `directions` (k, d). By default the tolerance is that of derivatives.
+        """
         model = self._model
-        near = self._reference is not None and not model.has_factor(self)
-        if near and self._reference is not None and self._rotation is not None and len(right) <= FEW:
-            found = self._solve_near(right, self._reference, self._rotation, transpose=transpose, directions=directions)
+        near = self.reference is not None and not model.has_factor(self)
+        if near and self.reference is not None and self._rotation is not None and len(right) <= FEW:
+            if tolerance is None:
+                tolerance = model.spec.solver.derivative_tolerance
+            found = self._solve_near(
+                right, self.reference, self._rotation, tolerance, transpose=transpose, directions=directions
+            )
             if found is not None:
                 return found
         return model.linearise(self).back_substitute(right, transpose=transpose)
@@ -263,6 +277,7 @@ class FiniteElementSolution:
         right: FloatArray,
         reference: ReferenceSolution,
         R: FloatArray,
+        tolerance: float,
         *,
         transpose: bool,
         directions: FloatArray | None,
@@ -285,7 +300,7 @@ class FiniteElementSolution:
             free,
             equations.total,
             equations.norms,
-            model.spec.solver.derivative_tolerance,
+            tolerance,
             ITERATIONS,
             first,
         )
@@ -300,7 +315,7 @@ class FiniteElementSolution:
         right = directions[:, equations.scalars] @ self._right_sides
         if equations.fields:
             right += self._model.visit(self).field_right_sides(directions)
-        du = self._solve(right, directions=directions)
+        du = self.solve(right, directions=directions)
         return du.reshape(*np.shape(direction)[:-1], -1)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
@@ -318,7 +333,7 @@ class FiniteElementSolution:
         The transpose of `state_tangent`, summed over the ranks.
         """
         loads = np.atleast_2d(weights)
-        multipliers = self._solve(loads, transpose=True)
+        multipliers = self.solve(loads, transpose=True)
         equations = self._model.equations
         gradients = np.zeros((len(loads), len(self.parameters)))
         gradients[:, equations.scalars] = equations.total(multipliers @ self._right_sides.T)

@@ -9,6 +9,8 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from forward.fem.cost import BYTES_PER_NONZERO, SPARE, Factor
+from forward.fem.dolfinx import version
+from forward.fem.dolfinx.spaces import owned_nodes
 from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
@@ -90,6 +92,39 @@ class StiffnessMatrix:
         x.destroy()
         y.destroy()
         return found
+
+
+class NodalBlocks:
+    """The 3×3 blocks on the diagonal of a stiffness of displacements, without the rest of it.
+
+    Parameters
+    ----------
+    form, constraints, comm
+        As of `StiffnessMatrix`.
+    space
+        The space of displacements.
+    """
+
+    def __init__(self, form: Any, constraints: list[Any], space: Any, comm: Any) -> None:
+        self._form, self._constraints = form, constraints
+        self._matrix = version.block_diagonal_matrix(space, comm)
+        nodes = np.arange(owned_nodes(space) + 1, dtype=np.int32)
+        self._matrix.setValuesBlockedLocalCSR(nodes, nodes[:-1], np.zeros(9 * len(nodes[1:])))
+        self._matrix.assemble()  # what is on the diagonal has its place now
+        self._matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATIONS, False)
+
+    def inverted(self) -> FloatArray | None:
+        """Assemble at the state that is set; return the inverses (n_owned, 3, 3), None where one is not positive."""
+        self._matrix.zeroEntries()
+        fem.petsc.assemble_matrix(self._matrix, self._form, bcs=self._constraints)
+        self._matrix.assemble()
+        rows, _, values = self._matrix.getValuesCSR()
+        first, last = self._matrix.getOwnershipRange()
+        assert len(values) == 3 * (last - first) == rows[-1]
+        blocks = np.asarray(values).reshape(-1, 3, 3)
+        if not np.isfinite(blocks).all() or np.linalg.eigvalsh(blocks + blocks.swapaxes(1, 2)).min(initial=1.0) <= 0:
+            return None
+        return np.asarray(np.linalg.inv(blocks))
 
 
 class DirectSolver:

@@ -134,3 +134,13 @@ def vector_of(function: Any) -> Any:
 def new_vector(form: Any) -> Any:
     """A vector for a compiled linear form."""
     return fem.petsc.create_vector(form if FIVE else form.function_spaces[0])
+
+
+def block_diagonal_matrix(space: Any, comm: Any) -> Any:
+    """A matrix for unknowns of a space of vectors that has room for the coupling of those of each node only."""
+    maps, sizes = [space.dofmap.index_map] * 2, [space.dofmap.index_map_bs] * 2
+    owned = np.arange(maps[0].size_local, dtype=np.int32)
+    pattern = cpp.la.SparsityPattern(comm, maps, sizes)
+    pattern.insert_diagonal(owned)
+    (pattern.assemble if FIVE else pattern.finalize)()
+    return cpp.la.petsc.create_matrix(comm, pattern)

@@ -6,8 +6,9 @@ import pytest
 from mpi4py import MPI
 
 from forward.external.models import PythonModel
+from forward.fem.cost import Way
 from forward.hyperelastic import Hyperelastic
-from forward.model import FunctionModel, ModelError
+from forward.model import FunctionModel, Guess, ReferenceSolution
 from forward.specimen import Specimen
 from inverse.data.measured_model import MeasuredModel
 from tests.bodies import MATERIALS, MIXED, MORE_MATERIALS, OUTPUTS, loaded_body
@@ -196,25 +197,73 @@ def test_data_of_a_specimen_have_errors():
 def test_models_without_a_mesh_have_none():
     model = FunctionModel(np.sum, ("a", "b"), ("sum",))
     assert model.solve(np.ones(2)).mesh_error() is None
-    spec = bent().enriched()
-    assert spec.body.degree == 2
-    assert spec.cost().textbook > bent().cost().textbook
+    assert bent().enriched().body.degree == 2
 
     plain = PythonModel.model_validate({"function": "math.hypot", "parameters": {"x": 1.0}, "outputs": ["y"]})
-    with pytest.raises(ModelError, match="no meshes"):
-        plain.enriched()
+    assert plain.mesh_error_cost() is None
+
+
+def near(spec, path, change, way):
+    """A solution that was found with the factor of a reference, and its enriched equations solved in another way."""
+    value = spec.scalars[path].value
+    model = spec.build(MPI.COMM_SELF, (path,))
+    model.enriched.way = way
+    centre = model.solve(np.array([value]))
+    reference = ReferenceSolution(centre.parameters, centre.state)
+    state = centre.state + centre.state_tangent(np.array([(change - 1) * value]))
+    return model.solve(np.array([change * value]), Guess(state, reference))
+
+
+@pytest.mark.parametrize(("cell", "load"), [("hexahedron", "traction"), ("tetrahedron", "pressure")])
+def test_steps_without_a_factor_come_close(cell, load):
+    direction = {"direction": (0, 0, -1)} if load == "traction" else {}
+    loads = ({"kind": load, "on": "x-max" if direction else "z-max", "size": 400.0, **direction},)
+    spec = bent(cells=(4, 2, 2), cell=cell, degree=2, loads=loads)
+    (path,) = (path for path in spec.scalars if path.startswith("loads."))
+    exact, rough = (near(spec, path, 1.5, way) for way in (Way.FACTOR, Way.SMOOTHING))
+    expected, found = exact.mesh_error(), rough.mesh_error()
+    assert found.work.factorisations == 0
+    assert found.work.residuals < 40
+    np.testing.assert_allclose(found.outputs[:2], expected.outputs[:2], rtol=0.08)
+    assert found.energy == pytest.approx(expected.energy, rel=0.08)
+    weights = np.array([1.0, 0.0, 0.0, 0.0])
+    cells = [solution.mesh_indicators(weights) for solution in (exact, rough)]
+    assert np.corrcoef(cells)[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("form", ["neo-hookean mixed", "mooney-rivlin"])
+def test_the_factor_of_a_reference_serves_others(form):
+    spec = loaded_body(form, outputs=PLAIN)
+    exact, found = (
+        near(spec, next(path for path in spec.scalars if path.startswith("loads.")), 1.3, way).mesh_error()
+        for way in (Way.FACTOR, Way.REFERENCE)
+    )
+    assert found.work.factorisations == 0
+    np.testing.assert_allclose(found.outputs[:3], exact.outputs[:3], rtol=0.01)
+
+
+def test_how_is_decided_by_sizes():
+    small, large = bent(), bent(cells=(40, 20, 20), degree=2)
+    assert small.mesh_error_cost().way == Way.FACTOR
+    assert large.mesh_error_cost().way == Way.SMOOTHING
+    assert large.mesh_error_cost().seconds < large.enriched().cost().textbook / 10
+    assert large.model_copy(update={"formulation": "mixed"}).mesh_error_cost().way == Way.REFERENCE
+    assert bent(cells=(12, 6, 6)).mesh_error_cost().way == Way.REFERENCE
 
 
 SCRIPT = """
 import sys
 import numpy as np
 from mpi4py import MPI
+from forward.fem.cost import Way
 from tests.bodies import OUTPUTS, loaded_body
 
 comm = MPI.COMM_WORLD
-for form in ("neo-hookean mixed", "mooney-rivlin"):
+for form in ("neo-hookean mixed", "mooney-rivlin", "demiray"):
     spec = loaded_body(form, body={"cells": (3, 2, 2)}, outputs=OUTPUTS[:4])
     model = spec.build(comm, ())
+    if form == "demiray":
+        model.enriched.way = Way.SMOOTHING
     solution = model.solve(np.zeros(0))
     error = solution.mesh_error()
     assert all(np.array_equal(error.outputs, other) for other in comm.allgather(error.outputs))
@@ -226,6 +275,9 @@ for form in ("neo-hookean mixed", "mooney-rivlin"):
 """
 
 
+SHAPES = ("neo-hookean mixed", "mooney-rivlin", "demiray")
+
+
 @pytest.mark.mpi
 def test_ranks_agree(tmp_path):
     found = []
@@ -234,7 +286,7 @@ def test_ranks_agree(tmp_path):
         folder.mkdir()
         done = run_script(ranks, SCRIPT, folder)
         assert done.returncode == 0, done.stdout + done.stderr
-        found.append([dict(np.load(folder / f"{form}.npz")) for form in ("neo-hookean mixed", "mooney-rivlin")])
+        found.append([dict(np.load(folder / f"{form}.npz")) for form in SHAPES])
     for other in found[1:]:
         for here, expected in zip(other, found[0], strict=True):
             for name, values in expected.items():
