@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,9 @@ from workflows.config.report import located
 from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
 
 DEEPEST = 32  # levels of lists and tables in a study
+LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smallest is one over the first
+MOST_LINES = 50
+_OPTIONS = "model.config"  # of another program's model, of which nothing is known
 
 
 def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Path = Path()) -> StudyKind:
@@ -43,6 +47,9 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     if _deeper_than(blocks, DEEPEST):
         message = f"lists and tables are nested too deeply, expected at most {DEEPEST} levels"
         raise StudyError(message)
+    beyond = [f"{place}: {why}" for place, value in _leaves(blocks) for why in _beyond(place, value)]
+    if beyond:
+        raise StudyError(*beyond[:MOST_LINES])
     modules = list(dict.fromkeys(dotted(blocks)))
     if modules:
         from forward.external.own_modules import make_visible
@@ -65,6 +72,19 @@ def _deeper_than(tree: Any, most: int) -> bool:
         level = [item for one in level for item in (one.values() if isinstance(one, dict) else one)]
         level = [item for item in level if isinstance(item, dict | list)]
     return bool(level)
+
+
+def _beyond(place: str, value: Any) -> Iterator[str]:
+    """Say of a number, or of those in a list, that it cannot be calculated with: its square may be none."""
+    if place.startswith(_OPTIONS):
+        return
+    if isinstance(value, list):
+        for item in value:
+            yield from _beyond(place, item)
+    elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        yield f"an integer of {value.bit_length()} bits, expected at most 63"
+    elif isinstance(value, float) and 0 < abs(value) < math.inf and not 1 / LARGEST <= abs(value) <= LARGEST:
+        yield f"{value:g} is too {'large' if abs(value) > 1 else 'small'}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}"
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -96,6 +116,9 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
         raise StudyError(message) from None
     except UnicodeDecodeError:
         message = f"{path}: not a text file in UTF-8"
+        raise StudyError(message) from None
+    except ValueError:  # of tomllib, or of a name that is no name
+        message = f"{path}: cannot be read: a number of thousands of digits, or a name with a null character"
         raise StudyError(message) from None
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
@@ -179,6 +202,9 @@ def _override(blocks: dict[str, Any], assignment: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
+    except ValueError:
+        message = f"--set {cut(assignment, 60)}: a number of thousands of digits"
+        raise StudyError(message) from None
     except RecursionError:
         message = f"--set {cut(assignment, 60)}: lists or tables are nested too deeply"
         raise StudyError(message) from None

@@ -220,3 +220,25 @@ def test_numbers_whose_powers_are_none(capsys, kind, numbers):
     given = f"parameters.density={{ kind = '{kind}', {numbers} }}"
     code = main(["check", str(CONFIGS / "beam.toml"), "--set", given])
     assert_said_plainly(code, capsys.readouterr().err, given)
+
+
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "-1e308", "5e-324", "9" * 5000, str(2**63 - 1)])
+@pytest.mark.parametrize(
+    "place",
+    ["method.samples", "method.seed", "material.D1", "loads.gravity.density", "body.size", "loads.gravity.direction"],
+)
+def test_numbers_that_are_none(capsys, place, number):
+    """Integers beyond 64 bits, and sizes of which the square is no number, in the study or on the command line."""
+    whole = place if place.startswith("method") else f"model.{place}"
+    given = f"{whole}=[{number}, 1, 1]" if place.endswith(("size", "direction")) else f"{whole}={number}"
+    code = main(["check", str(CONFIGS / "tiny.toml"), "--set", given])
+    said = capsys.readouterr().err
+    if code == 0:
+        assert number == str(2**63 - 1)
+    else:
+        assert_said_plainly(code, said, given)
+        assert len(said) < 300
+
+
+def test_names_of_files_that_are_no_names(capsys):
+    assert_said_plainly(main(["check", "a\0b"]), capsys.readouterr().err, "")
