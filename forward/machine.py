@@ -16,6 +16,7 @@ from pathlib import Path
 MIB = 2**20
 INTERRUPTED = "interrupted; the same command continues"
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}  # no room on disk, or no larger file is allowed
+IN_THE_WAY = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP, errno.EROFS, errno.EACCES}
 START = 240 * MIB  # Python with NumPy, pydantic and the buffer below
 BLAS_BUFFER = 160 * MIB  # OpenBLAS takes 128 MiB for its buffer, and tries for ever where it cannot have them
 SHARED_BY_RANKS = 4 * MIB  # file by which MPI lets ranks share memory
@@ -244,7 +245,7 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises
     ------
     StopError
-        If there is no space for it; no partial file is left.
+        If there is no space for it, or something else in its place; no partial file is left.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -256,7 +257,8 @@ def write_whole(path: Path, data: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             partial.unlink()
-        if error.errno not in FULL:
+        if error.errno not in FULL | IN_THE_WAY:
             raise
-        message = f"{path}: cannot be written: {error.strerror}; the same command continues once there is room"
+        remedy = "there is room" if error.errno in FULL else "that is mended"
+        message = f"{path}: cannot be written: {error.strerror}; the same command continues once {remedy}"
         raise StopError(message) from None

@@ -18,6 +18,10 @@ def brittle(p):
     return beam(p)
 
 
+def cube(p):
+    return p[0] ** 3
+
+
 def short(p):
     return p[:1]
 

@@ -45,8 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except (StudyError, ModelError) as error:
         return _end(str(error), BAD)
-    except (SolveError, StopError, FileNotFoundError, PermissionError) as error:
+    except (SolveError, StopError) as error:
         return _end(f"failed: {error}", FAILED)
+    except (FileNotFoundError, PermissionError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+        return _end(f"failed: {error if error.filename is None else f'{error.filename}: {error.strerror}'}", FAILED)
     except BaseException as error:
         world = _world()
         if world is not None:

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Protocol
 import h5py
 import numpy as np
 
-from forward.machine import write_whole
+from forward.machine import StopError, write_whole
 from forward.model import WORK, ModelError, Stability
 from uq.evaluation.evaluate import Evaluations, Failure
 from uq.evaluation.hdf5 import creation, image, in_memory
@@ -103,7 +103,13 @@ class Checkpoint:
 
     def save(self, key: str, block: Evaluations | Block) -> None:
         """Write a finished block and rename it into place."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            message = (
+                f"{self._folder}: cannot be made: {error.strerror}; the same command continues once that is mended"
+            )
+            raise StopError(message) from None
         note = "" if self._code is None else self._code.note()
         body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
         _write(self.path(key), body, key)

@@ -247,8 +247,12 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
             raise StopError(reason) from None
         message = f"{directory}: cannot be written: {error.strerror}"
         raise StudyError(message) from None
-    own_code.refuse_other(directory, study)
-    return _finished(directory)
+    try:
+        own_code.refuse_other(directory, study)
+        return _finished(directory)
+    except OSError as error:  # a folder where a file should be
+        message = f"{error.filename or directory}: cannot be read: {error.strerror or error}"
+        raise StudyError(message) from None
 
 
 def _keep_study(directory: Path, study: StudyKind) -> None:

@@ -15,6 +15,7 @@ from threading import Thread
 import pytest
 
 from tests.launch import ROOT, TISSUQ, environment, on_ranks, run_script
+from workflows.__main__ import main
 
 MODEL = """
 import os
@@ -360,3 +361,31 @@ def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
     assert ("finished before, nothing to do" in again.stdout) == (harm == "none")
     assert ("computed again" in again.stderr) == (harm == "cut")
     assert (out / "results.nc").read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "name", ["summary.json", "results.nc", "report.html", "evaluations.h5", "sources.json", "evaluations"]
+)
+@pytest.mark.parametrize("harm", ["folder", "file", "loop"])
+def test_what_stands_in_the_way_is_said_and_the_rest_continues(study, tmp_path, capsys, name, harm):
+    """In one line, and when it is gone the same command ends well."""
+    if harm == "file" and name != "evaluations":
+        pytest.skip("is a file")
+    study.write_text(STUDY.replace("endless.value", "tests.functions.cube").replace('["y", "z"]', '["y"]'))
+    out = tmp_path / "out"
+    command = ["run", str(study), "--out", str(out), "--quiet"]
+    assert main(command) == 0
+    (out / "summary.json").unlink()
+    thing = out / name
+    thing.unlink(missing_ok=True)
+    {"folder": thing.mkdir, "file": thing.touch, "loop": lambda: thing.symlink_to(thing)}[harm]()
+    capsys.readouterr()
+    code, said = main(command), capsys.readouterr().err
+    if code:
+        assert code in (1, 2)
+        assert len(said.splitlines()) == 1
+        assert "Traceback" not in said
+        assert str(out) in said
+        thing.rmdir() if harm == "folder" else thing.unlink()
+        assert main(command) == 0
+    assert json.loads((out / "summary.json").read_text())["status"] == "complete"
