@@ -14,8 +14,9 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from glob import iglob
 from itertools import count
 from pathlib import Path
 
@@ -234,7 +235,7 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
             elif path.is_file():
                 here = [path]
             else:
-                here = sorted(folder.glob(pattern)) if any(sign in pattern for sign in "*?[") else []
+                here = [one for one in sorted(_matching(folder, pattern)) if one.is_file()]
             if here:
                 found |= dict.fromkeys(here, True)
                 break
@@ -244,6 +245,14 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     if not any(found.values()):
         raise DataError(*missing)
     return list(found)
+
+
+def _matching(folder: Path, pattern: str) -> Iterator[Path]:
+    """Find what a pattern means, in a folder where it does not say in full where."""
+    if "\0" not in pattern and any(sign in pattern for sign in "*?["):
+        # pathlib takes no pattern that begins with the root
+        for found in iglob(pattern, root_dir=folder, recursive=True, include_hidden=True):  # noqa: PTH207
+            yield folder / found
 
 
 def distinct(paths: Sequence[Path]) -> list[str]:

@@ -47,6 +47,13 @@ if TYPE_CHECKING:
 SOLVES_OF_FIELD = 12  # for a mode
 
 
+def _digest(path: Path) -> str:
+    try:
+        return sha256(path.read_bytes()).hexdigest()[:16]
+    except OSError:  # it is not there, or cannot be read: then it is refused
+        return ""
+
+
 class InversionStudy(StudyKind):
     """What inversions of all kinds of models have in common.
 
@@ -204,8 +211,7 @@ class InversionStudy(StudyKind):
             except DataError as error:
                 measurement, wrong = None, "; ".join(error.args)
                 lines += [f"data: {line}" for line in error.args]
-            digest = sha256(path.read_bytes()).hexdigest()[:16] if path.is_file() else ""
-            sets.append(DataSet(name=name, file=path.name, digest=digest, refused=wrong))
+            sets.append(DataSet(name=name, file=path.name, digest=_digest(path), refused=wrong))
             found.append(measurement)
         if all(measurement is None for measurement in found):
             raise StudyError(*lines)

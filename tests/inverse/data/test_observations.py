@@ -32,6 +32,24 @@ def table(tmp_path):
     return write
 
 
+def test_patterns_say_files_also_in_full(tmp_path):
+    """From the root on, in folders below, in a folder whose name looks like a pattern; folders are no files."""
+    place = tmp_path / "[a]*"
+    for name in ("1.csv", "2.csv", "below/3.csv", ".4.csv"):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).touch()
+    for pattern, names in (
+        (f"{tmp_path}/*/?.csv", ["1", "2"]),
+        ("?.csv", ["1", "2"]),
+        ("**/*.csv", [".4", "1", "2", "3"]),
+        ("*/3*", ["3"]),
+    ):
+        assert [path.stem for path in files([pattern], [place])] == names
+    for pattern in ("*/", "below*", "*" * 200, "a\0*", "/", "[", "~"):
+        with pytest.raises(DataError, match="no such file"):
+            files([pattern], [tmp_path / "none"])
+
+
 def test_different_files_have_different_names():
     """Results, and what is kept of solves, are by these."""
     for paths, names in (

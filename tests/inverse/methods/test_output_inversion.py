@@ -135,6 +135,12 @@ def test_tables_are_data_sets_side_by_side(folder):
     assert "All data sets" in (folder / "batch" / "report.html").read_text()
 
 
+def test_a_file_that_cannot_be_read_is_refused_alone(folder):
+    """One that is there, and neither a folder nor text."""
+    found = load(folder / "stated.toml", ["data={files=['/proc/self/mem', 'data/one.csv'], noise={relative=0.1}}"])
+    assert [bool(one.refused) for one in found.data.sets] == [True, False]
+
+
 def test_files_of_one_name_in_different_folders_are_different_data(folder):
     """In all that is called after a data set: results, rows, solves that are kept."""
     for place, name in (("monday", "one"), ("tuesday", "two")):
