@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
 
-# One thread per rank: ranks are the parallelism, and threads of BLAS would fight them for the cores.
+# One thread per rank: ranks are the parallelism, and BLAS threads would compete with them for the cores.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -70,7 +70,7 @@ def _end(text: str, code: int) -> int:
 
 
 def _say(text: str) -> None:
-    """Print errors once, on the first rank of the job, a line each."""
+    """Print errors once, on the first rank of the job, one line each."""
     from forward.settings import one_line
 
     if next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0":
@@ -78,7 +78,7 @@ def _say(text: str) -> None:
 
 
 def _world() -> Any:
-    """Return all ranks of the job, or None where this process is the only one."""
+    """Return all ranks of the job, or None if this process is the only one."""
     mpi = sys.modules.get("mpi4py.MPI")
     return None if mpi is None or mpi.COMM_WORLD.size == 1 else mpi.COMM_WORLD
 
@@ -101,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     check = commands.add_parser("check", help="validate a study and print what it will cost")
     run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
-    report = commands.add_parser("report", help="build the report of results again; several are compared side by side")
+    report = commands.add_parser("report", help="rebuild the report of results; several are compared side by side")
     serve = commands.add_parser("serve", help="serve the model of a study to other programs by UM-Bridge")
     init = commands.add_parser("init", help="print a commented starter study")
     for command in (check, run, serve):
@@ -115,11 +115,11 @@ def _parser() -> argparse.ArgumentParser:
         )
     run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
     run.add_argument(
-        "--quiet", action="store_true", help="print nothing but errors and, off the terminal, progress once a minute"
+        "--quiet", action="store_true", help="print only errors and, off the terminal, progress once a minute"
     )
     run.add_argument("--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it")
     serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
-    serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 takes requests of other machines too")
+    serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts requests from other machines too")
     serve.add_argument("--quiet", action="store_true", help="print nothing but errors")
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")

@@ -1,6 +1,6 @@
-"""The way of requests to a server: what is read of a client, for how long, and from whom.
+"""How requests reach the server: what is read from a client, for how long, and from whom.
 
-Everything that is refused is answered by one line of JSON, in the form of UM-Bridge.
+Refusals are answered by one line of JSON, in the form of UM-Bridge.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
-SECONDS_TO_SEND = 30.0  # in which a client has to send its whole request, and to take the answer
+SECONDS_TO_SEND = 30.0  # within which a client must send its whole request and take the answer
 LARGEST = 16 * 2**20  # bytes of a request
 DEEPEST = 32  # levels of lists and tables in a request
 MOST_WAITING = 1024  # requests that wait to be answered
 
 
 class RefusalError(Exception):
-    """A request that cannot be answered: the kind of error in the words of the protocol, and what is wrong."""
+    """A request that cannot be answered: the kind of error, in the protocol's words, and what is wrong."""
 
     def __init__(self, kind: str, message: str, status: int = 400) -> None:
         super().__init__(message)
@@ -37,7 +37,7 @@ Ask = Callable[[str, dict[str, Any]], dict[str, Any]]  # what, with which fields
 
 
 class _Deadline(io.RawIOBase):
-    """What comes from a socket until some time."""
+    """What arrives from a socket before a deadline."""
 
     def __init__(self, connection: socket.socket, seconds: float) -> None:
         self._connection, self._until = connection, time.monotonic() + seconds
@@ -59,7 +59,7 @@ class Handler(BaseHTTPRequestHandler):
     server: Server
 
     def setup(self) -> None:
-        """Give the client a time to send its request in."""
+        """Set the client's time limit for sending its request."""
         super().setup()
         self._unread = True
         self.rfile = io.BufferedReader(_Deadline(self.connection, SECONDS_TO_SEND))
@@ -115,7 +115,7 @@ class Handler(BaseHTTPRequestHandler):
             self._linger()
 
     def _linger(self) -> None:
-        """Read on for a moment: a connection that is closed with unread bytes takes the answer with it."""
+        """Read on for a moment: closing a connection with unread bytes would discard the answer."""
         self.wfile.flush()
         with contextlib.suppress(OSError):
             self.connection.shutdown(socket.SHUT_WR)
@@ -124,17 +124,17 @@ class Handler(BaseHTTPRequestHandler):
                 pass
 
     def _check_origin(self) -> None:
-        """Refuse what the page of a browser asks, also under a name that was made to stand for this host."""
+        """Refuse requests from browser pages, also under a name that was made to point to this host."""
         host, origin = self.headers.get("Host"), self.headers.get("Origin")
         if self.server.local and host is not None and not _is_local(host, self.server.called):
-            message = f"Host: {host[:80]!r}, expected localhost: this server answers this machine only"
+            message = f"Host: {host[:80]!r}, expected localhost: this server answers only this machine"
             raise RefusalError("Forbidden", message, 403)
         if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
-            message = f"Origin: {origin[:80]!r}, expected none: this server answers no pages of browsers"
+            message = f"Origin: {origin[:80]!r}, expected none: this server does not answer browser pages"
             raise RefusalError("Forbidden", message, 403)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Say what is wrong with the head of a request."""
+        """Say what is wrong with the header of a request."""
         del explain
         body = json.dumps({"error": {"type": "InvalidInput", "message": message or HTTPStatus(code).phrase}}).encode()
         self.send_response_only(code)
@@ -144,7 +144,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of single requests."""
+        """Do not log single requests."""
 
 
 class Server(ThreadingHTTPServer):
@@ -158,9 +158,7 @@ class Server(ThreadingHTTPServer):
         Answers a request, given what it asks and its fields.
     """
 
-    request_queue_size = (
-        MOST_WAITING  # the system's own bound is often lower: connections that it drops are tried again
-    )
+    request_queue_size = MOST_WAITING  # the system's own limit is often lower: clients retry dropped connections
     daemon_threads = True
 
     def __init__(self, host: str, port: int, ask: Ask) -> None:
@@ -171,7 +169,7 @@ class Server(ThreadingHTTPServer):
         self.local = ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, if there are not too many of these."""
+        """Answer in a separate thread, if there are not too many of these."""
         if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
@@ -185,7 +183,7 @@ class Server(ThreadingHTTPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say what went wrong in a line, unless the client has just left."""
+        """Say in a line what went wrong, unless the client has just disconnected."""
         error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
         if not isinstance(error, ConnectionError | TimeoutError):
             sys.stderr.write(f"a request was not answered: {type(error).__name__}: {error}\n")
@@ -197,7 +195,7 @@ def parsed(body: bytes) -> dict[str, Any]:
     Raises
     ------
     RefusalError
-        If it is no JSON object, is nested too deeply, or holds numbers that are none.
+        If it is not a JSON object, is nested too deeply, or holds invalid numbers.
     """
 
     def refuse(word: str) -> float:
@@ -218,7 +216,7 @@ def parsed(body: bytes) -> dict[str, Any]:
 
 
 def nesting(body: bytes) -> int:
-    """Return a bound of how deep lists and tables of a JSON text are nested; brackets in strings count too."""
+    """Return a bound on the nesting of lists and tables in a JSON text; brackets in strings count too."""
     deepest = level = 0
     for byte in body.translate(None, delete=bytes(set(range(256)) - set(b"[]{}"))):
         level += 1 if byte in b"[{" else -1
@@ -227,7 +225,7 @@ def nesting(body: bytes) -> int:
 
 
 def _is_local(host: str, called: str) -> bool:
-    """Whether the name in a header, with or without a port, is one of this machine for itself."""
+    """Whether the name in a header, with or without a port, is a local name of this machine."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
     except ValueError:

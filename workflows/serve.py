@@ -46,7 +46,8 @@ class Service:
     Parameters
     ----------
     study
-        Whose model it is; its distributions say only where the solver starts from and how large a difference is.
+        The study whose model is served; its distributions only determine where the solver starts and how large a
+        difference is.
     """
 
     def __init__(self, study: Study) -> None:
@@ -173,7 +174,7 @@ class Service:
 
 
 class _Solver:
-    """A model, started at the tangent at the mean parameters where that is possible."""
+    """A model whose solves start from the tangent at the mean parameters, if possible."""
 
     def __init__(self, study: Study, spec: Any) -> None:
         from mpi4py import MPI
@@ -197,7 +198,7 @@ class _Solver:
         return self._last[1]
 
     def exactly_at(self, point: FloatArray) -> Solution:
-        """Solve so that derivatives come from a factor of their own."""
+        """Solve such that derivatives come from a separate factor."""
         return self.model.solve(point, None if self._guess is None else replace(self._guess(point), reference=None))
 
 
@@ -230,9 +231,9 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
     Parameters
     ----------
     study
-        The study; its method takes no part.
+        The study; its method is not used.
     port, host
-        Where requests are taken: port 0 is any free one, host 0.0.0.0 takes those of other machines too.
+        Where requests are accepted: port 0 is any free one, host 0.0.0.0 also accepts those of other machines.
     quiet
         Print nothing.
 
@@ -283,7 +284,7 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
                 job.future.set_exception(refusal)
             except ModelError as error:
                 job.future.set_exception(RefusalError("ModelError", str(error), 500))
-            except Exception as error:  # the next request may do better
+            except Exception as error:  # the next request may succeed
                 traceback.print_exc()
                 job.future.set_exception(RefusalError(type(error).__name__, str(error), 500))
             answered += 1
@@ -299,7 +300,7 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
 
 
 class _Job(NamedTuple):
-    """A request on its way to the thread that solves."""
+    """A request on its way to the solving thread."""
 
     future: Future[dict[str, Any]]
     what: str

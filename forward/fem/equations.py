@@ -63,9 +63,8 @@ class Discretisation(Linearisation):
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
         external = np.zeros(self.size) if self._proportional else self._forces_at_rest()
-        with np.errstate(
-            invalid="ignore"
-        ):  # a load that is not finite has no finite residual, which the solver reports
+        # A load that is not finite has no finite residual, which the solver reports.
+        with np.errstate(invalid="ignore"):
             for path, force in self._unit_loads.items() if self._proportional else ():
                 external += self._values.get(path, 1.0) * force
         self._external = self.norm(external)

@@ -1,1 +1,1 @@
-"""What makes a posterior doubtful, and what several models say together."""
+"""What makes a posterior doubtful, and comparisons of several models."""

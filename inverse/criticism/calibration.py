@@ -1,9 +1,9 @@
-"""Simulation-based calibration: whether a posterior of few parameters says of the truth what it should.
+"""Simulation-based calibration: whether posteriors of few parameters are right about the truth.
 
-Parameters are drawn from their prior and measured with noise. The probability that the posterior of such data gives to
-what lies below the truth is uniform on [0, 1], for every parameter, if the posterior is right (S. R. Cook, A. Gelman,
+Parameters are drawn from their prior and measured with noise. The posterior probability of values below the truth is
+uniform on [0, 1], for every parameter, if the posterior is right (S. R. Cook, A. Gelman,
 D. B. Rubin, J. Comput. Graph. Stat. 15 (2006) 675–692; S. Talts et al., arXiv:1804.06788): too many near both ends
-where it is too narrow, in the middle where it is too wide, at one end where it is shifted.
+if it is too narrow, in the middle if it is too wide, at one end if it is biased.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Kind = Literal["laplace", "corrected"]
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Where the truth stood in the posteriors of n specimens; NaN rows where one was not found.
+    """Ranks of the truth in the posteriors of n specimens; NaN rows where no posterior was found.
 
     Attributes
     ----------
@@ -38,13 +38,13 @@ class Calibration:
     truths
         Physical parameters (n, c), and the noise where it is unknown.
     laplace, corrected
-        Probabilities (n, c) of what lies below the truth, by Laplace's Gaussian and by weighted points.
+        Probabilities (n, c) of values below the truth, by Laplace's Gaussian and by weighted points.
     ess, pareto_k
-        Effective number (n,) of the points, and k̂ (n,) of their weights.
+        Effective sample sizes (n,), and k̂ (n,) of the weights.
     trusted
-        Whether (n,) the weights are worth what they say.
+        Whether (n,) the weights can be trusted.
     failures
-        Why specimens have no posterior, by their number.
+        Why specimens have no posterior, by number.
     """
 
     names: tuple[str, ...]
@@ -68,7 +68,7 @@ class Calibration:
         return np.array([kstest(column, "uniform").pvalue for column in self.found(kind).T])
 
     def probability(self, kind: Kind) -> float:
-        """The same of all coordinates together: the smallest, times their number (C. Bonferroni)."""
+        """The same for all coordinates together: the smallest, times their number (C. Bonferroni)."""
         return float(min(1.0, len(self.names) * self.probabilities(kind).min()))
 
     def counts(self, kind: Kind, bins: int = BINS) -> NDArray[np.int64]:
@@ -81,7 +81,7 @@ class Calibration:
         return np.asarray((np.abs(self.found(kind) - 0.5) <= level / 2).mean(axis=0))
 
     def dataset(self, bins: int = BINS) -> xr.Dataset:
-        """Return everything that a picture needs."""
+        """Return everything that a plot needs."""
         import xarray as xr
 
         kinds: tuple[Kind, Kind] = ("laplace", "corrected")
@@ -114,7 +114,7 @@ def calibrate(
     Parameters
     ----------
     posterior
-        Of which the data are replaced by those of each specimen.
+        A posterior whose data are replaced by those of each specimen.
     specimens
         Their number n.
     samples
@@ -166,8 +166,8 @@ def rank_by_laplace(gaussian: Laplace, x: FloatArray) -> FloatArray:
 def rank_by_weights(found: Evidence, x: FloatArray, tie: FloatArray) -> FloatArray:
     """Probabilities (c,) that weighted points give to coordinates below x (c,).
 
-    The truth is one more draw: among m draws that are as good, its rank is uniform on 0 … m, so that what is uniform on
-    [0, 1] is (m P + u)/(m + 1), with m the effective number of points and uniform numbers u (c,).
+    The truth is one more draw: among m equivalent draws, its rank is uniform on 0 … m, so that (m P + u)/(m + 1) is
+    uniform on [0, 1], with m the effective sample size and uniform numbers u (c,).
     """
     share = found.weights @ (found.density.x < x)
     return np.asarray((found.ess * share + tie) / (found.ess + 1))

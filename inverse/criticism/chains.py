@@ -1,4 +1,4 @@
-"""Markov chains and weighted samples that check a Gaussian where it may fail, and what they say of it.
+"""Markov chains and weighted samples that check a Gaussian where it may fail, and the verdict on it.
 
 A chain whose proposals are reversible with respect to Laplace's Gaussian N(x̂, LLᵀ), x = x̂ + Lz with
 
@@ -12,8 +12,8 @@ Gaussian (J. Goodman, J. Weare, Comm. Appl. Math. Comp. Sci. 5 (2010) 65–80; e
 Astron. Soc. Pac. 125 (2013) 306–312). R̂ and effective sample sizes are ArviZ's (A. Vehtari et al., Bayesian Anal. 16
 (2021) 667–718).
 
-For fields the Gaussian alone misses what is of second order in the many directions that the data hardly see: together
-they change what the data see well by more than the noise (a field that varies is softer in the mean than a constant
+For fields the Gaussian alone misses second-order effects of the many directions that the data hardly see: together
+they change well-determined quantities by more than the noise (a field that varies is softer in the mean than a constant
 one). So the L above is bent: with the part w of Lz in the directions U of λ ≤ 30, and the residual r of a solve at ξ̂+w,
 
     x = ξ̂ + w + U_s (a(w) + (I+Λ_s)^{−1/2} z_s),   a(w) = −(I+Λ_s)⁻¹ (A_sᵀ r + ξ̂_s),
@@ -22,7 +22,7 @@ the strong directions s follow by a step of Gauss–Newton. As a depends on w al
 of L, and all formulas stay as they are; for linear models a = 0. Samples x of independent z have the weights w ∝
 exp(ℓ(x) + ½|z|²), and the mean of these is the evidence.
 
-Chains and weighted samples share proposals, diagnostics and the verdict, and so one file.
+Chains and weighted samples share proposals, diagnostics and the verdict, hence one file.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from inverse.low_dimensional.posterior import Posterior
 if TYPE_CHECKING:
     import xarray as xr
 
-ACCEPTED = 0.3  # share of proposals that β aims at during the burn-in
+ACCEPTED = 0.3  # acceptance rate for which β is tuned during the burn-in
 FIRST_STEP = 0.5  # β at its start
 STRONG = 30.0  # λ of the directions of a field that follow the others
 DRAWS = 6  # of the Gaussian of a field, for the screen of stability
 SPREAD = 1.3  # of the starts of chains, in standard deviations of the Gaussian
 WIDER = 1.2  # standard deviations of the Gaussian of weighted points, over those of the points
-MIXED = 1.01  # R̂ up to which chains say the same
-INDEPENDENT = 400.0  # effective draws from which on R̂ and quantiles mean something
+MIXED = 1.01  # R̂ up to which chains agree
+INDEPENDENT = 400.0  # effective sample size from which R̂ and quantiles are meaningful
 
 Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Map = Callable[[FloatArray], FloatArray]
@@ -65,7 +65,7 @@ Map = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Lengths:
-    """How many chains there are, draws that are kept of each, steps before these, and steps for a draw."""
+    """Number of chains, draws kept from each, burn-in steps, and steps per draw."""
 
     chains: int
     draws: int
@@ -83,7 +83,7 @@ FIELD = Lengths(2, 1000, 200, 1)
 
 
 def walkers(size: int) -> Lengths:
-    """Lengths of an ensemble for so many unknowns: few walkers that go far, else no chain is long enough to judge."""
+    """Lengths of an ensemble for so many unknowns: few long walks, since short chains cannot be judged."""
     return Lengths(max(8, 2 * size), 800, 400, 5)
 
 
@@ -121,12 +121,12 @@ class Chains:
 
     @cached_property
     def ess_bulk(self) -> FloatArray:
-        """Effective number (k,) of draws, for the bulk."""
+        """Effective sample sizes (k,) for the bulk."""
         return self._diagnosed(_arviz().ess)
 
     @cached_property
     def ess_tail(self) -> FloatArray:
-        """Effective number (k,) of draws, for the quantiles of 5 and 95 %."""
+        """Effective sample sizes (k,) for the quantiles of 5 and 95 %."""
         return self._diagnosed(lambda dataset: _arviz().ess(dataset, method="tail"))
 
     def _diagnosed(self, diagnose: Callable[[Any], Any]) -> FloatArray:
@@ -137,12 +137,12 @@ class Chains:
 
     @property
     def mixed(self) -> bool:
-        """Whether all chains say the same, of enough draws."""
+        """Whether all chains agree, with enough draws."""
         return bool(self.rhat.max() <= MIXED and self.ess >= INDEPENDENT)
 
     @property
     def ess(self) -> float:
-        """Smallest effective number of draws of all quantities, for bulk and tails."""
+        """Smallest effective sample size over all quantities, for bulk and tails."""
         return float(min(self.ess_bulk.min(), self.ess_tail.min()))
 
     @property
@@ -208,7 +208,7 @@ def crank_nicolson(
 
     z = SPREAD * normals()
     x, here = place(z)
-    for _ in range(burn):  # starts beyond what can be solved come nearer
+    for _ in range(burn):  # starts at which the model has no answer are moved closer
         lost = ~np.isfinite(here)
         if not lost.any():
             break
@@ -228,7 +228,7 @@ def crank_nicolson(
         z, x = np.where(taken[:, None], moved, z), np.where(taken[:, None], x_moved, x)
         here = np.where(taken, there, here)
         if step < 0:
-            # One β for all chains; smaller and smaller changes, none after the burn-in.
+            # One β for all chains, with decreasing changes, and none after the burn-in.
             odds = float(np.clip(odds + 3 * (chance.mean() - ACCEPTED) / np.sqrt(step + burn + 1), -7, 7))
             continue
         accepted += taken
@@ -255,10 +255,10 @@ def chains_of_few(
     posterior
         What is sampled.
     around
-        Laplace's Gaussian, or weighted points, of which the mean and the covariance (made a little wider) are taken:
-        where the posterior is curved, Laplace's is too narrow, and chains stick in its tails.
+        Laplace's Gaussian, or weighted points, whose mean and (slightly widened) covariance are used: if the posterior
+        is curved, Laplace's is too narrow, and chains get stuck in its tails.
     lengths, seed
-        As of `crank_nicolson`.
+        As in `crank_nicolson`.
     """
     if isinstance(around, Laplace):
         centre, root = around.mode, around.root
@@ -344,7 +344,7 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
     pairs = found.spectrum
     slopes = mode.solution.state_tangent(found.directions)
     state = np.array(mode.solution.state)
-    # Where the samples go is what the screen of stability has to know.
+    # The screen of stability must know where the samples go.
     draws = pairs.root(np.random.default_rng(0).standard_normal((DRAWS, len(mode.whitened))))
     reference = ReferenceSolution(mode.values, state, mode.posterior.prior.root(draws))
     strong = pairs.values > STRONG
@@ -406,22 +406,22 @@ class FieldWeights:
 
     @property
     def ess(self) -> float:
-        """Effective number of samples."""
+        """Effective sample size."""
         return effective_sample_size(self.weights)
 
     @property
     def share(self) -> float:
-        """That, of the number of samples."""
+        """Effective sample size over the number of samples."""
         return self.ess / len(self.log_weights)
 
     @property
     def pareto_k(self) -> float:
-        """Shape k̂ of the largest weights; infinite where there are too few to say."""
+        """Shape k̂ of the largest weights; infinite if there are too few."""
         return pareto_shape(self.weights)
 
     @property
     def trusted(self) -> bool:
-        """Whether the weights are worth what they say."""
+        """Whether the weights can be trusted."""
         return trustworthy(self.pareto_k, self.ess, len(self.log_weights))
 
     @property
@@ -457,13 +457,13 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
 
 # --- what they say ---------------------------------------------------------------------------------------------------
 
-SHIFT = 0.25  # of the mean from the mode, in standard deviations, that is tolerated of Laplace's Gaussian
-WIDTH = 0.2  # relative difference of standard deviations that is
+SHIFT = 0.25  # distance of the mean from the mode, in standard deviations, tolerated for Laplace's Gaussian
+WIDTH = 0.2  # relative difference of standard deviations tolerated
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What of a posterior is to be trusted, and why.
+    """Which posterior can be trusted, and why.
 
     Attributes
     ----------
@@ -527,7 +527,7 @@ def verdict_on_field(
     test
         Of the residuals.
     chains
-        What was judged of chains, and `values` (n, N), the values of the field that they drew.
+        Judged chains, and `values` (n, N), the values of the field that they drew.
     """
     objection = _objection(mode.converged, test)
     if objection is not None:
@@ -551,7 +551,7 @@ def verdict_on_field(
 
 def _compared(gaussian: LowRankPosterior, mean: FloatArray, std: FloatArray, ess: float, worth: str) -> Verdict:
     """Compare the Gaussian with means and standard deviations (N,) by so many effective samples."""
-    # Root mean squares over the vertices, less what as few samples would give by chance.
+    # Root mean squares over the vertices, minus what so few samples would give by chance.
     chance = 1 / ess
     shift = np.sqrt(max(float((((mean - gaussian.mean) / gaussian.std) ** 2).mean()) - chance, 0.0))
     width = float(np.sqrt((std**2).mean() / (gaussian.std**2).mean()))

@@ -1,17 +1,17 @@
-"""What evidences, posteriors and residuals of several models say together.
+"""Comparison of several models by their evidences, posteriors and residuals.
 
-That one model is the most probable does not make it good. For that, the residuals r of each model are compared with
-those that it would have if it were true: their squares Σr² ~ χ², and their correlation between neighbours of a test, Σ
+The most probable model need not be a good one. So the residuals r of each model are compared with those that it would
+have if it were true: their squares Σr² ~ χ², and their correlation between neighbours of a test, Σ
 r_i r_j/Σ r² over pairs of them (`inverse.data.neighbours`), whose distribution for independent errors is drawn once.
 Both are posterior predictive probabilities (A. Gelman, X.-L. Meng, H. Stern, Stat. Sinica 6 (1996) 733–807); the second
-one says something even where the size of the noise was inferred.
+one is informative even if the size of the noise was inferred.
 
 Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i) (A. Vehtari, A. Gelman, J. Gabry, Stat.
 Comput. 27 (2017) 1413–1432), or whole tests t, by ln p(y_t | other tests) = ln Z − ln Z without t: data of one test
-follow one another, so that one of them left out alone is no surprise. Averaged predictions have the variance Σ P_k V_k
+follow one another, so that a single one left out is no surprise. Averaged predictions have the variance Σ P_k V_k
 within models and Σ P_k (μ_k − μ)² between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
 
-Probabilities, averages and tests of residuals share this file because each is read off the same weighted draws.
+Probabilities, averages and residual tests share this file because all come from the same weighted draws.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ Pair = tuple[str, str]  # candidate and group
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model that may be the right one.
+    """A candidate model.
 
     Attributes
     ----------
     inputs
         Its parameters.
     weight
-        π, its probability before the data, up to a common factor.
+        π, its prior probability, up to a common factor.
     """
 
     inputs: Inputs
@@ -59,20 +59,20 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Data:
-    """What was measured of one specimen, and what else is to be predicted.
+    """The measurements of one specimen, and what else is to be predicted.
 
     Attributes
     ----------
     values
         y (m,), the first m outputs of the model.
     sigma
-        Their standard deviations (m,), where they are known.
+        Their standard deviations (m,), if known.
     tests
         Name of the test of each output (M,).
     at
         Where in the test (M,).
     places
-        Where the data are, (m, k), in the space in which they stand beside each other; by default `at`.
+        Positions (m, k) of the data in the space in which neighbours are found; by default `at`.
     kinds
         Numbers (m,) of what can be compared; by default of the tests.
     """
@@ -86,7 +86,7 @@ class Data:
 
     @property
     def sorted(self) -> tuple[NDArray[np.intp], FloatArray, NDArray[np.int64]]:
-        """Numbers (m,) of the data in an order that is not that of the rows, and their places and kinds in it."""
+        """Numbers (m,) of the data in an order independent of the rows, and their places and kinds in it."""
         m = self.values.size
         places = self.at[:m, None] if self.places is None else self.places
         kinds = np.unique(self.tests[:m], return_inverse=True)[1] if self.kinds is None else self.kinds
@@ -115,7 +115,7 @@ class Criticism:
     misfit
         Posterior predictive probability of residuals as large as these, or larger.
     correlation
-        The same of neighbours that agree as much.
+        The same for neighbours that agree as much.
     """
 
     scores: FloatArray
@@ -127,7 +127,7 @@ class Criticism:
 
 
 def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
-    """Compare the residuals of a model with what it says of them."""
+    """Compare the residuals of a model with its predictions of them."""
     from scipy.stats import chi2
 
     w, density = found.weights, found.density
@@ -177,7 +177,7 @@ def comparison(
     left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
     meshes: Mapping[Pair, Moved],
 ) -> xr.Dataset:
-    """Put everything that is known of the candidates into a dataset.
+    """Collect everything that is known about the candidates in a dataset.
 
     Parameters
     ----------
@@ -186,13 +186,13 @@ def comparison(
     posteriors, stated
         What was found, by candidate and group.
     variants
-        ln Z and error by the name of the variant, the study as it is first.
+        ln Z and error by the name of the variant, beginning with the study as it is.
     checks
-        ln Z and error by nested sampling, if it was asked for.
+        ln Z and error by nested sampling, if requested.
     left_out
-        ln Z and error without each test, if they were asked for.
+        ln Z and error without each test, if requested.
     meshes
-        What a finer mesh would do, if that was looked at.
+        Effect of a finer mesh, if checked.
     """
     import xarray as xr
 

@@ -1,6 +1,6 @@
-"""What makes a posterior doubtful: its distance from the prior, ends of ranges, noise, strange data, the mesh.
+"""What makes a posterior doubtful: its distance from the prior, ends of ranges, noise, outliers, the mesh.
 
-Each function returns doubts: findings with a few words for the verdict. None of them solves anything.
+Each function returns doubts: findings with a few words for the verdict. None of them needs a solve.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import numpy as np
 from forward.model import FloatArray, Severity
 from uq.inputs.distributions import Distribution
 
-FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre that are a warning, an error
-UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance that are
+FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
+UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance for a warning, an error
 END, CROWDED = (
     0.02,
     5.0,
 )  # share of the prior at an end of a range, and how many times that share the posterior has there
 NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
-NOTHING_SEEN = 0.5  # size of the errors over that of the data from which on the model explains nothing
-STRANGE = 0.01  # probability that any datum of all is as far out as one that does not belong
+NOTHING_SEEN = 0.5  # size of the errors over that of the data above which the model explains nothing
+STRANGE = 0.01  # probability that any of all data is as far out as an outlier
 LISTED = 5
-LINEAR = 2.0  # deviations of the posterior up to which a shift of ln Z to first order is about right
+LINEAR = 2.0  # posterior deviations up to which a first-order shift of ln Z is about right
 MOVED = 1.0  # by which a finer mesh moves ln Z, "not worth more than a bare mention" (Kass and Raftery 1995)
 BIASED, WRONG = (
     0.5,
@@ -33,7 +33,7 @@ GRID = np.linspace(-40.0, 40.0, 8001)
 
 
 class Doubt(NamedTuple):
-    """A finding, and what a verdict says of it."""
+    """A finding, and its wording in a verdict."""
 
     severity: Severity
     text: str
@@ -57,8 +57,8 @@ def far_from_prior(
     mode, mean
         Of the posterior (d,).
     square, degrees
-        Squared distance of the mode from the centre in the directions that the data tell, over what is expected of it,
-        and their number: of χ² where the truth is drawn from the prior.
+        Squared distance of the mode from the centre in the directions that the data determine, over its expectation,
+        and their number: χ² distributed if the truth is drawn from the prior.
     """
     from scipy.special import chdtrc
 
@@ -88,7 +88,7 @@ def far_from_prior(
 
 
 def at_an_end(priors: Mapping[str, Distribution], mode: FloatArray, draws: FloatArray) -> list[Doubt]:
-    """Doubt parameters at an end of a bounded range, by name: of the mode (d,) or of draws (n, d) of the posterior."""
+    """Doubt parameters at an end of a bounded range, by name, from the mode (d,) or draws (n, d) of the posterior."""
     from scipy.special import ndtr
 
     found = []
@@ -131,7 +131,7 @@ def noise_far(factor: float, expected: float, sigma: FloatArray, values: FloatAr
 
 
 def too_large_errors(square: float, degrees: float, probability: float) -> list[Doubt]:
-    """Doubt stated errors that residuals are far smaller than."""
+    """Doubt stated errors that are far larger than the residuals."""
     factor = float(np.sqrt(square / degrees)) if degrees > 0 else 1.0
     if factor < 1 / NOISE_FAR and probability > 1 - STRANGE:
         text = f"residuals are {factor:.2g} times the stated errors: those are too large, and intervals too wide"
@@ -145,7 +145,7 @@ REMEDY = 'or allow for them: data.errors = { kind = "student-t" }'
 def strangers(
     residual: FloatArray, resolution: FloatArray, labels: Sequence[str], *, heavy: bool, remedy: str = REMEDY
 ) -> list[Doubt]:
-    """Doubt data that do not belong to the others.
+    """Doubt outliers among the data.
 
     Parameters
     ----------
@@ -156,9 +156,9 @@ def strangers(
     labels
         What each datum is.
     heavy
-        Whether heavy tails of the errors were allowed for already: then it is a note.
+        Whether heavy tails of the errors are allowed for already: then it is a note.
     remedy
-        What may be done beside looking at them.
+        What can be done besides looking at them.
     """
     from scipy.special import log_ndtr
 
@@ -187,18 +187,18 @@ ADVICE = "take a finer one, or thinner cells at held faces (body.grading)"
 def mesh_too_coarse(
     looked: bool, why: str, error: FloatArray, shifts: Mapping[str, float], nodes: FloatArray
 ) -> list[Doubt]:
-    """Doubt the mesh, by what a finer one says.
+    """Doubt the mesh, judging by a finer one.
 
     Parameters
     ----------
     looked
         Whether there was a solve on a finer mesh, or else `why` not.
     error
-        What it adds to the data (n,), over the noise.
+        What it adds to the predicted data (n,), over the noise.
     shifts
-        What that does to unknowns, by name, over their posterior deviations.
+        The resulting shifts of unknowns, by name, over their posterior deviations.
     nodes
-        The same of a field at the vertices (N,), or None.
+        The same for a field at the vertices (N,), or None.
     """
     if not looked:
         return [Doubt("warning", f"not checked for the mesh: {why}", "not checked for the mesh")]
@@ -220,16 +220,16 @@ def mesh_too_coarse(
 def meshes_too_coarse(
     log_evidence: Mapping[str, float], added: Mapping[str, float], shifts: Mapping[str, float]
 ) -> list[Doubt]:
-    """Doubt the meshes of candidates, by what finer ones do to their evidences.
+    """Doubt the meshes of candidates, judging by the effect of finer ones on their evidences.
 
     Parameters
     ----------
     log_evidence
         With the prior odds, by name.
     added
-        What a finer mesh adds to that, to first order; NaN where it is not known, and then zero.
+        What a finer mesh adds to that, to first order; NaN where unknown, which counts as zero.
     shifts
-        The largest shift of an unknown by it, in deviations of the posterior.
+        The resulting largest shift of an unknown, in posterior deviations.
     """
     known = {name: change for name, change in added.items() if np.isfinite(change)}
     if not known:
@@ -254,7 +254,7 @@ def certain(change: Any, shift: Any) -> Any:
 
 
 def change_in_words(change: float, shift: float) -> str:
-    """Write a change of ln Z that is known to first order, given the largest shift of an unknown (deviations)."""
+    """Write a first-order change of ln Z, given the largest shift of an unknown (posterior deviations)."""
     if abs(shift) <= LINEAR:
         return f"about {change:+.2g}"
     return (

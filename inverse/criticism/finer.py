@@ -1,4 +1,4 @@
-"""What a finer mesh would do to data, unknowns and evidence: from one solve on it, at the mode.
+"""The effect of a finer mesh on data, unknowns and evidence, from one solve on it at the mode.
 
 With δ, what that solve adds to the outputs ψ at the mode x̂, the model is y = ψ + δ + A(x − x̂) + e. Where the posterior
 is a Gaussian of covariance H⁻¹, its mode moves by −H⁻¹Aᵀδ (data over the errors). With e₀ = y − ψ + A x̂ and errors of
@@ -6,7 +6,7 @@ scale s, the evidence of the linear model is in closed form,
 
     −2 ln Z(s) = (e₀ − δ)ᵀ (s²I + AAᵀ)⁻¹ (e₀ − δ) + ln det(s²I + AAᵀ),
 
-and so is what δ adds to it; a size of the errors that is unknown is integrated out (C. E. Rasmussen, C. K. I. Williams,
+and so is the change due to δ; an unknown size of the errors is integrated out (C. E. Rasmussen, C. K. I. Williams,
 Gaussian Processes for Machine Learning (2006), section 2.1). At s = 1 the change is −r·δ − ½ δᵀ(I − AH⁻¹Aᵀ)δ.
 """
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
     from inverse.low_dimensional.posterior import Posterior
     from uq.inputs.distributions import Distribution
 
-SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: data by the million make it no finer
+SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: enough even for millions of data
 
 
 @dataclass(frozen=True)
 class Finer:
-    """Outputs (m,) on a finer mesh at parameters (d,) of the model, or why they are not known."""
+    """Outputs (m,) on a finer mesh at parameters (d,) of the model, or why they are unknown."""
 
     outputs: Callable[[FloatArray], FloatArray] | None
     why: str = ""
 
     def gap(self, point: FloatArray, outputs: FloatArray) -> tuple[FloatArray | None, str]:
-        """Return what the finer mesh adds to outputs (m,), or why that is not known."""
+        """Return what the finer mesh adds to outputs (m,), or why that is unknown."""
         if self.outputs is None:
             return None, self.why
         try:
@@ -50,12 +50,12 @@ NOT_LOOKED = Finer(None, "no finer mesh was given")
 
 @dataclass(frozen=True)
 class Moved:
-    """What a finer mesh does to an evidence and its posterior.
+    """The effect of a finer mesh on an evidence and its posterior.
 
     Attributes
     ----------
     why
-        Why it is not known; empty where it is.
+        Why it is unknown; empty if it is known.
     error
         What it adds to the data (m,), over their errors.
     parameters
@@ -71,7 +71,7 @@ class Moved:
 
 
 def moved(posterior: Posterior, gaussian: Laplace, finer: Finer) -> Moved:
-    """Look at what a finer mesh does, at the mode of few parameters whose errors are normal: one solve on each mesh."""
+    """Find the effect of a finer mesh at the mode of few parameters with normal errors: one solve on each mesh."""
     d, m = len(posterior.inputs.names), posterior.data.size
     at = posterior.at(gaussian.mode[None], derivatives=True)
     assert at.tangents is not None
@@ -88,7 +88,7 @@ def moved(posterior: Posterior, gaussian: Laplace, finer: Finer) -> Moved:
 
 
 def parameters_moved(posterior: Posterior, gaussian: Laplace, A: FloatArray, error: FloatArray) -> FloatArray:
-    """Return how far the most probable parameters (d,) move where data are predicted larger by `error` (m,).
+    """Return how far the most probable parameters (d,) move if predictions are larger by `error` (m,).
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def evidence_moved(A: FloatArray, data: FloatArray, error: FloatArray, noise: Di
     A, data, error
         Over the stated standard deviations of the errors.
     noise
-        Prior of the factor on these, where it is unknown.
+        Prior of the factor on these, if it is unknown.
     """
     s, log_prior = np.ones(1), np.zeros(1)
     if noise is not None:

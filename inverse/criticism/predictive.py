@@ -1,10 +1,10 @@
-"""What a posterior says of other quantities and of data, and what residuals say of it.
+"""Predictions of a posterior for other quantities and data, and tests of its residuals.
 
 If model, prior and noise are right and the model is linear, the normalised residuals r at the mode are normal with the
 covariance I − S, S = A(I + AᵀA)⁻¹Aᵀ (`inverse.fields.low_rank`): |r|² is a sum of squares weighted by 1/(1+λ), of the
 mean n − tr S. Its distribution is taken to be that of g χ²(ν) with the same mean and variance (F. E. Satterthwaite,
-Biom. Bull. 2 (1946) 110–114). Residuals of neighbours must not agree more than such a normal vector's do: that says
-something also where the size of the noise was inferred.
+Biom. Bull. 2 (1946) 110–114). Residuals of neighbours must not agree more than those of such a normal vector: this
+test works even if the size of the noise was inferred.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Map = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Summary:
-    """What is known of k quantities.
+    """What is known about k quantities.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ def predictive_std(mode: Point, found: LowRankPosterior, which: NDArray[np.int64
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """What residuals at the mode say of model, prior and noise.
+    """What residuals at the mode say about model, prior and noise.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class ResidualTest:
     agreement
         Σ r_i r_j/Σ r² over neighbours; NaN where there are none.
     agreement_probability
-        Of neighbours that agree as much or more.
+        Probability of neighbours that agree as much or more.
     """
 
     square: float
@@ -155,11 +155,11 @@ def examine(
     residual
         r (n,), zero where nothing was measured.
     spectrum
-        Pairs of AᵀA; what is left out counts as λ = 0.
+        Eigenpairs of AᵀA; neglected ones count as λ = 0.
     measured
         Not zero (n,) where something was measured.
     neighbours
-        Numbers of data that are expected to agree if the model is wrong, as of `inverse.data.neighbours`.
+        Numbers of data that are expected to agree if the model is wrong, as in `inverse.data.neighbours`.
     """
     from scipy.special import chdtrc
 

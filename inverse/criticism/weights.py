@@ -1,8 +1,8 @@
-"""Weights of points in a density: their normalisation, what they are worth, and draws by them.
+"""Weights of points in a density: their normalisation, their quality, and draws by them.
 
-The worth is told by the effective number (Σw)²/Σw² and the shape k̂ of the tail (A. Vehtari et al., J. Mach. Learn. Res.
-25 (2024) 72). `trustworthy` is the one rule by which weights are trusted, in evidences, posteriors, left-out scores and
-all that is said of them.
+The quality is measured by the effective sample size (Σw)²/Σw² and the shape k̂ of the tail (A. Vehtari et al., J. Mach.
+Learn. Res. 25 (2024) 72). `trustworthy` is the only rule by which weights are trusted, in evidences, posteriors,
+left-out scores and findings.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
-TRUSTED = 0.7  # k̂ up to which weights are worth what they say
-ALIKE = 0.8  # effective share from which on weights are equal for all that matters
-FEWEST = 20.0  # effective points below which weights say nothing
+TRUSTED = 0.7  # k̂ up to which weights can be trusted
+ALIKE = 0.8  # effective share above which weights are practically equal
+FEWEST = 20.0  # effective sample size below which weights say nothing
 RULE = (
     f"Weights are to be trusted where they are worth {FEWEST:.0f} points or more, and k̂ is {TRUSTED:g} or less or more "
     f"than {100 * ALIKE:.0f} % of the points count."
@@ -28,18 +28,18 @@ def normalised(log_weights: FloatArray) -> FloatArray:
 
 
 def effective_sample_size(weights: FloatArray) -> float:
-    """Return the number of points of equal weight that points with weights (n,) of sum 1 are worth."""
+    """Return the number of equally weighted points that points with weights (n,) of sum 1 are worth."""
     return float(1 / (weights**2).sum())
 
 
 def trustworthy(pareto_k: float, ess: float, count: int) -> bool:
-    """Whether weights of `count` points are worth what they say."""
-    # The tail of weights that are all but equal says nothing.
+    """Whether the weights of `count` points can be trusted."""
+    # The tail of almost equal weights says nothing.
     return ess >= FEWEST and (pareto_k <= TRUSTED or ess > ALIKE * count)
 
 
 def worth(pareto_k: float, ess: float, count: int) -> str:
-    """Say what weights of `count` points are worth."""
+    """Say in words how good the weights of `count` points are."""
     shape = "∞" if np.isinf(pareto_k) else f"{pareto_k:.2f}"
     return f"weights worth {ess:.0f} of {count} points, k̂ = {shape}"
 
@@ -52,7 +52,7 @@ def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:
 
 
 def pareto_shape(weights: FloatArray) -> float:
-    """Shape k̂ of the generalised Pareto distribution of the largest weights; infinite where they are fewer than 5.
+    """Shape k̂ of the generalised Pareto distribution of the largest weights; infinite if there are fewer than 5.
 
     The fit is the empirical Bayes estimate of J. Zhang, M. A. Stephens, Technometrics 51 (2009) 316–325, drawn a little
     towards 1/2 as Vehtari et al. do.

@@ -1,4 +1,4 @@
-"""A model of which only some outputs are looked at, in an order of their own: those that were measured."""
+"""A model restricted to its measured outputs, in the order of the measurements."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from forward.model import FloatArray, ForwardModel, Guess, MeshError, NodalSpace
 
 @dataclass(frozen=True)
 class MeasuredModel(OneByOne):
-    """A model with the outputs that data are of.
+    """A model restricted to the outputs of the data.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class MeasuredModel(OneByOne):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs, with a number where one is there several times."""
+        """Names of the outputs, numbered if they occur several times."""
         names = [self.model.outputs[i] for i in self.which]
         return tuple(
             f"{name}.{names[:k].count(name)}" if names.count(name) > 1 else name for k, name in enumerate(names)
@@ -54,7 +54,7 @@ class MeasuredModel(OneByOne):
 
 @dataclass(frozen=True)
 class MeasuredSolution:
-    """A solution of which some outputs are looked at."""
+    """A solution restricted to some outputs."""
 
     solution: Solution
     which: list[int]

@@ -1,6 +1,6 @@
-"""Which data stand beside each other: what a wrong model makes agree.
+"""Which data are neighbours: residuals of a wrong model agree there.
 
-Two places are neighbours where no third one is nearer to both than they are to each other (the relative neighbourhood
+Two places are neighbours if no third one is nearer to both than they are to each other (the relative neighbourhood
 graph: G. T. Toussaint, Pattern Recognit. 12 (1980) 261–268). Along a line these are the places that follow one another,
 on a grid those along its axes, and everywhere the graph is connected. It depends on distances only: not on the order of
 the data, nor on the choice of axes. Data at the same place are neighbours of each other, and of those at the next ones.
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-NEAREST = 16  # other places that are looked at from each
-SAME = 1e-9  # relative difference of distances that is rounding
+NEAREST = 16  # other places that are tested from each
+SAME = 1e-9  # relative difference of distances that counts as rounding
 
 
 def neighbours(places: FloatArray, kinds: NDArray[np.int64], measured: FloatArray | None = None) -> Neighbours:
-    """Pair the data that stand beside each other, each pair once.
+    """Pair neighbouring data, each pair once.
 
     Parameters
     ----------

@@ -1,12 +1,12 @@
-"""Displacements that were measured of a specimen: files of them, and what is wrong with them.
+"""Measured displacements of a specimen: their files, and what may be wrong with them.
 
 A table of comma-separated values has the columns x, y, z (of the undeformed body), any of ux, uy, uz, and optionally
 sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Empty cells
-and ``nan`` say that a component was not measured. Lines that begin with # say where the data are from; those that read
-``# truth.NAME = VALUE`` what they were made of, if they are synthetic. Other files are meshes that meshio reads, with
-the displacements of a load case at their points as ``displacement_CASE``, or ``displacement`` where there is one.
+and ``nan`` mean that a component was not measured. Lines that begin with # state the source of the data, and lines
+``# truth.NAME = VALUE`` the true values behind synthetic data. Other files are meshes that meshio reads, with the
+displacements of a load case at their points as ``displacement_CASE``, or ``displacement`` if there is only one.
 
-Most of its length is what may be wrong with a table, each mistake with its line.
+Most of the module describes what may be wrong with a table, each mistake with its line.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TABLES = (".csv", ".txt")
 MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
 POSITION, MOTION, ERRORS = ("x", "y", "z"), ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
-SAME = 1e-9  # of the extent of all points: distance of points that are one
+SAME = 1e-9  # of the extent of all points: distance within which points coincide
 TRUTH = "truth."
 
 
@@ -54,15 +54,15 @@ class Observations:
     displacements
         What was measured (n, 3) there (m); NaN where it was not.
     sigma
-        Standard deviations (n, 3) of the errors (m); NaN where the file does not say.
+        Standard deviations (n, 3) of the errors (m); NaN if the file does not state them.
     cases
         Names of the load cases, and `case` (n,) the number of each.
     labels
-        Where (n,) each point stands in its file.
+        Location (n,) of each point in its file.
     source
-        Where they are from, line by line.
+        Their source, line by line.
     truth
-        By name, what they were made of, as text.
+        True values by name, as text.
     """
 
     places: FloatArray
@@ -80,7 +80,7 @@ class Observations:
         return np.isfinite(self.displacements)
 
     def with_sigma(self, sigma: float | None) -> Observations:
-        """Return the same with a standard deviation (m) where the file does not say one.
+        """Return the same with a standard deviation (m) where the file states none.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Observations:
     def on(
         self, nearest_place: Callable[[FloatArray], FloatArray], extent: float, tolerance: float
     ) -> tuple[Observations, FloatArray]:
-        """Put the points on a body.
+        """Move the points onto a body.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class Observations:
         return replace(self, places=moved), distance
 
     def data_labels(self) -> list[str]:
-        """Say of each of the `components` where it stands, at which place, in which load case and along which axis."""
+        """Say for each of the `components` its location in the file, place, load case and axis."""
         which, axes = self._order
         return [
             f"{self.labels[i]} at ({', '.join(f'{x:.4g}' for x in self.places[i])}) m, {self.cases[self.case[i]]}, "
@@ -195,7 +195,7 @@ class Components:
 
     @property
     def which(self) -> None:
-        """They are the outputs of a model that observes them."""
+        """All outputs of a model that observes them."""
         return
 
     @property
@@ -204,21 +204,21 @@ class Components:
         return {"place": self.places, "datum_axis": self.axes.astype(float)}
 
     def neighbours(self) -> Neighbours:
-        """Return pairs of data of the same component and load case that stand beside each other."""
+        """Return pairs of neighbouring data of the same component and load case."""
         return neighbours(self.places, 3 * self.cases + self.axes)
 
 
 def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
-    """Return the files that are meant by names, folders (all data files in them) and patterns such as ``*.csv``.
+    """Return the files given by names, folders (all data files in them) and patterns such as ``*.csv``.
 
-    What is not there is among them too, so that others of a batch go on: it cannot be read.
+    Missing files are included too, so that the others of a batch go on: they cannot be read.
 
     Parameters
     ----------
     patterns
-        What is meant.
+        Names, folders and patterns.
     folders
-        Where to look for them: the first one that has something counts.
+        Where to look for them: the first folder with a match counts.
 
     Raises
     ------
@@ -306,7 +306,7 @@ class Table:
     columns
         Their names.
     rows
-        What stands in each column, row by row.
+        The cells of each column, row by row.
     lines
         Numbers of the lines of the rows.
     """
@@ -318,7 +318,7 @@ class Table:
 
 
 def read_table(path: Path) -> Table:
-    """Read a table; its first line that is no remark names the columns, and rows without a word in them do not count.
+    """Read a table; its first line that is not a remark names the columns, and empty rows do not count.
 
     Raises
     ------
@@ -327,7 +327,8 @@ def read_table(path: Path) -> Table:
     """
     name = path.name
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()  # programs of offices write a mark at the beginning
+        # Office programs write a byte order mark at the beginning.
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise DataError(f"{name}: not a text file in UTF-8") from None
     except OSError as error:
@@ -448,7 +449,7 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         raise DataError(message) from None
     if not path.exists():
         raise DataError(f"{path.name}: cannot be read: No such file or directory")
-    said = io.StringIO()  # what meshio prints, and what it prints before it leaves
+    said = io.StringIO()  # what meshio prints, also before it exits
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             mesh = meshio.read(path)
@@ -473,7 +474,7 @@ def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         if motion.shape != (n, 3) or points.shape != (n, 3):
             raise DataError(f"{path.name}: '{name}' has the shape {motion.shape}, expected ({n}, 3)")
     if not np.isfinite(points).all():
-        raise DataError(f"{path.name}: a point has a coordinate that is no number")
+        raise DataError(f"{path.name}: a point has a coordinate that is not a number")
     if any(np.isinf(motion).any() for motion in motions):
         raise DataError(f"{path.name}: a displacement is infinite, expected numbers, or nan where nothing was measured")
     return Observations(

@@ -1,8 +1,8 @@
 """Measured outputs of a model: a table with a row for each measurement, or numbers by name.
 
 A table of comma-separated values has the columns `output` and `value`, in the unit of the output, and may have `sigma`,
-the standard deviation of the error. An output may be measured several times. Lines that begin with # say where the
-data are from; ``# truth.PATH = number`` says what a number of the model really was.
+the standard deviation of the error. An output may be measured several times. Lines that begin with # state the source
+of the data; ``# truth.PATH = number`` gives the true value of a number of the model.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ COLUMNS = ("output", "value", "sigma")
 
 @dataclass(frozen=True, eq=False)
 class OutputData:
-    """Measured outputs of a model, each a part of the data of its own.
+    """Measured outputs of a model, each a separate part of the data.
 
     Attributes
     ----------
     names
-        Outputs (m,) that were measured; one may be there several times.
+        Measured outputs (m,); an output may occur several times.
     values, sigma
-        What was measured (m,), and the standard deviations (m,) of the errors, NaN where they are not known.
+        What was measured (m,), and the standard deviations (m,) of the errors, NaN if unknown.
     labels
-        Where each (m,) stands.
+        Location (m,) of each in its file.
     source
-        Where they are from, line by line.
+        Their source, line by line.
     truth
         Numbers of the model, by path.
     outputs
         All outputs of the model, in its order.
     parts
-        Those of which there are data in any data set of a study, in the order of the model.
+        Outputs with data in any data set of a study, in the order of the model.
     """
 
     names: tuple[str, ...]
@@ -78,7 +78,7 @@ class OutputData:
         return neighbours(np.zeros((len(self.names), 1)), self.cases)
 
     def with_sigma(self, given: Mapping[str, float], relative: float, absolute: float) -> OutputData:
-        """Return the same with the standard deviations of errors where they are not known.
+        """Return the same with standard deviations of the errors where they are unknown.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class OutputData:
         Raises
         ------
         DataError
-            If one is still not known.
+            If one is still unknown.
         """
         general = np.maximum(relative * np.abs(self.values), absolute)
         general = np.array([given.get(name, one) for name, one in zip(self.names, general, strict=True)])
@@ -105,11 +105,11 @@ class OutputData:
         return replace(self, sigma=sigma)
 
     def with_truth(self, truth: Mapping[str, float]) -> OutputData:
-        """Return the same with numbers of the model that are known beside the data."""
+        """Return the same with true numbers of the model that are known separately."""
         return replace(self, truth={**self.truth, **truth})
 
     def data_labels(self) -> list[str]:
-        """Say of each datum where it stands, and which output it is of."""
+        """Say for each datum its location, and its output."""
         return [f"{label}, {name}" for label, name in zip(self.labels, self.names, strict=True)]
 
 
@@ -182,7 +182,7 @@ def stated(values: Mapping[str, float | Sequence[float]]) -> OutputData:
 
 
 def _number(text: str) -> float:
-    """A number; NaN where a text is none."""
+    """A number; NaN if a text is not a number."""
     try:
         return float(text)
     except ValueError:

@@ -1,1 +1,1 @@
-"""What a study can do with random parameters: one method in each file."""
+"""Methods: what a study can do with random parameters, one method in each file."""

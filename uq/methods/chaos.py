@@ -1,8 +1,8 @@
-"""Polynomial chaos for outputs and for the whole displacement field: moments, Sobol' indices, and a function to keep.
+"""Polynomial chaos for outputs and for the whole displacement field: moments, Sobol' indices, and a surrogate.
 
 The expansion in orthonormal polynomials is fitted to values and gradients (`uq.surrogates.regression`), or projected by
-Gauss quadrature. Moments and Sobol' indices are sums of squares of its coefficients. Which functions it has, and when
-there are samples enough, is decided by the leave-one-out error.
+Gauss quadrature. Moments and Sobol' indices are sums of squares of its coefficients. The leave-one-out error decides
+which functions it has, and when there are enough samples.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
-LARGEST = 1000  # samples after which a tolerance is given up, if nothing else is said
-GROWTH = 1.5  # of the design, from one look at the tolerance to the next
+LARGEST = 1000  # samples after which a tolerance is given up by default
+GROWTH = 1.5  # growth of the design between checks of the tolerance
 DRAWN = 17  # 2^17 points of the expansion give quantiles and densities
 QUARTERS = 4
 BINS = 80
@@ -66,23 +66,23 @@ class Chaos(Amount):
     Parameters
     ----------
     samples, budget_seconds
-        As of `Amount`; there is one solve more, at the mean parameters.
+        As in `Amount`; there is one more solve, at the mean parameters.
     tolerance
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation.
     max_order
         Largest order that is tried; the order of the projection.
     gradients
-        Whether derivatives are fitted too, where the model has them.
+        Whether derivatives are fitted too, if the model has them.
     fit
         "regression" on a scrambled Sobol' design, or "projection" by a tensor product of Gauss rules with
-        ``max_order + 2`` points for each parameter, on values only: one more than orthogonality needs, so that there
-        is something left to measure the error by.
+        ``max_order + 2`` points for each parameter, on values only: one more than orthogonality needs, so that the
+        error can be measured.
     seed
         Seed of the design; sample z of a seed is the same in every study.
     quantiles
-        Probabilities of the quantiles of the outputs; without any there are no densities either.
+        Probabilities of the quantiles of the outputs; without any, there are no densities either.
     fields
-        Whether the displacement field is expanded too, node by node.
+        Whether the displacement field is expanded too, at each node.
     """
 
     kind: Literal["chaos"] = "chaos"
@@ -94,7 +94,7 @@ class Chaos(Amount):
     fields: bool = True
 
     def check_amount(self) -> None:
-        """Raise a ValueError where no amount is given, or where one is that a projection cannot heed."""
+        """Raise a ValueError if no amount is given, or one that a projection cannot respect."""
         if self.fit == "regression":
             super().check_amount()
         elif self.asked:
@@ -104,13 +104,13 @@ class Chaos(Amount):
             raise ValueError(message)
 
     def planned(self, dimension: int) -> int:
-        """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
+        """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.fit == "projection":
             return int(1 + (self.max_order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)
 
     def with_tangents(self, samples: int) -> int:
-        """All, where gradients are fitted to."""
+        """All samples, if gradients are fitted."""
         return samples if self.gradients and self.fit == "regression" else 0
 
     def stream(self) -> tuple[Any, ...] | None:
@@ -118,7 +118,7 @@ class Chaos(Amount):
         return "design", self.gradients
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters cannot be expanded in, or None."""
+        """Say why an expansion in these parameters is impossible, or None."""
         return objection(inputs, self.kind)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -140,7 +140,7 @@ class Chaos(Amount):
         return expansion_dataset(self, evaluate, self.expand(inputs, evaluate))
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
-        """Solve at the points of the design and fit; errors as of `run`."""
+        """Solve at the points of the design and fit; errors as in `run`."""
         refusal = self.objection(inputs)
         if refusal is not None:
             raise ValueError(refusal)
@@ -193,7 +193,7 @@ def objection(inputs: Inputs, kind: str) -> str | None:
 
 
 def _first(inputs: Inputs, *, gradients: bool) -> int:
-    """Samples before a tolerance is first looked at: enough for all products of two parameters, or for all slopes."""
+    """Samples before a tolerance is first checked: enough for all products of two parameters, or for all slopes."""
     d = len(inputs.names)
     terms = (d + 1) * (d + 2) // 2 if d <= FULL else 2 * (d + 1)
     return max(4, -(-ROWS_PER_TERM * terms // rows_of(inputs, gradients=gradients)))
@@ -201,7 +201,7 @@ def _first(inputs: Inputs, *, gradients: bool) -> int:
 
 @dataclass(frozen=True)
 class Expanded:
-    """An expansion with the evaluations that it was made from, and why they were enough."""
+    """An expansion with the evaluations from which it was made, and why they were enough."""
 
     centre: Linearisation
     evaluations: Evaluations
@@ -285,7 +285,7 @@ def expansion_dataset(
     if failed:
         dataset.attrs["note"] = (
             f"{failed} of {len(evaluations.ok)} samples have no answer; the expansion is fitted to the others and "
-            "continues them to where the model has no answer"
+            "extrapolates them to where the model has no answer"
         )
     return dataset
 
@@ -293,14 +293,14 @@ def expansion_dataset(
 def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
     """Quantiles and densities of the outputs, from many points of the expansion, or from the samples.
 
-    Where the moments are those of the samples, so are the quantiles; densities are of the expansion with errors at
-    samples that it has not seen, drawn independently.
+    If the moments are those of the samples, so are the quantiles; densities are those of the expansion plus its errors
+    at unseen samples, drawn independently.
     """
     inputs, basis, fit, data = regression.inputs, regression.basis, regression.fit, regression.data
     uniforms = np.split(sobol_points(method.seed, 0, 0, 2**DRAWN, len(inputs.names)), 2 ** max(DRAWN - 12, 0))
     drawn = np.concatenate([basis.values(inputs.points(some)) @ fit.coefficients for some in uniforms])
     central = np.quantile(drawn, method.quantiles, axis=0)
-    # No quantile moves by more than the function does. Quarters of the points are Sobol' points too.
+    # No quantile moves by more than the function does. Each quarter of the points is a set of Sobol' points too.
     quarters = [np.quantile(part, method.quantiles, axis=0) for part in np.split(drawn, QUARTERS)]
     factor = student(QUARTERS - 1) / Z / np.sqrt(QUARTERS)
     error = np.hypot(fit.loo, factor * np.std(quarters, axis=0, ddof=1))
@@ -323,7 +323,7 @@ def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tup
 
 
 def _density(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Density in bins of values (n,), and their edges; NaN for what does not vary, which has none."""
+    """Density in bins of values (n,), and their edges; NaN for values that do not vary."""
     if np.ptp(drawn) <= ROUNDING * np.abs(drawn).max():
         return np.full(BINS, np.nan), np.linspace(drawn.min(), drawn.max(), BINS + 1)
     return np.histogram(drawn, BINS, density=True)
@@ -347,9 +347,9 @@ def _field_estimates(
 ) -> dict[str, tuple[tuple[str, ...], FloatArray | float]]:
     """Coefficients of the functions `terms` (T,), mean and standard deviation of the displacements, and their errors.
 
-    Errors are those of the sketches and of the outputs in proportion to the residuals, which come from the same rows.
-    What the fit leaves of a variance s², residuals that are as much larger where it has not seen the sample as those of
-    the sketches are, is an error of the standard deviation too, √(s² + left) − s.
+    Errors are those of the sketches and of the outputs, scaled by the residuals, which come from the same rows. The
+    part of a variance s² that the fit misses (its residuals, increased by the ratio of unseen to seen residuals of the
+    sketches) is an error of the standard deviation too, √(s² + missed) − s.
     """
     basis, fit = regression.basis, regression.fit
     projections = evaluations.fields[fit.chosen.which][:, :count]

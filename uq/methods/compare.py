@@ -1,13 +1,13 @@
 """Error against cost: methods at growing budgets, each with independent repeats, against a reference.
 
 A repeat r of a method with n samples gives an estimate e_rn and the standard error that it claims. Over R repeats the
-root mean square of e_rn − e*, with the reference e*, is what the method really errs, whatever it claims; the share of
-repeats whose claimed 95 % interval holds e* says whether its claims are honest. Plain Monte Carlo needs (s/RMSE)²
-samples for the same error, where s² is the variance of one sample: σ² of the output for the mean.
+root mean square of e_rn − e*, with the reference value e*, is the true error of the method, whatever it claims; the
+share of repeats whose claimed 95 % interval holds e* says whether its claims are honest. Plain Monte Carlo needs
+(s/RMSE)² samples for the same error, where s² is the variance of one sample: σ² of the output for the mean.
 
 Points that several methods or budgets ask for are solved once, and charged to each as if it had solved them itself.
 
-Sharing of points, charging of costs and judging of claims refer to the same runs, hence one file.
+Sharing points, charging costs and judging claims all refer to the same runs, hence one file.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 COMPARED = Kinds("method", SAMPLING, Amount)  # methods that estimate moments from samples
 REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **SAMPLING}, Method)
 ESTIMATED = ("mean", "std")
-TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # of results, what no restart gives again
-RESOLVED = 2.0  # an error is measured where it is so many times the reference's own
-ROUNDING = 16 * np.finfo(float).eps  # relative error of a reference that claims less
+TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # results that a restart does not reproduce
+RESOLVED = 2.0  # an error counts as measured if it is this many times the reference's own
+ROUNDING = 16 * np.finfo(float).eps  # smallest relative error assumed for a reference
 UNLIKELY = 1e-3  # probability below which so few intervals would hold the reference if they were honest
 TIGHT, TEXTBOOK, REFINED = "tight", "textbook", "refined"  # names of the models beside the study's own
 TIGHTER = 1e-3  # tolerances of the solver that makes the reference, relative to those of the study
@@ -62,23 +62,23 @@ class Known(Settings):
 
 
 class Given(Method):
-    """A reference that is known: the moments of every output, by its name."""
+    """Known reference values: the moments of every output, by name."""
 
     kind: Literal["given"] = "given"
     values: dict[str, Known]
 
     def planned(self, dimension: int) -> int:
-        """None."""
+        """No solves."""
         return 0
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find outputs whose moments are not given, and others that are."""
+        """Find outputs whose moments are not given, and moments of unknown outputs."""
         outputs = [output.name for output in spec.outputs]
         if set(self.values) != set(outputs):
             yield ("method", "values"), f"expected values of every output: {', '.join(outputs)}", list(self.values)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Return what is known; errors as of every method."""
+        """Return the known values; errors as for every method."""
         import xarray as xr
 
         missing = [name for name in evaluate.outputs if name not in self.values]
@@ -90,7 +90,7 @@ class Given(Method):
 
 
 class Entry(Settings):
-    """A method to be compared: its block, with `budgets` in the place of `samples`, and a `name` if it needs one.
+    """A method to be compared: its block, with `budgets` instead of `samples`, and a `name` if needed.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Entry(Settings):
     budgets
         Numbers of samples, each of which the method must admit.
     sampling
-        The method with the first budget; its keys stand beside `name` and `budgets`.
+        The method with the first budget; its keys are beside `name` and `budgets`.
     """
 
     name: str = ""
@@ -119,7 +119,7 @@ class Entry(Settings):
     @model_validator(mode="before")
     @classmethod
     def _split(cls, value: Any) -> Any:
-        """Put the keys of the method apart."""
+        """Separate the keys of the method."""
         if not isinstance(value, dict):
             return value
         expected = "expected different numbers of samples, such as [16, 32, 64]"
@@ -179,7 +179,7 @@ _NOT_ITS_OWN = ("samples", "tolerance", "budget_seconds", "seed", "quantiles", "
 
 
 def _moments_only(method: Method) -> dict[str, Any]:
-    """Return what a method is told that is to estimate moments of outputs and nothing else."""
+    """Return the settings by which a method estimates only moments of outputs."""
     told: dict[str, Any] = {"fields": False, "quantiles": ()}
     return {name: value for name, value in told.items() if name in type(method).model_fields}
 
@@ -190,20 +190,21 @@ class Compare(Method):
     Parameters
     ----------
     methods
-        Blocks of methods with `budgets`, a list of numbers of samples, in the place of `samples`.
+        Blocks of methods with `budgets`, a list of numbers of samples, instead of `samples`.
     reference
-        What estimates are compared with: a block of a method, which is solved to tighter tolerances, or values of
+        The source of reference values: a block of a method, which is solved to tighter tolerances, or values of
         ``kind = "given"``.
     repeats
         Independent repeats R of every method. Errors are known to 1/√(2R), 16 % for 20.
     seed
-        Repeat r has the same points in every study of that seed.
+        Repeat r has the same points in every study with this seed.
     textbook
-        Draws that are also solved by the textbook (Newton's method from zero with a new factor for every step): what
-        plain Monte Carlo would cost so, and what the solver's tolerance leaves. 0 for none.
+        Number of draws that are also solved by the textbook solver (Newton's method from zero with a new factor for
+        every step), to find the cost of plain Monte Carlo with it, and the error due to the solver's tolerance. 0 for
+        none.
     mesh_error
         Whether the body is also solved at the mean parameters with twice the cells in each direction: the difference
-        says where the error of the mesh takes over.
+        shows where the mesh error dominates.
     """
 
     kind: Literal["compare"] = "compare"
@@ -228,7 +229,7 @@ class Compare(Method):
 
     @property
     def open_ended(self) -> bool:
-        """Methods that ask for the same points share them: fewer solves than planned may be enough."""
+        """Methods that use the same points share them: fewer solves than planned may be enough."""
         return True
 
     def planned(self, dimension: int) -> int:
@@ -252,17 +253,17 @@ class Compare(Method):
         return next(filter(None, (method.objection(inputs) for method in methods)), None)
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
-        """Return the model that makes the reference, the textbook's and, if it is asked for, one on a finer mesh."""
+        """Return the model of the reference, that of the textbook and, if requested, one on a finer mesh."""
         found = {TIGHT: spec.tighter(TIGHTER), TEXTBOOK: spec.textbook()}
         return found | ({REFINED: spec.refined(1)} if self.mesh_error else {})
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find that there is no mesh to be refined."""
+        """Find that there is no mesh to refine."""
         if self.mesh_error and not spec.meshed:
             yield ("method", "mesh_error"), f"a model of kind '{spec.kind}' has no mesh, expected false", True
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of the methods and of the reference does not fit the parameters and the outputs."""
+        """Find what in the methods and the reference does not fit the parameters and the outputs."""
         yield from super().mistakes(inputs, spec)
         for i, entry in enumerate(self.methods):
             for (block, *place), message, given in entry.at(min(entry.budgets)).mistakes(inputs, spec):
@@ -287,7 +288,7 @@ class Compare(Method):
         -------
         xarray.Dataset
             The reference (`mean`, `mean_error`, …) by output; all estimates by row (a method at a budget) and repeat;
-            what they err and cost by row; see docs/results.md. All but `TIMES` is the same after a restart.
+            true errors and costs by row; see docs/results.md. All but `TIMES` is the same after a restart.
 
         Raises
         ------
@@ -307,7 +308,7 @@ class Compare(Method):
         rows = [(entry, budget) for entry in self.methods for budget in sorted(entry.budgets)]
         trials: list[list[_Trial]] = [[] for _ in rows]
         for r in range(self.repeats):
-            # The largest budget first: it asks for the points of the others, in one request.
+            # The largest budget first: its one request includes the points of the others.
             for i, (entry, budget) in reversed(list(enumerate(rows))):
                 trials[i].append(_try(entry.at(budget, _seed(self.seed, r)), inputs, memory))
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
@@ -332,7 +333,7 @@ class Compare(Method):
     def _floors(
         self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation
     ) -> dict[str, tuple[tuple[str, ...], Any]]:
-        """Measure what the solver and the mesh leave, and what a plain solve costs, by the textbook and here."""
+        """Measure the errors of solver and mesh, and the cost of a plain solve, by the textbook and here."""
         m = len(evaluate.outputs)
         solver, mesh = np.full(m, np.nan), np.full(m, np.nan)
         plain = textbook = np.nan
@@ -357,7 +358,7 @@ class Compare(Method):
 
 
 def _seed(seed: int, repeat: int) -> int:
-    """Seed of a repeat: the same for all methods, which may so share their points."""
+    """Seed of a repeat: the same for all methods, so that they may share their points."""
     return int(np.random.SeedSequence([seed, repeat]).generate_state(1)[0])
 
 
@@ -366,7 +367,7 @@ def _seed(seed: int, repeat: int) -> int:
 
 @dataclass(frozen=True)
 class _Trial:
-    """What one run of a method gave, and what it is charged.
+    """The results of one run of a method, and its cost.
 
     Attributes
     ----------
@@ -375,13 +376,13 @@ class _Trial:
     half_width
         Standard errors on either side of a claimed 95 % interval.
     solves
-        Points that were asked for.
+        Number of points that were requested.
     seconds, own_seconds
         Processor time (s) of their solves, and of everything else that the method did.
     reason
         Why there is no estimate.
     doubts
-        What the method found out about its own numbers.
+        The method's findings about its own numbers.
     """
 
     estimates: dict[str, FloatArray]
@@ -408,9 +409,9 @@ def _try(method: Amount, inputs: Inputs, memory: _Memory) -> _Trial:
 
 
 def _doubts(rows: Sequence[tuple[Entry, int]], trials: Sequence[Sequence[_Trial]]) -> Iterator[Finding]:
-    """Find what each method found out about its own numbers, at which budgets and how often: a line for each severity.
+    """Collect each method's findings about its own numbers, at which budgets and how often: a line for each severity.
 
-    Errors are warnings here, where the numbers are compared with the reference.
+    Errors become warnings here, since the numbers are compared with the reference.
     """
     for label in dict.fromkeys(entry.label for entry, _ in rows):
         own = [i for i, (entry, _) in enumerate(rows) if entry.label == label]
@@ -436,7 +437,7 @@ class _Clock:
 
 
 class _Memory:
-    """An evaluation that solves each point once, and hands out what it found, seconds and all, as often as asked.
+    """An evaluation that solves each point once, and returns the result, with its time, as often as requested.
 
     Sums of fields over several points are not remembered.
     """
@@ -469,11 +470,11 @@ class _Memory:
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Share (n_nodes,) of the body that each node stands for, see `Evaluate`."""
+        """Volume (n_nodes,) of the body that each node represents, see `Evaluate`."""
         return self._evaluate.node_volumes
 
     def on(self, model: str) -> _Memory:
-        """Return the evaluation of another of the models, with a memory of its own."""
+        """Return the evaluation of another of the models, with its own memory."""
         if model not in self._others:
             self._others[model] = _Memory(self._evaluate.on(model), self.clock)
         return self._others[model]
@@ -501,7 +502,7 @@ class _Memory:
 
 
 def _one_by_one(found: Evaluations) -> list[Evaluations]:
-    """Cut evaluations of n points into n; fields stay where there is one point only."""
+    """Split evaluations of n points into n; fields are kept only for single points."""
     n = len(found.points)
     if n == 1:
         return [found]
@@ -524,7 +525,7 @@ def _one_by_one(found: Evaluations) -> list[Evaluations]:
 
 @dataclass(frozen=True)
 class _Score:
-    """What repeats err, by row and output (n, m).
+    """Errors of repeats, by row and output (n, m).
 
     Attributes
     ----------
@@ -570,7 +571,7 @@ def _score(errors: FloatArray, claims: FloatArray, halves: FloatArray, floor: Fl
     scatter = np.sqrt((spread**2).sum(axis=1) / np.maximum(R - 1, 1) / R)
     rmse = np.sqrt(mean)
     resolved = rmse > RESOLVED * floor
-    # The reference errs too: where that matters at all, intervals are as much wider.
+    # The reference has an error too: intervals are widened by it.
     within = there & (np.abs(errors) <= np.hypot(halves[..., None] * claims, 1.96 * floor))
     hits = within.sum(axis=1)
     return _Score(
@@ -619,7 +620,7 @@ def _compared(
     seconds = np.median(each(lambda t: t.seconds + t.own_seconds), axis=1)
     halves = each(lambda t: t.half_width)
     plain = [i for i, (entry, _) in enumerate(rows) if entry.sampling.kind == "monte-carlo"]
-    # What plain Monte Carlo costs by the textbook follows from its solves.
+    # The cost of plain Monte Carlo with the textbook solver follows from its solves.
     textbook = float(floors["textbook_seconds"][1])
     derived = plain if np.isfinite(textbook) else []
     shown = [*range(len(rows)), *derived]
@@ -667,18 +668,18 @@ def _compared(
 
 
 def plain_samples(dataset: xr.Dataset, estimated: str) -> xr.DataArray:
-    """Return how many samples of plain Monte Carlo err as much, by row and output, for the mean or the std.
+    """Return how many plain Monte Carlo samples give the same error, by row and output, for the mean or the std.
 
-    This is a lower bound where the error is not resolved.
+    This is a lower bound if the error is not resolved.
     """
     return (dataset[f"{estimated}_rmse"] / dataset[f"{estimated}_single"]) ** -2
 
 
 def gains(dataset: xr.Dataset, estimated: str) -> dict[str, xr.DataArray]:
-    """Return what plain Monte Carlo costs at equal error over what a method costs, by row and output.
+    """Return the cost of plain Monte Carlo at equal error over that of a method, by row and output.
 
-    By number of "solves", by processor time ("cpu"), and by processor time where plain Monte Carlo solves by the
-    textbook ("textbook"); the last two are NaN where nothing was solved by the textbook.
+    By number of "solves", by processor time ("cpu"), and by processor time with the textbook solver for plain Monte
+    Carlo ("textbook"); the last two are NaN if nothing was solved by the textbook.
     """
     plain, seconds = plain_samples(dataset, estimated), dataset["cpu_seconds"]
     return {

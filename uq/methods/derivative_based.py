@@ -10,15 +10,15 @@ Math. Comput. Simul. 87 (2013) 45–54). C is σ² for a normal and (b − a)²/
 distribution of shape k and scale θ it is θ²(k + 1)²/k where k > 1 (g = (1 − x/(k + 1)) exp(x/(k + 1)) with x = ω/θ
 attains it) and 4θ² otherwise.
 
-The same holds of ln ω with its own constant, S_Ti ≤ C_i' E[(ω_i ∂ψ/∂ω_i)²]/Var ψ: s² for a log-normal parameter, of
-which the logarithm has the standard deviation s and which has no C; ln²(b/a)/π² for a log-uniform one; 1/(k − 1) for a
-gamma distribution with k > 2 (g = 1/ω attains it). Where polynomials are of the logarithm (`uq.inputs.coordinates`)
-both bounds are computed, and the smaller one is taken.
+The same holds for ln ω with its own constant, S_Ti ≤ C_i' E[(ω_i ∂ψ/∂ω_i)²]/Var ψ: s² for a log-normal parameter
+whose logarithm has the standard deviation s (it has no C itself); ln²(b/a)/π² for a log-uniform one; 1/(k − 1) for a
+gamma distribution with k > 2 (g = 1/ω attains it). Where polynomials are in the logarithm (`uq.inputs.coordinates`),
+both bounds are computed and the smaller one is taken.
 
 The active subspace (P. G. Constantine, Active Subspaces, SIAM (2015)) are the leading eigenvectors of E[∇ψ∇ψᵀ] in
 standardised coordinates (`uq.inputs.coordinates`): the directions along which ψ changes most.
 
-Points are independent scrambles of Sobol' points, and errors come from drawing whole scrambles again
+Points are independent scrambles of Sobol' points, and errors come from resampling whole scrambles
 (`uq.estimators.indices`).
 
 The bounds, the active subspace and their errors are computed from the same products of gradients, hence one file.
@@ -62,9 +62,9 @@ from uq.surrogates.regression import FULL, Regression
 if TYPE_CHECKING:
     import xarray as xr
 
-SETTLED = 1e-5  # relative change of a Poincaré constant from one degree to twice that, at which it is taken as known
+SETTLED = 1e-5  # relative change of a Poincaré constant, when the degree is doubled, at which it counts as known
 DEGREES = (8, 16, 32, 64)
-ORDER = 6  # largest of the expansion that total indices come from
+ORDER = 6  # largest order of the expansion for total indices
 RANGE = (0.025, 0.975)
 
 
@@ -78,9 +78,9 @@ class DerivativeBased(Amount):
     tolerance
         Stop when the standard error of every bound is below it.
     budget_seconds
-        As of `Amount`.
+        As in `Amount`.
     scrambles
-        Number of independent scrambles: their scatter is the error. Means over scrambles of squared derivatives are
+        Number of independent scrambles, whose scatter gives the error. Means over scrambles of squared derivatives are
         skewed: of 256 solves of a function of a normal and a uniform parameter, 95 % intervals covered 90 to 91 % with
         16 scrambles, 92 to 94 % with 32 and 94 % with 64, while the standard error was right.
     seed
@@ -90,8 +90,8 @@ class DerivativeBased(Amount):
     fields
         Whether the derivatives of the displacement field at the mean parameters are kept.
     indices
-        Whether total indices are estimated too, from an expansion of the same samples; up to 8 parameters they are
-        unless this is false.
+        Whether total indices are estimated too, from an expansion of the same samples; by default, with up to 8
+        parameters.
     """
 
     kind: Literal["derivative-based"] = "derivative-based"
@@ -102,12 +102,12 @@ class DerivativeBased(Amount):
     indices: bool | None = None
 
     def check_amount(self) -> None:
-        """Raise a ValueError where no amount is given, or not one of whole scrambles."""
+        """Raise a ValueError if no amount is given, or not one of whole scrambles."""
         super().check_amount()
         check_scrambles(self.samples, self.scrambles)
 
     def planned(self, dimension: int) -> int:
-        """Number of solves, the largest where a tolerance may end the study earlier."""
+        """Number of solves; the largest, if a tolerance may end the study earlier."""
         return 1 + (self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles))
 
     def with_tangents(self, samples: int) -> int:
@@ -173,8 +173,8 @@ def poincare(marginal: Distribution, *, logarithm: bool) -> float:
 
     Where there is no closed form it is 1/λ with the smallest positive eigenvalue of −(p f')' = λ p f with f' = 0 at the
     ends (O. Roustant, F. Barthe, B. Iooss, Electron. J. Stat. 11 (2017) 3081–3119), by Galerkin's method in the
-    orthonormal polynomials of the distribution, of which the mass matrix is one. Where that does not settle, Cheeger's
-    upper bound 4 sup (min(F, 1 − F)/p)² of it is taken (S. Bobkov, C. Houdré, Ann. Probab. 25 (1997) 184–205).
+    orthonormal polynomials of the distribution, whose mass matrix is the identity. If that does not converge, Cheeger's
+    upper bound 4 sup (min(F, 1 − F)/p)² is taken (S. Bobkov, C. Houdré, Ann. Probab. 25 (1997) 184–205).
     """
     if logarithm and not marginal.logarithmic:
         return np.inf
@@ -347,7 +347,7 @@ class _Samples:
         return counted(found, self._inputs, self.outputs[:, :each][self.ok[:, :each]])
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        """Flatten (R, n, …) to (n R, …), the first points of all scrambles first: a shorter study is the beginning."""
+        """Flatten (R, n, …) to (n R, …), first points of all scrambles first: a shorter study is a prefix."""
         return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
 
     def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:

@@ -1,6 +1,6 @@
-"""What a study asks of a method: the base of every block `[method]` that solves at points, and the kinds there are.
+"""What a study asks of a method: the base of every block `[method]` that solves at points, and the list of kinds.
 
-A kind of one's own is a subclass in a module beside the study or in an installed package (`forward.registry`).
+Your own kind is a subclass in a module beside the study or in an installed package (`forward.registry`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Method(Settings):
 
         @property
         def kind(self) -> str:
-            """As the study has it."""
+            """Its kind, as in the study."""
 
     @abstractmethod
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -40,19 +40,19 @@ class Method(Settings):
         Returns
         -------
         xarray.Dataset
-            What docs/results.md names, as far as the method has it.
+            The variables of docs/results.md that the method provides.
 
         Raises
         ------
         SolveError
-            If the model has no answer where the method cannot do without one.
+            If the model has no answer where the method needs one.
         ValueError
             If the method cannot take the parameters, or needs derivatives that the model does not have.
         """
 
     @abstractmethod
     def planned(self, dimension: int) -> int:
-        """Number of solves for so many parameters, the largest where it may end earlier, with that at the mean."""
+        """Number of solves for so many parameters, with that at the mean; the largest, if it may end earlier."""
 
     @property
     def open_ended(self) -> bool:
@@ -61,16 +61,16 @@ class Method(Settings):
 
     @property
     def undecided(self) -> str:
-        """What the planned solves are for, where they decide how many more there are; else empty."""
+        """What the planned solves are for, if they decide how many more there are; otherwise empty."""
         return ""
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
-        """Return the models that it solves beside that of the study, by the names that it asks `Evaluate.on` for.
+        """Return the models that it solves besides that of the study, by the names for `Evaluate.on`.
 
         Raises
         ------
         ModelError, pydantic.ValidationError
-            If one of them cannot be.
+            If one of them is impossible.
         """
         return {}
 
@@ -79,31 +79,31 @@ class Method(Settings):
         return None
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what the method needs that the model does not have."""
+        """Find what the method needs and the model lacks."""
         yield from ()
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what of the method does not fit the parameters and the outputs."""
+        """Find what in the method does not fit the parameters and the outputs."""
         objection = self.objection(inputs)
         if objection is not None:
             given = [{"between": (a, b), "value": value} for a, b, value in inputs.correlations]
             yield ("correlations",), objection, given
 
     def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
-        """Return the method with the results of other studies that it names, as they are read."""
+        """Return the method with the results of other studies that it names, once they are read."""
         return self
 
     def with_tangents(self, samples: int) -> int:
-        """Of so many samples, the number whose derivatives are asked for too."""
+        """Of so many samples, the number whose derivatives are needed too."""
         return 0
 
     def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
-        """Predict the processor time (s) of what follows the first solves, by the costs of the models by name."""
+        """Predict the processor time (s) after the first solves, from the costs of the models by name."""
         own, samples = costs[OWN], self.planned(dimension) - 1
         return samples * own.sample + self.with_tangents(samples) * own.tangents_of_sample(dimension)
 
     def stream(self) -> tuple[Any, ...] | None:
-        """Name the points that it takes the first of, for all methods that take them; None where they are its own."""
+        """Name the sequence of points that it uses, for methods that share it; None if the points are its own."""
         return None
 
 

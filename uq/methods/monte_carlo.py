@@ -34,9 +34,9 @@ from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 if TYPE_CHECKING:
     import xarray as xr
 
-FIRST_ROUND = 64  # samples before a tolerance or a budget is first looked at
-MOST_GROWTH = 4.0  # of the number of samples, from one look to the next
-UNLIMITED = 100_000  # samples that a tolerance or a budget may take where no limit is given
+FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
+MOST_GROWTH = 4.0  # growth of the number of samples between checks
+UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -46,7 +46,7 @@ class MonteCarlo(Amount):
     Parameters
     ----------
     samples, budget_seconds
-        As of `Amount`.
+        As in `Amount`.
     tolerance
         Stop when the standard error of every mean is below this fraction of the mean (of the standard deviation,
         where the mean is smaller than that).
@@ -55,7 +55,7 @@ class MonteCarlo(Amount):
     quantiles
         Probabilities of the quantiles of the outputs.
     fields
-        Whether mean and standard deviation of the displacement field are computed, node by node.
+        Whether mean and standard deviation of the displacement field are computed at each node.
     """
 
     kind: Literal["monte-carlo"] = "monte-carlo"
@@ -65,11 +65,11 @@ class MonteCarlo(Amount):
 
     @property
     def limit(self) -> int:
-        """Number of samples, the largest where a tolerance may end the study earlier."""
+        """Number of samples; the largest, if a tolerance may end the study earlier."""
         return self.samples or UNLIMITED
 
     def planned(self, dimension: int) -> int:
-        """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
+        """Number of solves with so many parameters; the largest, if a tolerance may end the study earlier."""
         return 1 + self.limit
 
     def stream(self) -> tuple[Any, ...] | None:
@@ -111,7 +111,7 @@ class SensitivityMonteCarlo(MonteCarlo):
     second_moment: SecondMoment = "quadratic"
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        """Linearise at the mean parameters, sample and estimate; results as of `MonteCarlo`, and `variance_ratio`.
+        """Linearise at the mean parameters, sample and estimate; results as in `MonteCarlo`, and `variance_ratio`.
 
         Raises
         ------
@@ -266,7 +266,7 @@ def _dataset(
 
 
 def by_node(field: Estimates, displacements: int) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
-    """Return estimates of a state, of which so many entries are displacements, as arrays by node and component."""
+    """Return estimates of a state, whose first entries are displacements, as arrays by node and component."""
     return {
         f"field_{name}": (("node", "component"), getattr(field, name)[:displacements].reshape(-1, 3))
         for name in ESTIMATES
@@ -274,16 +274,16 @@ def by_node(field: Estimates, displacements: int) -> dict[str, tuple[tuple[str, 
 
 
 def failure_note(ok: NDArray[np.bool_], which: str, followed: str | None) -> str:
-    """Say what estimates mean where some samples have no answer.
+    """Say what estimates mean if some samples have no answer.
 
     Parameters
     ----------
     ok
         Which samples have an answer, not all of them.
     which
-        The estimates that use nothing but answers.
+        The estimates that use only answers.
     followed
-        What the samples without an answer are taken to follow in controlled estimates, if there are any.
+        What samples without an answer are assumed to follow in controlled estimates, if there are any.
     """
     failed = int((~ok).sum())
     note = f"{failed} of {len(ok)} samples have no answer"
@@ -291,5 +291,5 @@ def failure_note(ok: NDArray[np.bool_], which: str, followed: str | None) -> str
         note += f"; {which} are over the {len(ok) - failed} others, that is, conditional on the model having an answer"
     if followed is not None:
         # The mean of the control is known over all samples, also those that failed.
-        note += f"; controlled estimates take the failed ones to follow {followed}, which their errors do not cover"
+        note += f"; controlled estimates assume that the failed ones follow {followed}, which their errors do not cover"
     return note

@@ -8,9 +8,9 @@ tangent prediction T_l and V_l = E[T_l²], the terms of the mean and of the seco
     ⟨w_l − w_{l−1} − (T_l − T_{l−1})⟩
     ⟨w_l² − w_{l−1}² − (T_l² − V_l − T_{l−1}² + V_{l−1})⟩
 
-of which the controls, in brackets, have the expectation zero. `moments.combine` adds them up.
+where the controls, in brackets, have expectation zero. `moments.combine` adds them up.
 
-How samples are allotted, differences estimated and errors added depend on each other at every step: one file.
+Allotting samples, estimating differences and adding errors depend on each other at every step, hence one file.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec, Times
 
 FIRST_MESHES = 3  # two differences, the fewest that show a rate
-ASSUMED_RATE = 1.0  # of convergence per mesh, where there is one difference only
-RATES = (0.5, 2.0)  # between which rates are taken to lie: faster does not last where stresses are singular
-SIZE = 10_000  # unknowns that a model without a state is taken to have on the coarsest mesh
+ASSUMED_RATE = 1.0  # of convergence per mesh, if there is only one difference
+RATES = (0.5, 2.0)  # assumed bounds of rates: faster ones do not last where stresses are singular
+SIZE = 10_000  # unknowns assumed on the coarsest mesh for a model without a state
 HEAVY_TAILED = 100.0  # kurtosis beyond which a variance from a few samples says little
 UNCOUPLED = 0.5  # of the variance on a mesh: a difference that varies more gains nothing from the coarser mesh
 
@@ -51,29 +51,30 @@ class MultilevelMonteCarlo(Amount):
     """Multilevel Monte Carlo over meshes: mean and standard deviation to a total error, of mesh and sampling.
 
     The body of the study is the coarsest mesh; the cells of mesh l are divided by 2^l along each edge. Meshes are added
-    as the estimated error of the finest asks for, each with a pilot, from which the number of samples on every mesh is
+    as the estimated error of the finest requires, each with a pilot, from which the number of samples on every mesh is
     chosen so that the cost is least: n_l ∝ √(V_l/C_l), V_l the variance and C_l the predicted cost of one sample.
     Displacement fields are not estimated, since they live on different meshes.
 
     Parameters
     ----------
     samples
-        Number of samples on the coarsest mesh, with as many on the others as are best with that; with a tolerance or a
-        budget, the largest number.
+        Number of samples on the coarsest mesh, with optimal numbers on the others; with a tolerance or a budget, the
+        largest number.
     tolerance
         Stop when the total error of every mean, √(mesh² + sampling²), is below this fraction of the mean (of the
         standard deviation, where the mean is smaller than that).
     budget_seconds
-        As of `Amount`; a third mesh, or a finer one, is not added if that would take more than half of what is left.
+        As in `Amount`; a third or finer mesh is not added if it would take more than half of the remaining budget.
     levels
         Largest number of meshes.
     pilot
-        Number of samples on each mesh before anything is known about it; no more groups of ranks have work with them.
+        Number of samples on each mesh before anything is known about it; they keep at most this many groups of ranks
+        busy.
     control
         Control variate on every mesh: "none", or the "tangent" at the mean parameters, with the coefficient 1: there
         are too few samples on fine meshes to fit another.
     seed
-        Seed of the random points; every mesh has a stream of its own.
+        Seed of the random points; every mesh has its own stream.
     """
 
     kind: Literal["multilevel-monte-carlo"] = "multilevel-monte-carlo"
@@ -90,7 +91,7 @@ class MultilevelMonteCarlo(Amount):
         return self
 
     def planned(self, dimension: int) -> int:
-        """Number of solves of the linearisations and pilots on all meshes: how many more, these decide."""
+        """Number of solves of the linearisations and pilots on all meshes, which decide how many more are needed."""
         return self.levels + self.pilot * (2 * self.levels - 1)
 
     @property
@@ -103,7 +104,7 @@ class MultilevelMonteCarlo(Amount):
         return {_name(level): spec.refined(level) for level in range(1, self.levels)}
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find that there are no meshes, or that they have parameters of their own."""
+        """Find that there are no meshes, or that they have different parameters."""
         if not spec.meshed:
             yield ("method", "kind"), f"a model of kind '{spec.kind}' has no meshes, expected another method", self.kind
         elif spec.coefficients:
@@ -163,12 +164,12 @@ class MultilevelMonteCarlo(Amount):
         return np.inf if self.budget_seconds is None else self.budget_seconds - recorder.seconds
 
     def _wants_finer(self, meshes: list[_Mesh], found: _Found, allocation: _Allocation, left: float) -> bool:
-        """Whether a finer mesh is the next thing to do."""
+        """Whether a finer mesh is the next step."""
         if len(meshes) == self.levels or not meshes[-1].affords_finer(left):
             return False
         error = float(found.relative(found.bias_error).max())
         if self.tolerance is not None:
-            # First sample as if there was no finer mesh: only that shows how far the error of the mesh can be trusted.
+            # First sample as if there were no finer mesh: only this shows how far the mesh error can be trusted.
             return allocation.settled and 2 * error**2 > self.tolerance**2
         return error > allocation.sampling_error
 
@@ -340,7 +341,7 @@ class _Mesh:
 
     @property
     def measured_cost(self) -> float:
-        """Time (s) that one sample took on both meshes: what a budget pays for."""
+        """Time (s) that one sample took on both meshes, which counts against a budget."""
         here = self._seconds / self._solves
         return here if self._coarser is None else here + self._coarser._seconds / self._coarser._solves
 
@@ -351,7 +352,7 @@ class _Mesh:
         return TEXTBOOK * finer + self._method.pilot * (finer + self.seconds_per_solve)
 
     def affords_finer(self, left: float) -> bool:
-        """Whether the next finer mesh takes no more than half of what is left (s), judging by the solves so far."""
+        """Whether the next finer mesh takes at most half of the remaining budget (s), judging by the solves so far."""
         return self.cost_of_finer * self.measured_cost / self.cost <= left / 2
 
     @property
@@ -361,7 +362,7 @@ class _Mesh:
 
     @property
     def offset(self) -> FloatArray:
-        """Difference (m,) of what the deviations are from."""
+        """Difference (m,) of the values from which deviations are taken."""
         return self.centre.middle - (0 if self._coarser is None else self._coarser.centre.middle)
 
     def deviations(self, outputs: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -452,7 +453,7 @@ class _Found:
         return np.hypot(self.bias_error, self.estimates.mean_error)
 
     def relative(self, error: FloatArray) -> FloatArray:
-        """An error (…, m) over the mean, or over the standard deviation where that is larger."""
+        """An error (…, m) over the mean, or over the standard deviation if that is larger."""
         scale = np.maximum(np.abs(self.estimates.mean), self.estimates.std)
         return ratio(error, np.broadcast_to(scale, error.shape))
 
@@ -483,8 +484,8 @@ def rate(values: FloatArray) -> FloatArray:
 def bias(differences: FloatArray, alpha: FloatArray) -> FloatArray:
     """Estimate the error (m,) on the finest mesh from the differences (L, m) between meshes: |E[Y_L]| / (2^α − 1).
 
-    |E[Y_L]| counts as not below what the two differences before it let expect with the rate α (m,), which guards
-    against one that is small by chance (M. B. Giles, Acta Numerica 24 (2015), section 3.2).
+    |E[Y_L]| counts as at least what the two differences before it predict with the rate α (m,), which guards against
+    one that is small by chance (M. B. Giles, Acta Numerica 24 (2015), section 3.2).
     """
     last = np.abs(differences[-3:])
     expected = last * 2.0 ** (-alpha * np.arange(len(last))[::-1, None])
@@ -498,13 +499,13 @@ class _Allocation:
     Attributes
     ----------
     now
-        To go on to next.
+        To reach next.
     settled
-        Whether this is what there is already.
+        Whether this is the current allocation.
     cut
-        Whether the budget does not pay for all that is wanted.
+        Whether the budget is too small for all that is needed.
     sampling_error
-        Relative error of sampling that is expected in the end.
+        Expected final relative sampling error.
     """
 
     now: FloatArray
@@ -519,7 +520,7 @@ def optimal(variances: FloatArray, costs: FloatArray, target: float) -> FloatArr
 
 
 def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Found, left: float) -> _Allocation:
-    """Choose numbers of samples: as many as tolerance, samples and budget let, whichever is least."""
+    """Choose numbers of samples: the least of what tolerance, samples and budget allow."""
     counts = np.array([len(mesh.points) for mesh in meshes], dtype=float)
     costs = np.array([mesh.cost for mesh in meshes])
     limit = float(method.samples or UNLIMITED)
@@ -527,7 +528,7 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Fou
     by_output = found.relative(found.relative(np.array([mesh.term.variance for mesh in meshes])))
     variances = np.maximum(by_output.max(axis=1), 1e-30)
     if len(meshes) >= FIRST_MESHES:
-        # A few samples may be alike by chance: none of the finer meshes is taken to vary much less than expected.
+        # A few samples may agree by chance: no finer mesh is assumed to vary much less than expected.
         decay = 2.0 ** -max(float(rate(variances[1:, None])[0]), RATES[0])
         for level in range(2, len(meshes)):
             variances[level] = max(variances[level], 0.5 * decay * variances[level - 1])
@@ -539,7 +540,7 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Fou
     wanted = limit / shape[0]
     if method.tolerance is not None:
         wanted = min(wanted, 1 / _target(method, meshes, found, variances, costs))
-    # What the budget pays for: cost grows with the multiple, so bisection finds the largest.
+    # What the budget allows: cost grows with the multiple, so bisection finds the largest.
     paid = np.array([mesh.measured_cost for mesh in meshes])
     low, high = 0.0, wanted
     cut = (numbers(wanted) - counts) @ paid > left
@@ -556,7 +557,7 @@ def _allocate(method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Fou
 def _target(
     method: MultilevelMonteCarlo, meshes: Sequence[_Mesh], found: _Found, variances: FloatArray, costs: FloatArray
 ) -> float:
-    """Square of the relative error that is left to sampling."""
+    """Square of the relative error allowed for sampling."""
     assert method.tolerance is not None
     allowed = method.tolerance**2
     # A little more than its estimate, so that the total is met when sampling meets its share.

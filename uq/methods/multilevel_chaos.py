@@ -7,9 +7,9 @@ S. P. A. Bordas, Applied Mathematical Modelling 62 (2018) 86–102), where an it
 factor and the first level starts from the solution at the mean parameters. Here an iteration is a residual and a
 back-substitution with the factor at the mean, and the first level starts from the tangent there.
 
-No level gets below the error that its polynomials leave, whatever the number of levels: an expansion predicts the
-state to that, and a few corrections divide it by a constant. So, once the moments have settled, one level more goes on
-to the solver's tolerance, and what is reported rests on equilibria.
+No level gets below the error of its polynomials, whatever the number of levels: an expansion predicts the state to
+this error, and a few corrections divide it by a constant. So, once the moments have settled, one more level iterates to
+the solver's tolerance, and the reported results rest on equilibria.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from uq.surrogates.basis import Basis
 
-SAMPLES_PER_TERM = 3  # of a level, if nothing else is said; rounded up to a power of two
+SAMPLES_PER_TERM = 3  # of a level by default; rounded up to a power of two
 TO_TOLERANCE = 1_000_000  # iterations: as many as the solver needs
 
 
@@ -57,18 +57,18 @@ class MultilevelChaos(Amount):
         to the next: means relative to the means (to the standard deviations where these are larger), standard
         deviations relative to themselves, those of the displacement field in the Euclidean norm.
     budget_seconds
-        As of `Amount`; another level is begun if it pays for all of it.
+        As in `Amount`; another level is begun only if the budget covers all of it.
     iterations
         Iterations of the solver for each sample of a level.
     order
         Order of the expansion, which has all (d + order)! / d! order! terms.
     max_levels
-        Largest number of levels; the last one goes on to the solver's tolerance.
+        Largest number of levels; the last one iterates to the solver's tolerance.
     first
         Where the first level starts: from the "tangent" at the mean parameters, or from the state there ("mean"), as
         published.
     seed
-        Seed of the Sobol' points, of which each level takes another scramble.
+        Seed of the Sobol' points; each level uses a different scramble.
     quantiles
         Probabilities of the quantiles of the outputs.
     fields
@@ -86,7 +86,7 @@ class MultilevelChaos(Amount):
     fields: bool = True
 
     def check_amount(self) -> None:
-        """Raise no error: levels have a number of samples, and a largest number, if nothing is said."""
+        """Raise no error: levels have a default number of samples, and there is a default number of levels."""
 
     def per_level(self, dimension: int) -> int:
         """Number of samples of a level for so many parameters."""
@@ -99,11 +99,11 @@ class MultilevelChaos(Amount):
         return 1 + self.max_levels * self.per_level(dimension)
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters cannot be expanded in, or None."""
+        """Say why an expansion in these parameters is impossible, or None."""
         return objection(inputs, self.kind)
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find that there is no solver that could be stopped."""
+        """Find that there is no solver that could be stopped early."""
         if not spec.iterative:
             message = f"a model of kind '{spec.kind}' has no iterations of a solver, expected another method"
             yield ("method", "kind"), message, self.kind
@@ -128,7 +128,7 @@ class MultilevelChaos(Amount):
         Returns
         -------
         xarray.Dataset
-            As of `uq.methods.chaos.Chaos`, from the last level; the same moments from its samples with the expansion of
+            As in `uq.methods.chaos.Chaos`, from the last level; the same moments from its samples with the expansion of
             the level before as control variate (`control_mean`, …); and by level what it has cost and reached
             (`level_residual`, `level_change`, …); see docs/results.md.
 
@@ -198,7 +198,7 @@ class MultilevelChaos(Amount):
 
 @dataclass(frozen=True)
 class _Known:
-    """An approximation of the model of which the moments are known.
+    """An approximation of the model whose moments are known.
 
     Attributes
     ----------

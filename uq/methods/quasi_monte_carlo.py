@@ -4,7 +4,7 @@ The mean over one scramble is unbiased, since each of its points is uniform by i
 their scatter gives an honest standard error without any assumption on the smoothness that makes it small
 (A. B. Owen, SIAM J. Numer. Anal. 34 (1997) 1884–1910; C. Lemieux, Monte Carlo and Quasi-Monte Carlo Sampling (2009)).
 
-The three controls share the scrambles and their sums, and so one file.
+The three controls share the scrambles and their sums, hence one file.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Pair = tuple[FloatArray, FloatArray]
-ORDER = 6  # largest of the expansions that are tried as control
-FIT = 2**32 - 1  # number of the scramble that the control is fitted to, which none of the samples belong to
+ORDER = 6  # largest order of the expansions tried as control
+FIT = 2**32 - 1  # number of the scramble to which the control is fitted; no sample belongs to it
 
 
 class QuasiMonteCarlo(MonteCarlo):
@@ -61,8 +61,8 @@ class QuasiMonteCarlo(MonteCarlo):
     samples
         Number of samples in all, `scrambles` times a power of two; with a tolerance, the largest number.
     tolerance
-        As of `MonteCarlo`: the number of points is doubled until it is met, and all earlier points are kept. The error
-        that is compared with it is itself uncertain (by 18 % for 16 scrambles).
+        As in `MonteCarlo`: the number of points is doubled until it is met, and all earlier points are kept. The error
+        compared with it is itself uncertain (by 18 % for 16 scrambles).
     seed
         Point z of scramble r of a seed is the same in every study with as many parameters.
     scrambles
@@ -70,10 +70,10 @@ class QuasiMonteCarlo(MonteCarlo):
     control
         Control variate: "none", the "tangent" at the mean parameters, the "quadratic" Taylor polynomial there, which
         takes two more solves, with tangents, for each parameter, or "chaos", an expansion fitted to values and
-        gradients at samples of its own: its errors cost efficiency and bias nothing. It needs independent parameters,
-        and with `fields` it is where the solver starts from too.
+        gradients at separate samples: its errors cost efficiency but cause no bias. It needs independent parameters,
+        and with `fields` it also provides the starts of the solver.
     control_samples
-        Number of samples that the expansion is fitted to; if nothing is said, twice what order 3 needs (order 2 above
+        Number of samples to which the expansion is fitted; by default, twice what order 3 needs (order 2 above
         eight parameters). Order and terms are chosen as `Chaos` does. Where parameters have tails and the expansion
         goes wrong beyond the reach of these samples, which the others tell, it is held at its values there, and the
         displacement field has no control.
@@ -81,8 +81,8 @@ class QuasiMonteCarlo(MonteCarlo):
         "one", or "optimal": estimated by regression over the scrambles, of which there must be 4; it has a bias of
         order 1/R, a fraction of its error (seen with 4 points per scramble, for the standard deviation).
     quantiles, fields
-        As of `MonteCarlo`. With `fields`, one scramble is evaluated after the other, so that no more groups of ranks
-        than points in a scramble have work.
+        As in `MonteCarlo`. With `fields`, scrambles are evaluated one after the other, so that at most as many groups
+        of ranks as points in a scramble have work.
     """
 
     kind: Literal["quasi-monte-carlo"] = "quasi-monte-carlo"  # type: ignore[assignment]
@@ -105,15 +105,15 @@ class QuasiMonteCarlo(MonteCarlo):
 
     @property
     def limit(self) -> int:
-        """Number of samples, the largest where a tolerance may end the study earlier."""
+        """Number of samples; the largest, if a tolerance may end the study earlier."""
         return self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles)
 
     def planned(self, dimension: int) -> int:
-        """Number of solves with that many parameters, the largest where a tolerance may end the study earlier."""
+        """Number of solves with so many parameters; the largest, if a tolerance may end the study earlier."""
         return 1 + self.limit + self._fitted(dimension)
 
     def with_tangents(self, samples: int) -> int:
-        """Number of samples that the control variate is fitted to."""
+        """Number of samples to which the control variate is fitted."""
         return max(0, samples - self.limit)
 
     def stream(self) -> tuple[Any, ...] | None:
@@ -143,7 +143,7 @@ class QuasiMonteCarlo(MonteCarlo):
         Returns
         -------
         xarray.Dataset
-            As of `MonteCarlo`, with the scramble of each sample (`scramble`), what a sample is worth
+            As in `MonteCarlo`, with the scramble of each sample (`scramble`), its worth in plain samples
             (`variance_ratio`, `std_variance_ratio`) and the estimates from the first points of all scrambles
             (`running_mean`, `running_mean_error`); see docs/results.md.
 
@@ -186,7 +186,7 @@ class QuasiMonteCarlo(MonteCarlo):
         return self._dataset(inputs, evaluate, centre, fitted, samples, scalars)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
-        """Fit the expansion to a scramble of its own: given the fit, the samples are as random as ever."""
+        """Fit the expansion to a separate scramble, so that given the fit, the samples are still random."""
         d = len(inputs.names)
         points = inputs.points(sobol_points(self.seed, FIT, 0, self._fitted(d), d))
         try:
@@ -327,7 +327,7 @@ class _Samples:
         return np.tile(np.arange(self._method.scrambles), self.each)
 
     def in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
-        """Flatten (R, n, …) to (R n, …), the first points of all scrambles first: a shorter study is the beginning."""
+        """Flatten (R, n, …) to (R n, …), first points of all scrambles first: a shorter study is a prefix."""
         return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
 
     def extend(self, each: int) -> None:
@@ -379,7 +379,7 @@ class _Samples:
         products = np.where(ok[..., None], _products(deviations, controls), 0.0).sum(axis=2)
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
-        # A tangent grows no faster than a normal quantity; what grows faster says itself what is beyond the samples.
+        # A tangent grows no faster than a normal quantity; controls that grow faster tell what lies beyond the samples.
         tails = counted(found, self._inputs, self.outputs[:, :each][ok])
         if self._method.control not in ("quadratic", "chaos"):
             return tails
@@ -387,7 +387,7 @@ class _Samples:
         return replace(found, std_error=np.where(found.second_coefficient == 0, tails.std_error, known))
 
     def _unseen(self, each: int) -> FloatArray:
-        """Error (m,) of the standard deviation from where a polynomial controls what no sample has seen.
+        """Error (m,) of the standard deviation from regions without samples, where a polynomial is the control.
 
         With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
         about 2λ√b σ, with λ in proportion to that at the samples, which have 1 − b of the variance. A tangent does not

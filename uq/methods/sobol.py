@@ -2,14 +2,14 @@
 
 The formulas, and where they are from, are in `uq.estimators.indices`. Exchanged samples (A. Saltelli et al., Comput.
 Phys. Commun. 181 (2010) 259–270) come in rows of d + 2 solves; A and B are the halves of scrambled Sobol' points in 2d
-dimensions. A row in which a solve failed is left out as a whole: with some of its points only, the differences that the
-estimators average would be of other points.
+dimensions. A row in which a solve failed is left out as a whole: with only some of its points, the differences that the
+estimators average would be incomplete.
 
-The rows belong to one scrambled Sobol' sequence: independent scrambles of a sixteenth of the rows each err two to four
-times more at a thousand rows. Errors come from drawing its R parts of consecutive rows again, each a net by itself. The
-parts complement each other, which this does not see: it claims the error of R independent parts, which is no smaller.
+The rows belong to one scrambled Sobol' sequence: independent scrambles of a sixteenth of the rows each have two to four
+times the error at a thousand rows. Errors come from resampling its R parts of consecutive rows, each a net by itself.
+This ignores that the parts complement each other: it claims the error of R independent parts, which is no smaller.
 
-The three designs share groups, fields and intervals, and so one file.
+The three designs share groups, fields and intervals, hence one file.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
 
-SAME = 1e-6  # relative difference of outputs of one model at its mean parameters, at most
+SAME = 1e-6  # largest relative difference of outputs of the same model at its mean parameters
 DIMENSIONS = {
     "sobol_first": ("output", "parameter"),
     "sobol_total": ("output", "parameter"),
@@ -72,14 +72,14 @@ Variables = dict[str, tuple[tuple[str, ...], Any]]
 
 
 class Sobol(Amount):
-    """Sobol' indices: the shares of the variance that parameters have alone, and with their interactions.
+    """Sobol' indices: shares of the variance due to parameters alone, and with their interactions.
 
     Parameters
     ----------
     design
         "chaos": from an expansion fitted to values and gradients at few points. "saltelli": from exchanged scrambled
-        Sobol' points, with nothing assumed of the model. "given-data": from the results of another study of the same
-        model and parameters, of its expansion or of one that is fitted to its samples; no sample is solved.
+        Sobol' points, without assumptions on the model. "given-data": from the results of another study of the same
+        model and parameters: from its expansion, or one fitted to its samples; no sample is solved.
     samples
         Number of solves ("chaos"), or of rows of solves ("saltelli"): `scrambles` times a power of two, each of d + 2
         solves, of one more for every group, and of d more for the second order; with a tolerance or a budget, the
@@ -88,24 +88,24 @@ class Sobol(Amount):
         Stop when the leave-one-out error of every output is below this fraction of its standard deviation ("chaos"),
         or when the standard error of every index of first order and total is below it ("saltelli").
     budget_seconds
-        As of `Amount`.
+        As in `Amount`.
     second_order
-        Whether the shares of products of two parameters are estimated too.
+        Whether second-order indices, of pairs of parameters, are estimated too.
     groups
-        Names of groups with the parameters that they have: their indices are estimated too.
+        Named groups of parameters, whose indices are estimated too.
     source
         Directory of the results to take ("given-data"), beside the study or else in the working directory.
     scrambles
-        Number of parts of one scrambled sequence ("saltelli"): their scatter is the error that is claimed, with R − 1
+        Number of parts of one scrambled sequence ("saltelli"), whose scatter gives the claimed error, with R − 1
         degrees of freedom.
     max_order, gradients
-        As of `Chaos`.
+        As in `Chaos`.
     seed
         Seed of the design; sample z of a seed is the same in every study with as many parameters.
     quantiles
         Probabilities of the quantiles of the outputs.
     fields
-        Whether indices of the displacement field are computed: of the whole (weighted by the variance) and by node.
+        Whether indices of the displacement field are computed: for the whole (weighted by the variance) and by node.
     """
 
     kind: Literal["sobol"] = "sobol"
@@ -122,7 +122,7 @@ class Sobol(Amount):
     results: SkipJsonSchema[Any] = Field(default=None, exclude=True, repr=False)  # those of `source`
 
     def check_amount(self) -> None:
-        """Raise a ValueError where design, amount and source do not go together."""
+        """Raise a ValueError if design, amount and source are inconsistent."""
         if self.design == "given-data":
             if self.source is None or self.asked:
                 message = (
@@ -139,11 +139,11 @@ class Sobol(Amount):
             check_scrambles(self.samples, self.scrambles)
 
     def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
-        """Return the same with the results that it takes."""
+        """Return the same with the results that it uses."""
         return self if self.source is None else self.model_copy(update={"results": read(self.source)})
 
     def planned(self, dimension: int) -> int:
-        """Number of solves for so many parameters, the largest where a tolerance may end the study earlier."""
+        """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.design == "given-data":
             return 1
         if self.design == "chaos":
@@ -162,14 +162,14 @@ class Sobol(Amount):
         return None
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find groups of strange parameters, too."""
+        """Also find groups with unknown parameters."""
         yield from super().mistakes(inputs, spec)
         stranger = self.unknown(inputs)
         if stranger is not None:
             yield ("method", "groups"), stranger, self.model_dump()["groups"]
 
     def unknown(self, inputs: Inputs) -> str | None:
-        """Say which member of a group is no parameter, or None."""
+        """Say which member of a group is not a parameter, or None."""
         for group, names in self.groups.items():
             for name in names:
                 if name not in inputs.names:
@@ -356,8 +356,8 @@ def _running(rounds: dict[int, dict[str, FloatArray]]) -> Variables:
 def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     """Add the indices of an expanded field.
 
-    Errors of the whole field's are known with the expansion; where that explains nothing of the field there are none.
-    Maps are empty where it explains nothing of a node.
+    Errors of the whole field's indices come with the expansion; there are none if it explains nothing of the field.
+    Maps are empty at nodes of which it explains nothing.
     """
     if "field_coefficients" not in dataset:
         return dataset
@@ -379,7 +379,7 @@ def _with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
 
 
 def _fitting(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-    """Return the results of another study, which must be of the same parameters and outputs.
+    """Return the results of another study, which must have the same parameters and outputs.
 
     Raises
     ------
@@ -406,7 +406,7 @@ def _fitting(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evalu
 
 
 def _distributions(config: str | None) -> dict[str, Any]:
-    """Return the distributions of a study that was written down, if it was."""
+    """Return the distributions of a recorded study, if there is a record."""
     import tomllib
 
     return dict(tomllib.loads(config or "").get("parameters", {}))
@@ -478,7 +478,7 @@ class _Rows:
         self._reasons: set[str] = set()
 
     def extend(self, each: int) -> None:
-        """Go on to `each` rows in every part: to all from none, or to twice as many."""
+        """Extend every part to `each` rows: to all from none, or to twice as many."""
         method, centre, K = self._method, self._centre, self.products.size
         d, before, after = len(self._inputs.names), len(self.ok), self._parts * each
         cubes = sobol_points(method.seed, 0, before, after, 2 * d)

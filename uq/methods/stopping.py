@@ -1,4 +1,4 @@
-"""How long a sampling method goes on (samples, tolerance, time), and how long a solve will take."""
+"""When a sampling method stops (samples, tolerance, time), and how long a solve will take."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from pydantic import Field, model_validator
 
 from uq.methods.method import Method
 
-TEXTBOOK = 15  # times as long as a predicted solve takes one from zero, at 10⁴ unknowns
+TEXTBOOK = 15  # ratio of the times of a solve from zero and a predicted one, at 10⁴ unknowns
 
 
 class Amount(Method):
-    """The amount of sampling that is asked for, at least one of the three.
+    """The requested amount of sampling, at least one of the three.
 
     Parameters
     ----------
     samples
         Number of samples; with a tolerance or a budget, the largest number.
     tolerance
-        Largest error; of what, the method says.
+        Largest error, of a quantity that depends on the method.
     budget_seconds
-        Processor time (s) of all solves together, on all ranks: so much more is not begun, judging by the solves so
-        far. Solves that a restart finds on disk count with the time that they took.
+        Processor time (s) of all solves together, on all ranks: no work is begun that would exceed it, judging by the
+        solves so far. Solves that a restart finds on disk count with the time that they took.
     """
 
     samples: Annotated[int, Field(ge=2)] | None = None
@@ -36,7 +36,7 @@ class Amount(Method):
         return self
 
     def check_amount(self) -> None:
-        """Raise a ValueError where no amount is given."""
+        """Raise a ValueError if no amount is given."""
         if not self.asked:
             message = "gives neither samples nor tolerance nor budget_seconds, expected at least one of them"
             raise ValueError(message)
@@ -52,11 +52,11 @@ class Amount(Method):
         return self.tolerance is not None or self.budget_seconds is not None
 
     def met(self, reached: float) -> bool:
-        """Whether a tolerance was asked for and an error `reached` meets it."""
+        """Whether a tolerance was requested and an error `reached` meets it."""
         return self.tolerance is not None and reached <= self.tolerance
 
     def affordable(self, solves: int, seconds: float) -> float:
-        """Return the number of solves that the budget still pays for, if they take as long as those `solves` did."""
+        """Return the number of solves that the budget still allows, if they take as long as those `solves` did."""
         if self.budget_seconds is None or seconds == 0:
             return np.inf
         return max(0.0, solves * (self.budget_seconds / seconds - 1))
@@ -87,9 +87,9 @@ class Amount(Method):
 def seconds_per_solve(unknowns: int) -> float:
     """Weigh solves on nested meshes of so many unknowns against each other, in seconds.
 
-    Methods choose numbers of samples by it: it follows from the unknowns alone, and stays as it is, so that results do
-    too. What `check` says of times is better (`forward.fem.cost`), and may become better still.
-    Fitted to 0.011, 0.067 and 0.98 s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core;
-    `python -m benchmarks realisation`). Inputs so wide that the prediction fails take several times as long.
+    Methods choose numbers of samples by it: it depends only on the unknowns and stays fixed, so that results do too.
+    The predictions of `check` are better (`forward.fem.cost`) and may improve further. Fitted to 0.011, 0.067 and 0.98
+    s at 1 575, 9 963 and 70 227 unknowns (quadratic tetrahedra, a 2.8 GHz core; `python -m benchmarks realisation`).
+    Inputs so wide that the prediction fails take several times as long.
     """
     return float(4e-3 + 1.2e-6 * unknowns**1.2)

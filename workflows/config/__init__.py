@@ -1,1 +1,1 @@
-"""Studies as they are written down: their blocks, and what is wrong with them."""
+"""Studies as they are written: their blocks, and the mistakes in them."""

@@ -18,15 +18,15 @@ class Correlation(Settings):
 
 
 class Parallel(Settings):
-    """How ranks are used; it does not change results (except by rounding, where ranks share a model or blocks change).
+    """How ranks are used; results do not depend on it (except for rounding, if ranks share a model or blocks change).
 
     Parameters
     ----------
     ranks_per_model
         Ranks that share one model; the others work on other samples.
     blocks
-        Most blocks that an evaluation is cut into: more groups of ranks than these have nothing to do, and a block
-        that is interrupted is begun again.
+        Largest number of blocks into which an evaluation is cut: more groups of ranks than this have nothing to do, and
+        an interrupted block is started again.
     """
 
     ranks_per_model: Annotated[int, Field(ge=1)] = 1

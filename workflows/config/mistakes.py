@@ -30,7 +30,7 @@ class StudyError(Exception):
 
 
 def refused(title: str, mistakes: Sequence[Mistake]) -> None:
-    """Raise what pydantic raises, if there are mistakes."""
+    """Raise pydantic's exception if there are mistakes."""
     if mistakes:
         raise ValidationError.from_exception_data(
             title,
@@ -42,7 +42,7 @@ def refused(title: str, mistakes: Sequence[Mistake]) -> None:
 
 
 _APART = [kind for kind in STUDIES.own if kind != SAMPLING]  # kinds of studies whose files have other blocks
-# What pydantic puts into the places of mistakes beside keys: the members of a union, in words of TOML.
+# What pydantic adds to the locations of mistakes besides keys: the members of a union, in TOML's words.
 _MEMBERS = {
     "str": "a text",
     "float": "a number",
@@ -80,7 +80,7 @@ def lines(error: ValidationError, place: str = "") -> list[str]:
 
 
 def _around_member(steps: Sequence[str | int], place: str) -> tuple[str, str | None, bool]:
-    """Return where a union on the way to a mistake stands, the member that it is in, and whether it is inside that."""
+    """Return the location of a union on the path to a mistake, its member, and whether the mistake is inside that."""
     for i, step in enumerate(steps):
         match = _MEMBER.match(step) if isinstance(step, str) else None
         if match is not None:
@@ -115,7 +115,7 @@ _WORD = 60  # letters of a key in a message
 
 
 def _kinds() -> set[str]:
-    """Return the kinds of blocks, which pydantic puts into the places of errors."""
+    """Return the kinds of blocks, which pydantic includes in the locations of errors."""
     from typing import get_args
 
     from forward.bodies import geometry, inclusions
@@ -125,4 +125,4 @@ def _kinds() -> set[str]:
     return {member.model_fields["kind"].default for member in members}
 
 
-_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys stand in its own block
+_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys are in its own block

@@ -1,4 +1,4 @@
-"""Priors that reach where there is no model: what is refused, and what is said of the rest."""
+"""Priors with values for which there is no model: what is refused, and what is said about the rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
-LEAST = 0.5  # probability that constants must have to be of a material at all
+LEAST = 0.5  # smallest probability of admissible constants
 
 
 def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
@@ -23,7 +23,7 @@ def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, flo
 
 
 def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
-    """Find a prior of the factor on standard deviations of errors that reaches what is no standard deviation."""
+    """Find a prior of the factor on standard deviations of errors that allows values ≤ 0."""
     if prior is None:
         return
     lowest = prior.support[0] if prior.support is not None else prior.at(NEGLIGIBLE)
@@ -35,7 +35,7 @@ def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mist
 def mistakes_of_parameters(
     scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution], constants: Collection[str] = ()
 ) -> Iterator[Mistake]:
-    """Find parameters that are no numbers of a model, or that reach where it is impossible.
+    """Find parameters that are not numbers of a model, or that allow values for which it is impossible.
 
     Constants of materials are left out: they are judged together, by `workflows.config.priors`.
     """
@@ -57,7 +57,7 @@ def mistakes_of_parameters(
 
 
 def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mistake]:
-    """Find distributions of constants of which most are of no material; they are judged together."""
+    """Find distributions of constants most of which are inadmissible; constants are judged together."""
     if inputs.admitted >= LEAST:
         return
     middle = inputs.from_normals(np.zeros((1, len(inputs.names))))[0][0]
@@ -68,7 +68,7 @@ def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mist
 
 
 def findings_of_materials(inputs: Inputs, where: str = "") -> Iterator[Finding]:
-    """Say how much of a prior is of no material, and that the rest takes its place."""
+    """Say how much of a prior is inadmissible, and that the rest is rescaled."""
     if inputs.admitted < 1:
         text = (
             f"{where}{_share(inputs)} of the prior is of materials that are not stable at rest (μ or κ is not "
@@ -78,7 +78,7 @@ def findings_of_materials(inputs: Inputs, where: str = "") -> Iterator[Finding]:
 
 
 def findings_of_draws(inputs: Inputs) -> Iterator[Finding]:
-    """Say how many of the samples will be of no material, and that they fail."""
+    """Say how many of the samples will be inadmissible, and that they fail."""
     if inputs.admitted < 1:
         text = (
             f"{_share(inputs)} of the samples are of materials that are not stable at rest (μ or κ is not positive): "

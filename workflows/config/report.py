@@ -1,4 +1,4 @@
-"""What a study asks of its report."""
+"""What a study specifies for its report."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from forward.settings import Settings
 
 
 class Report(Settings):
-    """What the report shows beside what every report does. It changes no results.
+    """What the report shows besides the usual sections. It does not change results.
 
     Parameters
     ----------
     sections
-        Sections of one's own: dotted paths, such as "my_sections.Wear", to classes in modules beside the study.
+        Your own sections: dotted paths, such as "my_sections.Wear", to classes in modules beside the study.
     folder
         Where these modules are: the folder of the study, unless said otherwise.
     """
@@ -32,7 +32,7 @@ class Report(Settings):
 
 
 def located(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the blocks of a study with the folder of its sections, which it names from where it stands itself."""
+    """Return the blocks of a study with the folder of its sections, which it names relative to its own."""
     block = blocks.get("report")
     if not isinstance(block, Mapping) or not isinstance(place := block.get("folder", ""), str):
         return dict(blocks)

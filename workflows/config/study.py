@@ -30,16 +30,16 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     document
         The blocks of the study, as read from TOML.
     overrides
-        Assignments such as ``method.samples=512`` that come on top; values are TOML, or else plain text.
+        Assignments such as ``method.samples=512``, applied last; values are TOML, or else plain text.
     folder
-        Where tables of data, meshes and modules of kinds are that it names.
+        Where the data tables, meshes and modules that it names are.
 
     Raises
     ------
     StudyError
         With every mistake found.
     ModelError
-        If a kind is a dotted path to a module that is there twice.
+        If a kind is a dotted path to a module that exists twice.
     """
     blocks = dict(document)
     for assignment in overrides:
@@ -66,7 +66,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
 
 
 def _deeper_than(tree: Any, most: int) -> bool:
-    """Whether lists and tables are nested in more levels than these."""
+    """Whether lists and tables are nested more deeply than this."""
     level = [tree]
     for _ in range(most):
         level = [item for one in level for item in (one.values() if isinstance(one, dict) else one)]
@@ -88,7 +88,7 @@ def _beyond(place: str, value: Any) -> Iterator[str]:
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Say in full where a mesh and the results of another study are, which a study names from where it stands itself.
+    """Give the full paths of a mesh and of another study's results, which a study names relative to its own folder.
 
     Results may be in the working directory too.
     """
@@ -105,9 +105,10 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
-    """Read a study from a TOML file; overrides and errors as of `parse`."""
+    """Read a study from a TOML file; overrides and errors as in `parse`."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors on Windows begin files with a mark
+        # Editors on Windows begin files with a byte order mark.
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
         message = f"{path}: lists or tables are nested too deeply"
         raise StudyError(message) from None
@@ -127,7 +128,7 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
 
 
 def schema() -> dict[str, Any]:
-    """Return the JSON Schema of a study file, by which editors complete and check it."""
+    """Return the JSON Schema of a study file, with which editors complete and check it."""
     from workflows.studies.inversion import Inversion
     from workflows.studies.material_tests import DataFile
     from workflows.studies.output_inversion import OutputInversion
@@ -141,7 +142,7 @@ def schema() -> dict[str, Any]:
         Study | Selection | SpecimenSelection | OutputSelection | Inversion | OutputInversion | Synthesis
     )
     found = adapter.json_schema(ref_template="#/$defs/{model}")
-    # A file may name a table in place of the data themselves.
+    # A file may name a table instead of containing the data.
     files = (("Selection", DataFile), ("SpecimenSelection", DisplacementFile), ("OutputSelection", OutputFile))
     for name, file in files:
         table = TypeAdapter(file).json_schema(ref_template="#/$defs/{model}")
@@ -166,7 +167,7 @@ def dump(study: StudyKind) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """List what changed between two documents, one line for each place.
 
-    Blocks that results do not depend on do not count, nor where a mesh is, as long as it is the same.
+    Blocks on which results do not depend do not count, nor does the path of a mesh, as long as the mesh is the same.
     """
     before, after = (dict(_leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
     if before.get(_MESH) == after.get(_MESH) is not None:

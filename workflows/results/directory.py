@@ -1,4 +1,4 @@
-"""The results directory: results.nc, summary.json and files for ParaView; each written whole or not at all."""
+"""The results directory: results.nc, summary.json and files for ParaView; each written completely or not at all."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 def with_random_fields(
     dataset: xr.Dataset, factors: Mapping[str, NDArray[np.float64]], variance_kept: Mapping[str, float]
 ) -> xr.Dataset:
-    """Add what random fields look like, realisation by realisation (n, nodes), where fields are kept at the nodes."""
+    """Add realisations (n, nodes) of random fields, if fields are stored at the nodes."""
     if not factors:
         return dataset
     dataset = dataset.assign_coords(random_field=list(variance_kept))
@@ -94,7 +94,7 @@ def with_random_fields(
 
 
 def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.int64] | None) -> xr.Dataset:
-    """Add the regions of the cells, where there are some and the mesh is kept."""
+    """Add the regions of the cells, if there are any and the mesh is stored."""
     if numbers is None or "cell" not in dataset.dims:
         return dataset
     return dataset.assign_coords(region=list(names)).assign(cell_region=(("cell",), numbers))
@@ -103,7 +103,7 @@ def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.
 def body_grid(dataset: xr.Dataset) -> Any:
     """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes.
 
-    What is not known is NaN, and left out where nothing is: VTK cannot read vectors again of which all lengths are
+    Unknown values are NaN, and fields without any values are left out: VTK cannot read vectors whose lengths are all
     infinite or NaN.
     """
     import pyvista
@@ -124,7 +124,7 @@ def body_grid(dataset: xr.Dataset) -> Any:
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
 
-    Displacements are in one file, what data sets say of the interior in one for each.
+    Displacements are in one file; what each data set says about the interior is in one file each.
     """
     if "cell_nodes" not in dataset:
         return None
@@ -139,7 +139,7 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
 
 
 def _vtu(grid: Any) -> bytes:
-    """Return a pyvista grid as a file for ParaView: VTK itself would leave half a file, and not say so."""
+    """Return a pyvista grid as a ParaView file: VTK itself could leave half a file without an error."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
@@ -151,7 +151,7 @@ def _vtu(grid: Any) -> bytes:
 
 
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return the fields (n_nodes, 3) and numbers (n_nodes,) of the results by a name that tells what they are."""
+    """Return the fields (n_nodes, 3) and numbers (n_nodes,) of the results, under descriptive names."""
     arrays = {}
     for name, variable in dataset.data_vars.items():
         if set(variable.dims) == {"node", "component"}:
@@ -190,9 +190,9 @@ def with_norms(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def above_rounding(dataset: xr.Dataset) -> xr.Dataset:
-    """Let no standard error be smaller than the rounding of what it is the error of.
+    """Let no standard error be smaller than the rounding error of its estimate.
 
-    A standard deviation is a difference of numbers as large as the mean, an index a ratio of sums that are as large.
+    A standard deviation is a difference of numbers as large as the mean, an index a ratio of sums of that size.
     """
     found = {}
     for label, errors in dataset.data_vars.items():
@@ -211,7 +211,7 @@ def above_rounding(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def blank_where_still(dataset: xr.Dataset) -> xr.Dataset:
-    """Leave out the indices of nodes that do not vary: there they are ratios of what rounding leaves."""
+    """Leave out the indices of nodes that do not vary: there they are ratios of rounding errors."""
     names = [str(name) for name in dataset.data_vars if str(name).startswith("node_sobol_")]
     if not names or "field_std" not in dataset:
         return dataset
@@ -220,7 +220,7 @@ def blank_where_still(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any, vtk_cell_type: int) -> xr.Dataset:
-    """Add the mesh, where there are fields, and the units of the outputs."""
+    """Add the mesh, if there are fields, and the units of the outputs."""
     dataset = dataset.assign_coords(unit=("output", [units[str(name)] for name in dataset.output.values]))
     if "node" in dataset.dims:
         dataset = dataset.assign(

@@ -1,4 +1,4 @@
-"""Integrals over a body of fields that are known at its nodes: norms that do not depend on the mesh.
+"""Integrals over a body of fields given at its nodes: norms that do not depend on the mesh.
 
 The field on a cell is the polynomial through its values at the nodes, and so is the place: |u|² is integrated by Gauss'
 rule, exactly on cells with plane faces and parallel edges (O. C. Zienkiewicz et al., The Finite Element Method (2013),
@@ -44,7 +44,7 @@ def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> 
 
 
 def node_volumes(nodes: FloatArray, cells: NDArray[np.int64]) -> FloatArray:
-    """Return the share (N,) of the body that each node stands for: Σ_n v_n f_n is ∫f dX of what is known at nodes only.
+    """Return the volume (N,) that each node represents: Σ_n v_n f_n is ∫f dX of a quantity known only at nodes.
 
     Of hexahedra these are the integrals of the shape functions: on bricks of degree 2 Simpson's rule. Of tetrahedra of
     degree 2 they would be negative at the vertices; there f is linear on the eight parts that the midpoints of the
@@ -87,7 +87,7 @@ def _measure(places: FloatArray, slopes: FloatArray, weights: FloatArray) -> Flo
 
 
 def _reference(places: FloatArray, corners: FloatArray, *, tetrahedra: bool) -> FloatArray:
-    """Find where the nodes (k, 3) of a cell stand in the reference cell: at corners, and between them."""
+    """Return the positions (k, 3) of a cell's nodes in the reference cell: at corners, and between them."""
     if len(places) == len(corners):
         return corners
     grid = np.array(list(product((0.0, 0.5, 1.0), repeat=3)))

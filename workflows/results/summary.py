@@ -1,4 +1,4 @@
-"""What summary.json says of results: each kind of result has its part."""
+"""What summary.json says about results: each kind of result has its part."""
 
 from __future__ import annotations
 

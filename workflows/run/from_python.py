@@ -25,22 +25,22 @@ def run(
     study
         What `load` returns, or `tissuq.Study(...)`.
     directory
-        Where results go; a study that was interrupted there is continued, one that is finished is read. By default
-        nothing is left on disk.
+        Where results go; an interrupted study there is continued, a finished one is read. By default nothing is written
+        to disk.
     quiet
         Print no progress.
     report
-        Write report.html too, where there is a directory.
+        Write report.html too, if there is a directory.
 
     Returns
     -------
     xarray.Dataset
-        results.nc, see docs/results.md; `findings` says what of it is doubtful. Empty on ranks other than the first.
+        results.nc, see docs/results.md; `findings` says what is doubtful about it. Empty on ranks other than the first.
 
     Raises
     ------
     StudyError, ModelError, SolveError, StopError
-        As the command says them in one line.
+        Those that the command reports in one line.
     """
     from mpi4py import MPI
 

@@ -1,4 +1,4 @@
-"""What is written down of a user's modules beside its results, so that results of two versions never mix."""
+"""The record of a user's modules beside the results, so that results of two versions never mix."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FILE = "sources.json"
 
 
 def modules(study: StudyKind) -> tuple[str, ...]:
-    """Return the modules of a user that a study names: those of its model, and of kinds that are dotted paths."""
+    """Return the user's modules that a study names: those of its model, and of kinds that are dotted paths."""
     return tuple(dict.fromkeys([*study.modules, *dotted(document(study))]))
 
 
@@ -31,13 +31,13 @@ def digest(study: StudyKind) -> str | None:
 
 
 def identity(study: StudyKind) -> dict[str, Any]:
-    """Return all that decides on evaluations: the study, and the text of these modules."""
+    """Return everything that evaluations depend on: the study, and the source of these modules."""
     source = digest(study)
     return study.identity() | ({} if source is None else {"source": source})
 
 
 def refuse_other(directory: Path, study: StudyKind) -> None:
-    """Compare the modules of a user with those that the results in a directory follow from.
+    """Compare the user's modules with those from which the results in a directory were computed.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
 
 
 def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
-    """Write down the modules of a user, with those that were loaded in the course of a run."""
+    """Record the user's modules, with those that were loaded during a run."""
     found = modules(study)
     if found and loaded is not None:
         known = (_kept(directory) or sources(found)).with_files(loaded())
@@ -65,14 +65,14 @@ def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
 
 
 def make_visible(directory: Path) -> None:
-    """Have the modules found that the results in a directory follow from, where they were when these were computed."""
+    """Let Python find the modules behind the results in a directory, where they were when these were computed."""
     known = _kept(directory)
     if known is not None:
         sys.path += [str(folder) for folder in known.folders if folder.is_dir() and str(folder) not in sys.path]
 
 
 def listed(study: StudyKind) -> list[str]:
-    """Say which kinds of a study are a user's own, and where they are from."""
+    """Say which kinds of a study are the user's own, and where they come from."""
     names = list(dict.fromkeys(dotted(document(study))))
     if not names:
         return []
@@ -87,5 +87,5 @@ def _kept(directory: Path) -> Sources | None:
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError, AttributeError):
-        message = f"{directory / FILE}: damaged: what code is behind the results is not known; choose another --out"
+        message = f"{directory / FILE}: damaged: the code behind the results is unknown; choose another --out"
         raise StudyError(message) from None

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def memory(study: StudyKind) -> float:
-    """Predict the memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements.
+    """Predict the memory (bytes) of a group of ranks, without that of the program; 0 without finite elements.
 
     A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen has one.
     """
@@ -22,7 +22,7 @@ def memory(study: StudyKind) -> float:
 
 
 def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
-    """Say that the memory of this machine may not do for a study, by so many groups of ranks on it."""
+    """Warn if the memory of this machine may not suffice for a study with so many groups of ranks."""
     need = memory(study)
     if not need:
         return None
@@ -36,7 +36,7 @@ def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
 
 
 def of_program(limit: Headroom) -> float:
-    """Memory (bytes) of the program itself, as a limit counts it."""
+    """Memory (bytes) of the program itself, as counted by a limit."""
     return ADDRESSES_OF_PROGRAM if limit.of_addresses else BYTES_OF_PROGRAM
 
 

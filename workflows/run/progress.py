@@ -16,12 +16,12 @@ class Progress:
     planned
         Number of solves expected; it grows when a method asks for more.
     quiet
-        Show nothing but a line a minute, and not even that on a terminal.
+        Show only a line a minute, and on a terminal not even that.
     silent
         Show nothing at all.
     failures
-        Whether solves without an answer are failures, which are shown; where data are explained they may be parameters
-        that explain nothing.
+        Whether solves without an answer are failures, which are shown; in inversions they may be parameters with zero
+        likelihood.
     """
 
     def __init__(self, planned: int, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
@@ -30,7 +30,7 @@ class Progress:
         self._planned = planned
         self._failures = failures
         self._begin = time.monotonic()
-        self._shown, self._before = self._begin, 0  # when the last line was printed, and what was done by then
+        self._shown, self._before = self._begin, 0  # when the last line was printed, and the count then
         self._bar = None
         terminal = sys.stderr.isatty()
         self._quiet = quiet or silent
@@ -62,7 +62,7 @@ class Progress:
             self._print_line(self._begin, 0)
 
     def _print_line(self, since: float, before: int) -> None:
-        """Print what is done, with the rate since a time: what was read from disk at first took none."""
+        """Print the progress, with the rate since a given time: what was read from disk at first took no time."""
         seconds = time.monotonic() - since
         rate = (self.done - before) / seconds if seconds > 0 else 0.0
         left = max(self._planned - self.done, 0) / rate if rate > 0 else float("inf")

@@ -60,7 +60,7 @@ def run(
     directory
         Where results go; made if it does not exist.
     quiet
-        Print nothing but errors and, off the terminal, a line of progress a minute.
+        Print only errors and, off the terminal, a line of progress a minute.
     silent
         Not even that line.
     report
@@ -81,12 +81,12 @@ def run(
     SolveError
         If the study cannot be finished because the model has no answer.
     StopError
-        If there is no memory, or no room on disk; what is finished is kept.
+        If there is no memory, or no space on disk; finished work is kept.
 
     Notes
     -----
-    Where it fails before anything is solved, or because the model has no answer that could be kept, the directory is
-    left as it was.
+    If it fails before anything is solved, or because the model has no answer worth keeping, the directory is left as it
+    was.
     """
     try:
         return _run(study, name, directory, quiet=quiet or silent, silent=silent, report=report)
@@ -151,7 +151,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
 
 
 def _warn_of_memory(study: StudyKind, world: Any, *, quiet: bool) -> None:
-    """Say on the first rank that the memory of its machine may not do; collective."""
+    """Warn on the first rank if the memory of its machine may not suffice; collective."""
     from mpi4py import MPI
 
     here = world.Split_type(MPI.COMM_TYPE_SHARED)
@@ -168,7 +168,7 @@ def exit_code(summary: Mapping[str, Any]) -> int:
 
 
 def _agreed(world: Any, prepare: Callable[[], int | None]) -> int | None:
-    """Return on all ranks what rank 0 finds, or raise there what it raises."""
+    """Return rank 0's result, or raise its exception, on all ranks."""
     refusal: Exception | None = None
     found = None
     if world.rank == 0:
@@ -190,14 +190,14 @@ def _leave(
     checkpoint: Checkpoint,
     job: Job,
 ) -> None:
-    """Write all results, in an order that a kill cannot spoil."""
+    """Write all results, in an order that is safe against a kill."""
     write_dataset(directory / "results.nc", dataset, job.arviz_groups(dataset))
     write_fields(directory / "fields", dataset)
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         write_text(directory / name, text)
     checkpoint.consolidate(evaluations)
-    # The summary says that the study is finished: only then may the blocks go.
+    # The summary marks the study as finished: only then may the blocks be removed.
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
@@ -256,7 +256,7 @@ def _prepare(study: StudyKind, directory: Path, ranks: int) -> int | None:
 
 
 def _keep_study(directory: Path, study: StudyKind) -> None:
-    """Write study.toml, also where it differs in what is asked of the report, which is then made again."""
+    """Write study.toml, also if only the block of the report differs; the report is then made again."""
     kept = directory / "study.toml"
     if not kept.exists():
         write_text(kept, dump(study))
@@ -266,7 +266,7 @@ def _keep_study(directory: Path, study: StudyKind) -> None:
 
 
 def _finished(directory: Path) -> int | None:
-    """Return the exit code of a study that is finished; None for any other, and where its results are lost."""
+    """Return the exit code of a finished study; None if it is unfinished, or its results are lost."""
     summary = read_summary(directory)
     if summary is None:
         return None
@@ -289,7 +289,7 @@ def _note(text: str) -> None:
 
 
 def _withdraw(directory: Path) -> None:
-    """Remove what `_prepare` has made, if nothing else is there: the study, corrected, may go to the same place."""
+    """Remove what `_prepare` has made, if nothing else is there, so that the corrected study can use the directory."""
     made = ("study.toml", own_code.FILE)
     if {path.name for path in directory.iterdir()} <= set(made):
         for name in made:

@@ -1,4 +1,4 @@
-"""What a run does when it is told to end: one line, and no rank is left waiting."""
+"""How a run ends on a signal: with one line, and no rank left waiting."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 from forward.machine import INTERRUPTED
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
-SECONDS_FOR_OTHERS = 1.5  # in which `mpirun`, if it was told too, ends all ranks without a word
+SECONDS_FOR_OTHERS = 1.5  # within which `mpirun`, if it was signalled too, ends all ranks silently
 SECONDS_TO_ABORT = 2.0
 
 
 def heed() -> None:
     """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
 
-    A process alone raises KeyboardInterrupt. Of several ranks the first one speaks and ends the job from a thread of
-    its own, since MPI waits without ever coming back to Python, and `mpirun` kills a second later. The others die of
-    the signal at once, wherever they are, and the job with them.
+    A single process raises KeyboardInterrupt. Of several ranks the first prints the line and ends the job from a
+    separate thread, since MPI waits without ever returning to Python, and `mpirun` kills a second later. The others die
+    from the signal at once, wherever they are, and the job with them.
     """
     from mpi4py import MPI
 

@@ -1,4 +1,4 @@
-"""What a run leaves in summary.json, and says at its end."""
+"""What a run writes to summary.json, and prints at its end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def summarised(
     rank_groups: int,
     wall: float,
 ) -> dict[str, Any]:
-    """Return what summary.json says: the study, what came of it, what that took, and by what it was made."""
+    """Return the contents of summary.json: the study, its results, their cost, and the versions that made them."""
     from forward.model import WORK
 
     evaluations, outcomes = job.evaluations, job.outcomes
@@ -112,7 +112,7 @@ def _unlikely(evaluations: Iterable[Evaluations]) -> int:
 
 
 def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    """Say at the end of a run what was found."""
+    """Summarise the results at the end of a run."""
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
         f"probability {found['probability']:.3g}"

@@ -1,4 +1,4 @@
-"""Versions of this program, of what it stands on, and of its source."""
+"""Versions of this program, of its dependencies, and of its source."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The kinds of study beside sampling."""
+"""The kinds of studies."""

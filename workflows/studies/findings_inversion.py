@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from uq.inputs.distributions import Distribution
     from workflows.studies.inversion import InversionStudy
 
-NEITHER, DOUBTFUL = 2, 3  # numbers of what is to be trusted of an inversion, see docs/results.md
+NEITHER, DOUBTFUL = 2, 3  # values of `trust`, see docs/results.md
 SEVERITY: dict[int, Severity] = {NEITHER: "error", DOUBTFUL: "warning"}
 
 
 def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
-    """Look for all that makes the posteriors of an inversion doubtful; return the results with verdicts that say so."""
+    """Look for everything that makes the posteriors of an inversion doubtful; return the results with verdicts."""
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
     for k, name in enumerate(dataset.data_set.values):
@@ -38,7 +38,7 @@ def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
 
 
 def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
-    """Return the sentence and the number of a verdict, given what it was before anything was doubted."""
+    """Return the sentence and the number of a verdict, given those before any doubts."""
     errors = [doubt.short for doubt in doubts if doubt.severity == "error"]
     warnings = [doubt.short for doubt in doubts if doubt.severity == "warning"]
     if trust == NEITHER:
@@ -51,7 +51,7 @@ def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
 
 
 def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
-    """Say what is doubtful of one data set, by its number."""
+    """Say what is doubtful about one data set, given by its number."""
     from inverse.criticism import doubts as criticism
     from uq.inputs.distributions import Normal
 

@@ -33,12 +33,12 @@ def ranking(values: xr.DataArray) -> list[str]:
 
 
 def by_probability(dataset: xr.Dataset, values: xr.DataArray) -> list[str]:
-    """Names of the models by ln Z `values` and what they were worth before the data, the most probable first."""
+    """Names of the models by ln Z `values` and prior probabilities, the most probable first."""
     return ranking(values + np.log(dataset["prior_probability"]))
 
 
 def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
-    """Say in which way the residuals of a model are not what it says of them; empty where they may be."""
+    """Say how the residuals of a model contradict it; empty if they do not."""
     of_model = dataset.sel(model=model)
     asked = 2 * dataset.sizes["group"]
     said = []
@@ -58,7 +58,7 @@ def conflicts(dataset: xr.Dataset, model: str) -> list[str]:
 
 
 def findings(dataset: xr.Dataset) -> list[Finding]:
-    """Say which model the data support, by how much, how sure that is and what it depends on."""
+    """Say which model the data support, by how much, how certain that is and what it depends on."""
     order = by_probability(dataset, dataset["log_evidence"])
     best = order[0]
     P = float(dataset["probability"].sel(model=best))
@@ -101,7 +101,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
 
 
 def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
-    """Evidences that cannot be trusted, each with what its weights are worth."""
+    """Evidences that cannot be trusted, each with the quality of its weights."""
     from inverse.criticism.weights import worth
 
     found = []
@@ -118,7 +118,7 @@ def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
 def doubts_of_selection(
     dataset: xr.Dataset, candidates: Mapping[str, Inputs], noise: Distribution | None
 ) -> list[Finding]:
-    """Say what is doubtful of the most probable candidate: its constants, its errors, and data that do not belong.
+    """Say what is doubtful about the most probable candidate: its constants, its errors, outliers.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def doubts_of_selection(
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
-    """Say what finer meshes do to the evidences, and of which of the others that is not known."""
+    """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
     from inverse.criticism import doubts as criticism
 
     if "mesh_checked" not in dataset:
@@ -185,7 +185,7 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
-    """Trust no evidence whose mesh was not looked at, or whose ln Z a finer one moves or may move."""
+    """Trust no evidence whose mesh was not checked, or whose ln Z a finer mesh moves or may move."""
     from inverse.criticism.doubts import certain
 
     if "mesh_checked" not in dataset:

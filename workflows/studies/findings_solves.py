@@ -1,4 +1,4 @@
-"""What the solves of a study say: how far locking changes its outputs, and how many were of no model."""
+"""Findings from solves: how far locking changes the outputs, and how many parameters had no model."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ AFFORDABLE = 30_000  # unknowns of a solve beside those of the study
 
 
 def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
-    """Say what the outputs at the mean of the inputs are in a form that locks less; collective over the model's ranks.
+    """Compare outputs at the mean of the inputs with a form that locks less; collective over the model's ranks.
 
-    Nothing where the body does not lock by the tables, or where the solve would be too large or fails.
+    Empty if the body does not lock by the tables, or if the solve would be too large or fails.
     """
     spec, better = model.spec, model.spec.unlocked()
     tables = spec.locking(ranges(study.parameters))
@@ -43,7 +43,7 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
 
 
 def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
-    """Say how many solves were of parameters for which there is no model: they explain nothing, and did not fail."""
+    """Say how many solves had parameters without a model: their likelihood is zero, but they did not fail."""
     every = list(evaluations)
     lost = [failure for found in every for failure in found.failures if failure.inadmissible]
     if not lost:

@@ -31,7 +31,7 @@ def finer_mesh(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
 
 
 def on_finer_mesh(observed: ForwardModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
-    """Return a model of what is observed on a finer mesh; where that cannot be made, its solves fail."""
+    """Return a model of the observations on a finer mesh; if it cannot be made, its solves fail."""
 
     def solve(point: FloatArray) -> FloatArray:
         try:
@@ -43,7 +43,7 @@ def on_finer_mesh(observed: ForwardModel, outputs: Callable[[FloatArray], FloatA
 
 
 def once_on_finer_mesh(make: Callable[[], ForwardModel]) -> ForwardModel:
-    """Return a model on a finer mesh of a specimen, which is made for each solve: there is one for each candidate."""
+    """Return a model on a finer mesh of a specimen, made anew for each solve: there is one for each candidate."""
     from forward.fem.finer import FinerMesh
     from forward.fem.specimen import SpecimenModel
 

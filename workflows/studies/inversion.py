@@ -62,7 +62,7 @@ class InversionStudy(StudyKind):
     model
         What is measured.
     parameters
-        Priors by the paths of the numbers of the model that are unknown.
+        Priors by the paths of the unknown numbers of the model.
     correlations
         Correlations between them.
     data
@@ -72,7 +72,7 @@ class InversionStudy(StudyKind):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     model: Any
@@ -112,12 +112,12 @@ class InversionStudy(StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the model before anything is solved."""
+        """Findings about the model before anything is solved."""
         raise NotImplementedError
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Names of the parts of the data (load cases, outputs) of which it is said what each alone tells."""
+        """Names of the parts of the data (load cases, outputs) for which results of each alone are given."""
         raise NotImplementedError
 
     @property
@@ -127,12 +127,12 @@ class InversionStudy(StudyKind):
 
     @property
     def planned(self) -> int:
-        """Number of evaluations: data sets, or solves where all groups work on one."""
+        """Number of evaluations: data sets, or solves if all groups work on one."""
         return self.solves if self.together else len(self.data.sets) + 1
 
     @property
     def solves(self) -> int:
-        """Number of solves of all data sets, roughly: the searches for the modes take as many as they take."""
+        """Approximate number of solves for all data sets: the searches for the modes are not predictable."""
         method, field = self.method, self.field
         each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
@@ -169,7 +169,7 @@ class InversionStudy(StudyKind):
         return self.inputs.names
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides on evaluations; of a file, its contents and not its place."""
+        """Return everything that evaluations depend on; files count by their contents, not their path."""
         return super().identity() | {"model": self.model.identity()}
 
     def measured(self, number: int) -> Data:
@@ -224,7 +224,7 @@ class InversionStudy(StudyKind):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        """Find what no inversion can do with."""
+        """Find mistakes common to all inversions."""
         for package in {"pcn": ("arviz",), "emcee": ("arviz", "emcee")}.get(self.method.chains or "", ()):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
@@ -254,7 +254,7 @@ class Inversion(InversionStudy):
     model
         The specimen: body, material, inclusions or a field, load cases.
     parameters
-        Priors by the paths of the numbers of the specimen that are unknown; nothing for a field of nodal values.
+        Priors by the paths of the unknown numbers of the specimen; none for a field of nodal values.
     correlations
         Correlations between them.
     data
@@ -264,7 +264,7 @@ class Inversion(InversionStudy):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     model: Specimen
@@ -280,7 +280,7 @@ class Inversion(InversionStudy):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the specimen before anything is solved."""
+        """Findings about the specimen before anything is solved."""
         return (*self.model.findings, *self.model.locking(ranges(self.parameters)), *findings_of_materials(self.inputs))
 
     @property
@@ -290,7 +290,7 @@ class Inversion(InversionStudy):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters in results: of a field, its mean."""
+        """Names of the parameters in results; for a field, its mean."""
         if self.field:
             label = f"fields.{self.model.fields[0].label}.mean"
             return names_of(Inputs({label: Normal(mean=0.0, std=1.0)}), self.method)
@@ -317,7 +317,7 @@ class Inversion(InversionStudy):
         return found
 
     def read(self, path: Path) -> Measurement:
-        """Read a file of displacements; errors as of every inversion."""
+        """Read a file of displacements; errors as in every inversion."""
         return read_measurement(path, self.model, self.data)
 
     def plan(self, rank_groups: int) -> list[str]:
@@ -326,7 +326,7 @@ class Inversion(InversionStudy):
         return found
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
-        """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
+        """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
 
     def _mistakes(self) -> Iterator[Mistake]:

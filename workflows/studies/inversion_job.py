@@ -51,7 +51,7 @@ def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: 
 
 
 class _Made(Protocol):
-    """A model that is measured, as inversions need it.
+    """A measured model, as inversions need it.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class _Made(Protocol):
     def look(self) -> Look | None: ...
 
     def observing(self, number: int) -> ForwardModel:
-        """Return the model that a data set, by its number, is compared with.
+        """Return the model with which a data set, by its number, is compared.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class _Made(Protocol):
         """
 
     def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
-        """Return outputs on a finer mesh, or why they are not known; None where the model has no mesh."""
+        """Return outputs on a finer mesh, or why they are unknown; None if the model has no mesh."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class _Outputs:
         return cls(study, study.spec.build(ensemble.group, names), fine)
 
     def observing(self, number: int) -> ForwardModel:
-        """Return the model: which of its outputs were measured is known with the data."""
+        """Return the model: the data tell which of its outputs were measured."""
         return self.model
 
     def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
@@ -140,7 +140,7 @@ class _Specimen:
         return cls(study, model, vertices, look, mesh, why)
 
     def observing(self, number: int) -> SpecimenModel:
-        """Return the model of the displacements of a data set; errors as of every model."""
+        """Return the model of the displacements of a data set; errors as for every model."""
         data = self.study.measured(number)
         try:
             return self.model.observing(data.places, data.axes, data.cases)  # type: ignore[arg-type]
@@ -148,7 +148,7 @@ class _Specimen:
             raise SolveError(str(error)) from None
 
     def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str]:
-        """Return what is observed on a finer mesh."""
+        """Return the observations on a finer mesh."""
         return None if self.mesh is None else partial(self.mesh.outputs, cast("SpecimenModel", observed)), self.why
 
 
@@ -176,7 +176,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         return invert_by_group(study.inputs, observed, data, method, made.look, errors, finer, kept)
 
     def forget() -> None:
-        """Remove the solves of a data set: what follows from them is kept."""
+        """Remove the solves of a data set, whose results are stored."""
         while solving:
             solving.pop().forget()
 
@@ -198,7 +198,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
 
 
 def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, ForwardModel, Finer, Progress], xr.Dataset]:
-    """Return what inverts a data set, by its number, for a field of a specimen."""
+    """Return the function that inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
 

@@ -1,4 +1,4 @@
-"""What is known after inversions: the dataset of all data sets, summary.json, batch.csv, ArviZ's groups."""
+"""Results of inversions: the dataset of all data sets, summary.json, batch.csv, ArviZ's groups."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Vertices = tuple[FloatArray, NDArray[np.int64], int]
 
 
 def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertices | None) -> xr.Dataset:
-    """Put what inversions of all data sets have left into a dataset, with what is known beside it.
+    """Collect the results of inversions of all data sets in a dataset, with what else is known.
 
     Parameters
     ----------
     study
-        What was asked.
+        The study.
     outcomes
         Of the inversions.
     vertices
@@ -96,7 +96,7 @@ def _of_specimen(study: Inversion, record: Mapping[str, FloatArray], vertices: V
 
 
 def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:
-    """Posterior of the volumes (m³) of inclusions whose radii are unknown, by the draws that are kept."""
+    """Posterior of the volumes (m³) of inclusions whose radii are unknown, from the stored draws."""
     names = study.inputs.names
     before = derived(study.model.inclusions, names, prior_draws(study)) if not study.field else {}
     labels = [label for label, values in before.items() if np.ptp(values) > 0]
@@ -125,7 +125,7 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
 
 
 def prior_moments(study: InversionStudy) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (c,) of the parameters before the data."""
+    """Prior mean and standard deviation (c,) of the parameters."""
     if study.field:
         field = study.model.fields[0]
         prior = field.prior(study.model.body)
@@ -142,14 +142,14 @@ def prior_moments(study: InversionStudy) -> tuple[FloatArray, FloatArray]:
 
 
 def prior_stiffness_std(study: Inversion, places: FloatArray) -> FloatArray:
-    """Return the standard deviation (N,) of ln stiffness at places (N, 3) before the data."""
+    """Return the prior standard deviation (N,) of ln stiffness at places (N, 3)."""
     if study.field:
         return np.asarray(np.sqrt(study.model.fields[0].prior(study.model.body).variance))
     return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
 
 
 def prior_draws(study: InversionStudy) -> FloatArray:
-    """Draws (n, d) of the parameters before the data."""
+    """Prior draws (n, d) of the parameters."""
     rng = np.random.default_rng(study.method.seed)
     kept = np.zeros((0, len(study.inputs.names)))
     while len(kept) < PRIOR_DRAWS:
@@ -159,7 +159,7 @@ def prior_draws(study: InversionStudy) -> FloatArray:
 
 
 def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArray) -> FloatArray:
-    """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is not known."""
+    """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is unknown."""
     if measurement is None:
         return np.full(len(places), np.nan)
     if measurement.inclusions:
@@ -174,7 +174,7 @@ def _true_at(study: Inversion, measurement: Measurement | None, places: FloatArr
 
 
 def summary(found: xr.Dataset) -> dict[str, Any]:
-    """Return the part of summary.json that follows from the results; that of the only data set stands above it."""
+    """Return the part of summary.json that follows from the results; a single data set's is also at the top level."""
     sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
     only = next(iter(sets.values())) if len(sets) == 1 else {}
     return {**only, "solves": int(np.nansum(found["solves"])), "data_sets": sets}
@@ -250,14 +250,14 @@ def _row(one: xr.Dataset) -> list[Any]:
 
 
 class Rows:
-    """The table of a batch, written anew whenever a data set is finished; the sets stand in their order.
+    """The table of a batch, rewritten whenever a data set is finished; rows are in the order of the data sets.
 
     Parameters
     ----------
     study
         All data sets.
     vertices
-        As of `dataset`.
+        As in `dataset`.
     write
         Writes the table.
     """
@@ -288,7 +288,7 @@ def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Datas
 
     of_set = found if found.sizes["data_set"] > 1 else found.isel(data_set=0, drop=True)
 
-    # Draws of chains stand one after the other, as many of each.
+    # The draws of all chains follow one another, the same number of each.
     counts = set(found["chains"].to_numpy()[found["ok"].to_numpy()].astype(int).tolist())
     chains = max(counts.pop() if len(counts) == 1 and not study.field else 1, 1)
     each = found.sizes["sample"] // chains
@@ -317,7 +317,7 @@ def arviz_groups(study: InversionStudy, found: xr.Dataset) -> dict[str, xr.Datas
     dense = draws("draw_log_likelihood")
     left["log_likelihood"] = xr.Dataset({study.quantity: dense})
     seen = np.isfinite(found["measured"].to_numpy())
-    # Of different numbers of data: one variable of each, without what is filled up.
+    # For different numbers of data: one variable for each, without padding.
     if len(seen) > 1 and not seen.all():
         parts = {
             str(name): dense.sel(data_set=name, drop=True)[..., here].rename(datum=f"datum_{name}")

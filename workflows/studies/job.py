@@ -1,4 +1,4 @@
-"""What the ranks do for a study: evaluations that a method asks for, or tasks that each give a dataset."""
+"""What the ranks do for a study: evaluations that a method requests, or tasks that each return a dataset."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Job(Protocol):
 
     @property
     def arviz_groups(self) -> ArvizGroups:
-        """Groups of results.nc beside its own variables."""
+        """Groups of results.nc besides its own variables."""
 
     @property
     def texts(self) -> Texts:
@@ -40,11 +40,11 @@ class Job(Protocol):
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was evaluated, by the name that it is kept under."""
+        """What was evaluated, by the name under which it is stored."""
 
     @property
     def outcomes(self) -> Sequence[Outcome]:
-        """What came of tasks, where there are any, in their order."""
+        """Outcomes of tasks, if there are any, in their order."""
 
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Do it: results on rank 0, None on the others; collective over all ranks."""
@@ -52,7 +52,7 @@ class Job(Protocol):
 
 @dataclass(frozen=True)
 class MethodJob:
-    """Evaluations that a method asks for.
+    """Evaluations that a method requests.
 
     Attributes
     ----------
@@ -61,13 +61,13 @@ class MethodJob:
     task
         Runs the method on rank 0.
     recorders
-        What was evaluated, by the name that it is kept under.
+        What was evaluated, by the name under which it is stored.
     labelled, arviz_groups, texts
-        As of `Job`.
+        As in `Job`.
     costly
-        Whether solves are worth a file: where they are not, an interrupted study begins again.
+        Whether solves are worth storing: if not, an interrupted study starts again.
     node_volumes
-        Of the nodes of the first model, see `Evaluate`; on rank 0, if a method asks.
+        Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
     """
 
     model: ForwardModel
@@ -82,7 +82,7 @@ class MethodJob:
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was evaluated, by the name that it is kept under."""
+        """What was evaluated, by the name under which it is stored."""
         return {name: merge(recorder.log) for name, recorder in self.recorders.items()}
 
     @property
@@ -105,18 +105,18 @@ class MethodJob:
 
 @dataclass(frozen=True)
 class TasksJob:
-    """Tasks that groups of ranks share, each of which gives a dataset.
+    """Tasks shared by groups of ranks, each of which returns a dataset.
 
     Attributes
     ----------
     names
         Of the tasks.
     work, arrived, kept
-        As of `uq.evaluation.tasks.run_tasks`.
+        As in `uq.evaluation.tasks.run_tasks`.
     results
         The dataset of the study from the outcomes of all tasks.
     labelled, arviz_groups, texts
-        As of `Job`.
+        As in `Job`.
     outcomes
         Those of all tasks, once they are done.
     """

@@ -16,7 +16,7 @@ from workflows.config.mistakes import StudyError, lines
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
 MODES: tuple[Mode, ...] = ("uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear")
-WHOLE = "all"  # name of the group where there is one
+WHOLE = "all"  # name of the group if there is only one
 
 
 class MeasuredTest(MaterialTest):
@@ -29,7 +29,7 @@ class MeasuredTest(MaterialTest):
     sigma
         Standard deviations (Pa) of their errors, where they are known.
     group
-        Specimen, region, …: each group has constants of its own.
+        Specimen, region, …: each group has its own constants.
     """
 
     measured: tuple[float, ...]
@@ -45,11 +45,11 @@ class MeasuredTest(MaterialTest):
         return self
 
 
-LARGEST_STRETCH = 20.0  # beyond, a column holds per cent or lengths
+LARGEST_STRETCH = 20.0  # larger values mean that a column holds per cent or lengths
 
 
 class DataFile(Settings):
-    """Tests in a table of comma-separated values; lines that begin with # say where they are from.
+    """Tests in a table of comma-separated values; lines that begin with # state their source.
 
     Parameters
     ----------
@@ -59,19 +59,19 @@ class DataFile(Settings):
         Names of the columns: kind of test, stretch or amount of shear, second stretch (of biaxial tests), stress and,
         if there are any, its standard deviation and the group. Where rows hold both stresses, or their difference,
         `measured` (and `sigma`) name a column for each: ``{ P1 = "force_x", P2 = "force_y" }``; empty cells are left
-        out. Each stress is a test of its own: "biaxial", "biaxial P2", "biaxial P1-P2".
+        out. Each stress is a separate test: "biaxial", "biaxial P2", "biaxial P1-P2".
     component
-        Column that says which stress a row holds, where there is one in each: P1, P2 or P1-P2.
+        Column that says which stress a row holds, if each row has one: P1, P2 or P1-P2.
     modes
-        What the words of the column of modes mean, where they are not modes themselves.
+        Meaning of the words in the column of modes, if they are not names of modes.
     unit
         Pa in the unit of stresses.
     stress
         "nominal" or "cauchy".
     where
-        Rows that are kept: by column, the word that stands there.
+        Rows to keep: by column, the word that must be there.
     between
-        Smallest and largest stretch or amount of shear that are kept.
+        Smallest and largest stretch or amount of shear to keep.
     """
 
     file: str
@@ -94,7 +94,7 @@ class DataFile(Settings):
         Raises
         ------
         StudyError
-            If the table cannot be read, lacks a column, or holds what is no number.
+            If the table cannot be read, lacks a column, or holds something that is not a number.
         """
         path = folder / self.file
         try:
@@ -163,7 +163,7 @@ class DataFile(Settings):
         return {component: (column, sigma.get(component)) for component, column in measured.items()}
 
     def _in_row(self, row: Mapping[str, str], place: str, *, held: bool) -> dict[Component, tuple[str, str | None]]:
-        """Columns of the stresses that a row holds; where something acts across, there may be two."""
+        """Columns of the stresses that a row holds; modes with a load across may have two."""
         stresses = self.stresses
         if self.component is not None:
             word = row[self.component] or "P1"
@@ -206,7 +206,7 @@ class Measurements(Settings):
     tests
         Material tests with their data.
     source
-        Where they are from, line by line.
+        Their source, line by line.
     """
 
     tests: tuple[MeasuredTest, ...] = Field(min_length=1)

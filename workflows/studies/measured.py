@@ -1,4 +1,4 @@
-"""Measured displacements of a specimen: where their files are, and what was read of them."""
+"""Measured displacements of a specimen: where their files are, and what was read from them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class DataSet(Settings):
-    """A file of data, as a study that ran knows it.
+    """A data file, as recorded by a study that ran.
 
     Parameters
     ----------
@@ -50,20 +50,20 @@ class DataFiles(Settings):
     ----------
     files
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
-        directory; one alone may be given as a word. Each file is a data set, which is inverted by itself.
+        directory; a single one may be given as a string. Each file is a data set and is inverted separately.
     sigma
-        Standard deviation (m) of the errors where a file does not say.
+        Standard deviation (m) of the errors, if a file does not state it.
     unit
         m per unit of the files.
     tolerance
-        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are taken at the
-        nearest place of it, and counted.
+        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are moved to its
+        nearest point, and counted.
     errors
-        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } where a few data may be far off.
+        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be outliers.
     truth
-        By path: what is inside, where that is known beside what the files say of it.
+        By path: true values, if they are known in addition to those in the files.
     sets
-        What the files were when the study ran; written by the run.
+        The files as they were when the study ran; written by the run.
     """
 
     files: tuple[str, ...] = Field(min_length=1)
@@ -95,9 +95,9 @@ class Measurement:
     moved
         How far (n,) its points were moved (m).
     truth
-        Numbers that it was made of, by path.
+        Numbers from which it was made, by path.
     inclusions
-        Those that were really there.
+        The true ones.
     places, stiffness
         Where (k, 3) ln of the true stiffness factor (k,) is known beside that.
     """

@@ -25,7 +25,7 @@ from workflows.studies.measured import DataSet
 if TYPE_CHECKING:
     from forward.model import Finding
 
-STATED = "outputs"  # name of the data set that stands in the study itself
+STATED = "outputs"  # name of the data set given in the study itself
 Positive = Annotated[float, Field(gt=0)]
 
 
@@ -51,20 +51,20 @@ class MeasuredOutputs(Settings):
     ----------
     files
         Tables with the columns output, value and, where it is known, sigma: names of files, folders, or patterns such
-        as ``data/*.csv``, beside the study or else in the working directory. Each file is a data set, which is inverted
-        by itself.
+        as ``data/*.csv``, beside the study or else in the working directory. Each file is a data set and is inverted
+        separately.
     outputs
-        In place of files: what was measured, by output: a number, or a list of repeated measurements.
+        Instead of files: measurements by output, a number or a list of repeated measurements.
     sigma
-        Standard deviations of the errors by output, where a table does not say.
+        Standard deviations of the errors by output, if a table does not state them.
     noise
         Errors of the other outputs: { relative = 0.05 }, { absolute = 1e-4 } or both.
     errors
-        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } where a few data may be far off.
+        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be outliers.
     truth
-        By path: the numbers that the data were made of, where these are known.
+        By path: the numbers from which the data were made, if known.
     sets
-        What the files were when the study ran; written by the run.
+        The files as they were when the study ran; written by the run.
     """
 
     files: tuple[str, ...] = ()
@@ -96,7 +96,7 @@ class OutputInversion(InversionStudy):
     model
         A model with outputs, of which some were measured.
     parameters
-        Priors by the paths of the numbers of the model that are unknown.
+        Priors by the paths of the unknown numbers of the model.
     correlations
         Correlations between them.
     data
@@ -106,7 +106,7 @@ class OutputInversion(InversionStudy):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
@@ -121,7 +121,7 @@ class OutputInversion(InversionStudy):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the model before anything is solved."""
+        """Findings about the model before anything is solved."""
         return (*self.model.findings_over(ranges(self.parameters)), *findings_of_materials(self.inputs))
 
     @property
@@ -154,7 +154,7 @@ class OutputInversion(InversionStudy):
         return found
 
     def read(self, path: Path) -> OutputData:
-        """Read a table of outputs; errors as of every inversion."""
+        """Read a table of outputs; errors as in every inversion."""
         return self._with_errors(read_outputs(path, self.outputs))
 
     def _with_errors(self, found: OutputData) -> OutputData:

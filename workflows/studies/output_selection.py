@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from forward.model import Finding, ForwardModel
 
 Positive = Annotated[float, Field(gt=0)]
-SECONDS = 1e-3  # of a solve of which nothing is known
+SECONDS = 1e-3  # of a solve about which nothing is known
 _SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")])
 
 
@@ -46,9 +46,9 @@ class OutputFile(Settings):
     file
         A table with the columns output, value and, where it is known, sigma, beside the study.
     outputs
-        In its place: what was measured, by output: a number, or a list of repeated measurements.
+        Instead of a file: measurements by output, a number or a list of repeated measurements.
     sigma
-        Standard deviations of the errors by output, where the table does not say.
+        Standard deviations of the errors by output, if the table does not state them.
     """
 
     file: str | None = None
@@ -91,13 +91,13 @@ class ListedOutputs(Settings):
     Parameters
     ----------
     names
-        Output that each value is of.
+        Output to which each value belongs.
     measured
         The values, in the units of the outputs.
     sigma
         Standard deviations of their errors, where they are known.
     source
-        Where they are from, line by line.
+        Their source, line by line.
     """
 
     names: tuple[str, ...] = Field(min_length=1)
@@ -140,7 +140,7 @@ class OutputSelection(Comparison):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     model: dict[str, Any]
@@ -173,7 +173,7 @@ class OutputSelection(Comparison):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the models before anything is solved, each once."""
+        """Findings about the models before anything is solved, each once."""
         of_models = (
             finding
             for name, one in self.of_candidates.items()
@@ -183,7 +183,7 @@ class OutputSelection(Comparison):
 
     @cached_property
     def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not looked at on a finer mesh, empty where it is; none where there are no meshes."""
+        """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
         if not any(spec.meshed for spec in self.of_candidates.values()):
             return {}
         return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
@@ -199,7 +199,7 @@ class OutputSelection(Comparison):
 
     @property
     def models(self) -> dict[str, Candidate]:
-        """The candidates as the method wants them."""
+        """The candidates as the method needs them."""
         return {
             name: Candidate(candidate.restricted(self.of_candidates[name]), candidate.weight)
             for name, candidate in self.candidates.items()
@@ -300,7 +300,7 @@ def _of_candidate(spec: ModelSpec, candidate: OutputCandidate) -> Iterator[Mista
     constants = () if materials is None else materials.names
     yield from mistakes_of_parameters(spec.scalars, candidate.parameters, constants)
     if materials is not None and all(path in spec.scalars for path in candidate.parameters):
-        with suppress(ValueError):  # correlations, which are told elsewhere
+        with suppress(ValueError):  # correlations, which are reported elsewhere
             yield from mistakes_of_materials(candidate.restricted(spec), materials)
 
 

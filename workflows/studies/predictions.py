@@ -1,4 +1,4 @@
-"""Parts of what studies say of themselves before they run."""
+"""Parts of what studies say about themselves before they run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from forward.specimen import Specimen
 
-HOPELESS = 100  # times a solve by the textbook that one may take which fails, with its load steps
-NOT_ASKED = "not asked for: nothing will be said to be trusted"
+HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
+NOT_ASKED = "not requested: no result will be called trusted"
 
 
 def times_of(spec: ModelSpec) -> Times:
@@ -25,7 +25,7 @@ def times_of(spec: ModelSpec) -> Times:
 
 
 def formulation(decision: Decision) -> str:
-    """Say which formulation is taken, and why."""
+    """Say which formulation is used, and why."""
     return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
 
@@ -38,7 +38,7 @@ def mesh_check(spec: Specimen) -> tuple[float, str]:
             fine = finer(spec)
             unknowns, once = fine.unknowns, sum(times_of(fine.loaded(case)).textbook for case in fine.cases)
     except ValueError as error:
-        return 0.0, f"not possible: {error}; nothing will be said to be trusted"
+        return 0.0, f"not possible: {error}; no result will be called trusted"
     longest = duration(HOPELESS * once)
     return once, f"one solve of {unknowns:,} displacements, about {duration(once)}; up to {longest} if it has no answer"
 

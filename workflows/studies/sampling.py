@@ -39,8 +39,8 @@ class Study(StudyKind):
     model
         A body, or a model of another program.
     parameters
-        Distributions by the paths of the numbers of the model that they override; may be left out where the model has
-        random fields, whose coefficients are parameters by themselves.
+        Distributions by the paths of the numbers of the model that they replace; may be left out if the model has
+        random fields, whose coefficients are parameters automatically.
     correlations
         Correlations between them.
     method
@@ -48,7 +48,7 @@ class Study(StudyKind):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "one linearisation"
@@ -87,12 +87,12 @@ class Study(StudyKind):
 
     @property
     def planned(self) -> int:
-        """Number of solves, the largest where a tolerance may end the study earlier, the least of a multilevel one."""
+        """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
         return self.method.planned(len(self._marginals))
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the study before anything is solved."""
+        """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
         return (*self.model.findings_over(ranges(self.parameters)), *of_draws)
@@ -122,18 +122,18 @@ class Study(StudyKind):
         return self.inputs.names
 
     def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        """Add how the stability of each sample was looked at."""
+        """Add how the stability of each sample was tested."""
         with_stability = named("workflows.studies.sampling_job:with_stability")
         found: xr.Dataset = with_stability(self, dataset, evaluations["/"])
         return found
 
     def summary(self, job: Job) -> dict[str, Any]:
-        """Return what was solved on each mesh, where there are several."""
+        """Return what was solved on each mesh, if there are several."""
         of_meshes = named("workflows.studies.sampling_job:of_meshes")
         return {"meshes": of_meshes(self, job)} if len(self.meshes) > 1 else {}
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides on evaluations; of a file, its contents and not its place."""
+        """Return everything that evaluations depend on; files count by their contents, not their path."""
         return super().identity() | {"model": self.model.identity()}
 
     @model_validator(mode="after")

@@ -49,7 +49,7 @@ def job(study: Study, ensemble: Ensemble) -> Job:
         )
 
     model = cast("HyperelasticModel", function)
-    # Rank 0 may leave the task by an exception: nothing that needs the other ranks may follow it.
+    # Rank 0 may leave the task by an exception: nothing collective may follow it.
     cells, kind = model.space.cells()
     regions = model.space.regions()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
@@ -66,7 +66,7 @@ def job(study: Study, ensemble: Ensemble) -> Job:
 
 
 def _without_nodes(found: xr.Dataset) -> xr.Dataset:
-    """Leave out fields where states are no displacement fields."""
+    """Leave out fields if states are not displacement fields."""
     return found.drop_dims([dim for dim in ("node",) if dim in found.dims])
 
 
@@ -82,7 +82,7 @@ def _factors(study: Study, inputs: Inputs, model: HyperelasticModel) -> dict[str
 
 
 def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) -> xr.Dataset:
-    """Add how the stability of each sample was looked at, and say where there is no answer."""
+    """Add how the stability of each sample was tested, and say where there is no answer."""
     continued = "loo_error" in dataset or getattr(study.method, "control", None) == "chaos"
     add(dataset, *branch.findings(study.inputs, evaluations, continued=continued))
     if not branch.counts([evaluations]):
@@ -95,7 +95,7 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
 
 
 def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:
-    """What was solved on each mesh, and what it took."""
+    """What was solved on each mesh, and its cost."""
     assert isinstance(job, MethodJob)
     recorder = job.recorders["/"]
     found = []

@@ -52,7 +52,7 @@ def _in_series(paths: Sequence[str]) -> Iterator[str]:
 
 
 class Part(NamedTuple):
-    """What a part of a study takes: predicted processor time (s), what for, and whether groups of ranks share it."""
+    """Cost of a part of a study: predicted processor time (s), purpose, and whether groups of ranks share it."""
 
     seconds: float
     what: str
@@ -60,9 +60,9 @@ class Part(NamedTuple):
 
 
 def parts(study: Study) -> list[Part]:
-    """Predict what a study of a body takes, part by part.
+    """Predict the cost of a study of a body, part by part.
 
-    Samples are the most that there may be; those that multilevel methods add after their pilots are not known.
+    Samples are the maximum number; those that multilevel methods add after their pilots are unknown.
     """
     method, dimension = study.method, len(study.inputs.names)
     costs = {OWN: times_of(study.spec)} | {name: times_of(model) for name, model in study.models.items()}
@@ -83,12 +83,12 @@ def parts(study: Study) -> list[Part]:
 
 
 def _compiled_before() -> bool:
-    """Whether forms were compiled on this machine; which, only a run can tell."""
+    """Whether any forms were compiled on this machine; only a run can tell which."""
     return any(compiled_forms().glob("forms-*/*/"))
 
 
 def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str) -> list[str]:
-    """Say what a study takes by the clock, if every group of ranks has a core, and of what that is the sum."""
+    """Say how long a study takes by the clock, if every group of ranks has a core, and of what this is the sum."""
     by_clock = [part.seconds / (rank_groups if part.shared else 1) for part in found]
     cores = f"{rank_groups} core{'s' if rank_groups > 1 else ''}"
     lines = [f"time        {up_to}about {duration(sum(by_clock))} on {cores}, to a factor of 2{more}:"]

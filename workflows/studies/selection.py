@@ -38,7 +38,7 @@ SECONDS_PER_STRESS = 4e-4  # of a material point with its derivatives
 
 
 class CandidateModel(Settings):
-    """A material that may be the right one, with its prior.
+    """A candidate material with its prior.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class CandidateModel(Settings):
                 message = f"'{name}' is no constant of '{kind}'; {nearest(name, tuple(known))}"
                 raise ValueError(message)
             if name in self.fixed and name in self.parameters:
-                message = f"'{name}' stands in material and in parameters, expected one of them"
+                message = f"'{name}' is given in material and in parameters, expected one of them"
                 raise ValueError(message)
         left_out = of_volume(self.kind) if incompressible(self.kind, given) else ()
         missing = [name for name in known if name not in given and name not in left_out]
@@ -117,7 +117,7 @@ class CandidateModel(Settings):
             raise ValueError(message)
         try:
             wrong = next(mistakes_of_materials(self.inputs, self.materials), None)
-        except ValueError:  # correlations, which are told elsewhere
+        except ValueError:  # correlations, which are reported elsewhere
             return self
         if wrong is not None:
             message = f"parameters {', '.join(wrong[2])}: {wrong[1]}"
@@ -148,17 +148,17 @@ class Comparison(StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the study before anything is solved."""
+        """Findings about the study before anything is solved."""
         of_all = (findings_of_materials(one.inputs, f"{name}: ") for name, one in self.models.items())
         return tuple(finding for found in of_all for finding in found)
 
     @property
     def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not looked at on a finer mesh, empty where it is; none where there are no meshes."""
+        """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
         return {}
 
     def described(self, name: str) -> str:
-        """What a candidate is, in words."""
+        """Describe a candidate."""
         raise NotImplementedError
 
     def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
@@ -166,7 +166,7 @@ class Comparison(StudyKind):
         raise NotImplementedError
 
     def build_finer(self, name: str, make: Callable[[], ForwardModel], comm: Any = None) -> ForwardModel:
-        """Make what a candidate's model is on a finer mesh, where it is looked at (see `unchecked`); collective.
+        """Make a candidate's model on a finer mesh, if it is checked there (see `unchecked`); collective.
 
         Parameters
         ----------
@@ -202,12 +202,12 @@ class Comparison(StudyKind):
 
     @property
     def models(self) -> dict[str, Candidate]:
-        """The candidates as the method wants them."""
+        """The candidates as the method needs them."""
         return {name: Candidate(candidate.inputs, candidate.weight) for name, candidate in self.candidates.items()}
 
     @property
     def planned(self) -> int:
-        """Number of solves, roughly: the searches for the modes take as many as they take."""
+        """Approximate number of solves: the searches for the modes are not predictable."""
         searches = sum(self.searches(name) for name, _ in self.pairs)
         return (self.method.samples * len(self.pairs) + searches) * self.evidences // len(self.pairs)
 
@@ -285,13 +285,13 @@ class Selection(Comparison):
     candidates
         Models by name.
     predict
-        Tests that are predicted beside those that were measured, in every group.
+        Tests that are predicted besides the measured ones, in every group.
     method
         How the candidates are compared.
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     data: Measurements

@@ -1,4 +1,4 @@
-"""What a comparison of models leaves for ArviZ."""
+"""Results of a comparison of models for ArviZ."""
 
 from __future__ import annotations
 

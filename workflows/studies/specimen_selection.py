@@ -44,13 +44,13 @@ class DisplacementFile(Settings):
     file
         The file, beside the study.
     sigma
-        Standard deviation (m) of the errors where the file does not say; not needed where the noise of the method is
-        given otherwise.
+        Standard deviation (m) of the errors, if the file does not state it; not needed if the method's noise is given
+        otherwise.
     unit
         m per unit of the file.
     tolerance
-        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are taken at the
-        nearest place of it.
+        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are moved to its
+        nearest point.
     """
 
     file: str
@@ -102,11 +102,11 @@ class MeasuredDisplacements(Settings):
     measured
         Displacements (m).
     sigma
-        Standard deviations (m) of their errors, where they are known.
+        Standard deviations (m) of their errors, if known.
     source
-        Where they are from, line by line.
+        Their source, line by line.
     points_moved, largest_move
-        How many points lay outside the body, and how far (m) the farthest one was moved to it.
+        How many points lay outside the body, and the largest distance (m) by which one was moved.
     """
 
     places: tuple[Vector, ...] = Field(min_length=1)
@@ -129,13 +129,12 @@ class MeasuredDisplacements(Settings):
 
 
 class SpecimenCandidate(Settings):
-    """A model of the specimen that may be the right one, with its prior.
+    """A candidate model of the specimen, with its prior.
 
     Parameters
     ----------
     model
-        What it changes of the model: blocks and values that take the place of those there; a material is another one
-        altogether.
+        What it changes of the model: blocks and values that replace those there; a material is replaced completely.
     parameters
         Priors by the paths of the numbers that vary.
     correlations
@@ -175,7 +174,7 @@ class SpecimenSelection(Comparison):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     model: dict[str, Any]
@@ -196,7 +195,7 @@ class SpecimenSelection(Comparison):
             for name, candidate in self.candidates.items()
         }
         of_inputs = {name: ranges(candidate.parameters) for name, candidate in self.candidates.items()}
-        # The forms differ a little on a mesh: where one candidate needs pressures, all have them that can.
+        # The forms differ a little on a mesh: if one candidate needs pressures, all that can have them do.
         mixed = any(one.formulation == "auto" and one.decision(of_inputs[name]).mixed for name, one in given.items())
         return {
             name: one.model_copy(update={"formulation": "mixed"})
@@ -214,7 +213,7 @@ class SpecimenSelection(Comparison):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the specimens before anything is solved, each once."""
+        """Findings about the specimens before anything is solved, each once."""
         of_specimens = (
             finding
             for name, one in self.specimens.items()
@@ -224,7 +223,7 @@ class SpecimenSelection(Comparison):
 
     @cached_property
     def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not looked at on a finer mesh; empty where it is."""
+        """Why each candidate is not checked on a finer mesh; empty if it is."""
         return {name: self._unchecked(specimen) for name, specimen in self.specimens.items()}
 
     def _unchecked(self, specimen: Specimen) -> str:
@@ -238,7 +237,7 @@ class SpecimenSelection(Comparison):
 
     @property
     def models(self) -> dict[str, Candidate]:
-        """The candidates as the method wants them."""
+        """The candidates as the method needs them."""
         return {
             name: Candidate(candidate.within(self.specimens[name]), candidate.weight)
             for name, candidate in self.candidates.items()
@@ -256,7 +255,7 @@ class SpecimenSelection(Comparison):
 
     @property
     def data_groups(self) -> dict[str, Data]:
-        """Data by group; load cases are tests, whose data are told apart by their number."""
+        """Data by group; load cases are tests, whose data are distinguished by their number."""
         data, cases = self.data, list(dict.fromkeys(self.data.cases))
         kinds = 3 * np.array([cases.index(case) for case in data.cases]) + self._axes
         counted: dict[str, int] = dict.fromkeys(cases, 0)
@@ -334,7 +333,7 @@ def _of_candidate(specimen: Specimen, candidate: SpecimenCandidate) -> Iterator[
     materials = specimen.materials(candidate.parameters)
     yield from mistakes_of_parameters(specimen.scalars, candidate.parameters, materials.names)
     if all(path in specimen.scalars for path in candidate.parameters):
-        with suppress(ValueError):  # correlations, which are told elsewhere
+        with suppress(ValueError):  # correlations, which are reported elsewhere
             yield from mistakes_of_materials(candidate.within(specimen), materials)
 
 
@@ -364,7 +363,7 @@ def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a block with other values; a block with a kind takes the place of what was there."""
+    """Return a block with changed values; a block with a kind replaces what was there."""
     found = dict(block)
     for key, value in changes.items():
         here = found.get(key)

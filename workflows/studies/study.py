@@ -1,4 +1,4 @@
-"""What the program asks of a study of any kind, and the kinds there are."""
+"""What the program asks of a study of any kind, and the list of kinds."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class StudyKind(Settings):
     Attributes
     ----------
     stopped
-        Why it ends, in words, where the results do not say it.
+        Why it ends, in words, if the results do not say so.
     explains
-        Whether data are explained: then parameters without a model have no likelihood, which is an answer too.
+        Whether it explains data: then parameters without a model have zero likelihood, which is a valid answer.
     """
 
     stopped: ClassVar[str] = ""
@@ -52,7 +52,7 @@ class StudyKind(Settings):
 
         @property
         def report(self) -> Report | None:
-            """What the report shows beside what every report does."""
+            """What the report shows besides the usual sections."""
 
     @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
@@ -70,17 +70,17 @@ class StudyKind(Settings):
     @property
     @abstractmethod
     def planned(self) -> int:
-        """Number of evaluations that ranks share, and one."""
+        """Number of evaluations that ranks share, plus one."""
 
     @property
     def solves(self) -> int:
-        """Number of solves, as the progress counts them."""
+        """Number of solves, as counted for the progress."""
         return self.planned
 
     @property
     @abstractmethod
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the study before anything is solved."""
+        """Findings about the study before anything is solved."""
 
     @property
     def specs(self) -> Sequence[ModelSpec]:
@@ -94,7 +94,7 @@ class StudyKind(Settings):
 
     @abstractmethod
     def plan(self, rank_groups: int) -> list[str]:
-        """Say line by line what it is and what it will cost with so many groups of ranks."""
+        """Say line by line what the study is and what it will cost with so many groups of ranks."""
 
     @abstractmethod
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
@@ -102,7 +102,7 @@ class StudyKind(Settings):
 
     @abstractmethod
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the parameters of evaluations, by the name that these are kept under."""
+        """Names of the parameters of evaluations, by the name under which these are stored."""
 
     def run(self, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False) -> xr.Dataset:
         """Run the study from Python, in memory or to a directory, as `workflows.run.from_python.run` does."""
@@ -114,11 +114,11 @@ class StudyKind(Settings):
         return dataset
 
     def summary(self, job: Job) -> dict[str, Any]:
-        """Return what summary.json has of this kind alone."""
+        """Return the part of summary.json that is specific to this kind."""
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides on evaluations, as a table."""
+        """Return everything that evaluations depend on, as a table."""
         blocks = self.model_dump(mode="json", exclude_none=True)
         return {key: value for key, value in blocks.items() if key not in WITHOUT_EFFECT}
 

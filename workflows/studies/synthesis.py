@@ -1,4 +1,4 @@
-"""Studies that make synthetic data: a specimen that is known is solved, and measured with errors."""
+"""Studies that make synthetic data: a known specimen is solved, and measured with errors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Synthesis(StudyKind):
     Parameters
     ----------
     model
-        The specimen that is measured, with what is observed of it.
+        The specimen to be measured, with its observations.
     parameters
         Distributions of numbers that are drawn for each data set; coefficients of random fields always are.
     correlations
@@ -54,7 +54,7 @@ class Synthesis(StudyKind):
     parallel
         Use of ranks.
     report
-        Sections of one's own in the report.
+        Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "all data made"
@@ -75,7 +75,7 @@ class Synthesis(StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is to be said of the specimen before anything is solved."""
+        """Findings about the specimen before anything is solved."""
         return (*self.model.findings, *self.model.locking(ranges(self.parameters)))
 
     @cached_property
@@ -90,7 +90,7 @@ class Synthesis(StudyKind):
         return len(self.method.fraction) + 1
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
-        """Return ln of what the inclusions multiply the stiffness by (n, k) at places (k, 3) and parameters (n, d)."""
+        """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
         return log_factor(self.model.inclusions, self.inputs.names, points, places)
 
     @property
@@ -133,13 +133,13 @@ class Synthesis(StudyKind):
 
 
 def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
-    """An inclusion with other numbers, by their paths."""
+    """An inclusion with changed numbers, by their paths."""
     block: dict[str, Any] = inclusion.model_dump()
     return {key: values.get(f"inclusions.{inclusion.label}.{key}", value) for key, value in block.items()}
 
 
 def points_of(model: SpecimenModel) -> NDArray[np.int64]:
-    """Number (m,) of the point that each output of a specimen is observed at, the same in all load cases."""
+    """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases."""
     return np.asarray(np.unique(np.round(model.places, 12), axis=0, return_inverse=True)[1].ravel())
 
 
@@ -203,7 +203,7 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
 
 
 def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
-    """The specimen that is known; collective over the group."""
+    """The known specimen; collective over the group."""
     model = study.specimen.build(ensemble.group, study.inputs.names)
     places, points = model.space.coordinates, points_of(model)
     factor = np.ones((len(study.method.fraction), 1))

@@ -467,7 +467,7 @@ def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
     assert {"severity": "warning", "text": "made-2: not checked for the mesh: method.mesh_check = false."} in summary[
         "findings"
     ]
-    assert any("nothing will be said to be trusted" in line for line in plan(load(folder / "few.toml", changes)))
+    assert any("no result will be called trusted" in line for line in plan(load(folder / "few.toml", changes)))
     assert any("mesh check  one solve of 192 displ" in line for line in plan(load(folder / "few.toml")))
 
 

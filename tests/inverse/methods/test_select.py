@@ -280,7 +280,7 @@ def small(tmp_path):
         ('"neo-hookean" }', '"neo-hokean" }', "candidates.neo-hookean: material.kind: 'neo-hokean'; did you mean"),
         ("parameters.C1", "parameters.C3", "'C3' is no constant of 'neo-hookean'"),
         ("mean = 500", 'mean = "soft"', "candidates.neo-hookean.parameters.C1.mean"),
-        ("C2 = 10", "C1 = 10", "stands in material and in parameters"),
+        ("C2 = 10", "C1 = 10", "is given in material and in parameters"),
         (", C2 = 10", "", "missing: C2"),
         (
             '"log-normal", mean = 500',
