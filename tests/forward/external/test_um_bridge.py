@@ -211,7 +211,7 @@ def post(body, *headers, length=None, what="Evaluate"):
         (post(b"{}", "Host: 192.168.0.7"), 403, "this server answers only this machine"),
         (post(b"{}", "Host: localhost", "Origin: http://evil.example"), 403, "does not answer browser pages"),
         (post(b"{}", "Host: localhost", "Origin: null"), 403, "does not answer browser pages"),
-        (b"GET /Info HTTP/1.1\r\nHost: rebound.example\r\n\r\n", 403, "this machine only"),
+        (b"GET /Info HTTP/1.1\r\nHost: rebound.example\r\n\r\n", 403, "only this machine"),
         (b"PUT /Evaluate HTTP/1.1\r\n\r\n", 501, "Unsupported method"),
         (b"POST /" + b"x" * 70_000 + b" HTTP/1.1\r\n\r\n", 414, "Too Long"),
         (b"POST /" + b"x" * 5000 + b" HTTP/1.1\r\n\r\n", 404, "is not of the protocol"),
