@@ -13,16 +13,16 @@ kind = "hyperelastic"
 # A box [0, size] in m; its boundaries are x-min, x-max, y-min, y-max, z-min and z-max.
 # kind = "block" has corners = [...] instead: the images of the corners of a cube, x goes first, then y, then z.
 # kind = "mesh" has file = "liver.msh" (or .xdmf, .vtk, .vtu) and unit = 1e-3: its groups are boundaries and regions.
-# A model of another program in place of a body: kind = "python" or "um-bridge", see README.
+# A model of another program instead of a body: kind = "python" or "um-bridge", see README.
 # cell = "hexahedron" | "tetrahedron", degree = 1 | 2
 body = { kind = "box", size = [0.1, 0.02, 0.02], cells = [8, 2, 2], cell = "hexahedron", degree = 2 }
-# In Pa, but for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1), "yeoh" (C10, C20, C30, D1),
-# "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda), "saint-venant-kirchhoff" (lmbda, mu),
-# "blatz-ko" (mu).
+# In Pa, except for the ratios Jm and b: "mooney-rivlin" (C1, C2, D1), "neo-hookean" (C1, D1),
+# "yeoh" (C10, C20, C30, D1), "gent" (mu, Jm, D1), "demiray" (a, b, D1), "neo-hookean-coupled" (mu, lmbda),
+# "saint-venant-kirchhoff" (lmbda, mu), "blatz-ko" (mu).
 material = { kind = "mooney-rivlin", C1 = 1e4, C2 = 2e4, D1 = 2e5 }
 # Others: neo-hookean, neo-hookean-coupled, yeoh, gent, demiray, ogden, saint-venant-kirchhoff, blatz-ko, and
 # holzapfel-gasser-ogden, c = 2e4, k1 = 1e4, k2 = 1, D1 = 2e5, fibres = [[1, 1, 0], [1, -1, 0]]
-# formulation = "mixed"  # or "displacement"; by default mixed where the bulk modulus may be above 3 shear moduli
+# formulation = "mixed"  # or "displacement"; by default mixed if the bulk modulus may be above 3 shear moduli
 # Balls of `contrast` times the stiffness of the body around them; `width` is that of the smooth transition (m):
 # (kind = "ellipsoid" has radii a, b, c and a rotation vector turn_x, turn_y, turn_z (rad) instead of a radius)
 # inclusions = [{ name = "tumour", x = 0.05, y = 0.01, z = 0.01, radius = 6e-3, contrast = 9, width = 3e-3 }]
@@ -79,7 +79,7 @@ fields = true         # mean and standard deviation of the displacement at every
 kind = "quasi-monte-carlo"
 samples = 256         # scrambles × a power of two; or tolerance = 0.001, or budget_seconds = 600: whichever comes first
 scrambles = 16        # independent randomisations of the Sobol' points: their scatter is the error
-control = "tangent"   # or "none"; "quadratic": two more solves for each parameter; "chaos": a fit to samples of its own
+control = "tangent"   # or "none"; "quadratic": two more solves for each parameter; "chaos": a fit to separate samples
 coefficient = "one"   # or "optimal": regression over the scrambles
 seed = 1
 fields = true         # mean and standard deviation of the displacement at every node
@@ -88,7 +88,7 @@ fields = true         # mean and standard deviation of the displacement at every
 kind = "multilevel-monte-carlo"
 tolerance = 0.01      # total error (mesh and sampling) of means, relative; or budget_seconds = 600, or samples = 100 on
                       # the coarsest mesh: whichever comes first
-levels = 3            # the body above is the coarsest of so many meshes: each has cells half as long as the one before
+levels = 3            # meshes; the body above is the coarsest, and each one halves the cells of the one before
 pilot = 8             # samples on every mesh before the numbers are chosen
 control = "tangent"   # or "none"
 seed = 1
@@ -108,7 +108,7 @@ kind = "multilevel-chaos"
 iterations = 2        # of the solver for each sample of a level
 tolerance = 1e-3      # relative change of the moments from level to level
 order = 3             # of the expansion
-samples = 32          # of each level; by default three for each term and more
+samples = 32          # of each level; by default at least three for each term
 max_levels = 10
 first = "tangent"     # where the first level starts; or "mean": the state at the mean parameters, as published
 seed = 1
@@ -119,7 +119,7 @@ fields = true         # mean, standard deviation and expansion of the displaceme
 kind = "compare"
 repeats = 20          # independent repeats of every method: errors are known to 16 %
 seed = 1
-textbook = 8          # draws that are also solved by Newton's method from zero: what plain Monte Carlo would cost so
+textbook = 8          # draws that are also solved by Newton's method from zero: the cost of plain Monte Carlo with it
 mesh_error = false    # true: solve once with twice the cells in each direction
 # A method, solved to tighter tolerances, or { kind = "given", values = { sag = { mean = ..., std = ... }, ... } }:
 reference = { kind = "chaos", fit = "projection", max_order = 8 }
@@ -137,7 +137,7 @@ kind = "sobol"
 design = "chaos"      # from values and gradients at few points; or "saltelli": exchanged Sobol' points, samples = rows,
                       # scrambles × a power of two, of d + 2 solves each; or "given-data", source = "results/DIRECTORY"
 samples = 15          # or tolerance = 1e-3 (leave-one-out error / std; error of an index), or budget_seconds = 600
-second_order = true   # the share of every product of two parameters
+second_order = true   # the share of every pair of parameters
 # groups = { load = ["loads.gravity.density"] }   # indices of several parameters together
 seed = 1
 fields = true         # indices of the displacement field, and at every node

@@ -1,4 +1,4 @@
-"""What sections of a report are made of: plain values, each drawn by the macro of its name in report.html.jinja."""
+"""The blocks of a section of a report: plain values, each drawn by the macro of its name in report.html.jinja."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HALF = 8.0  # inches: wider pictures are not legible on half a page
 
 @dataclass(frozen=True)
 class Block:
-    """Something that stands on the page."""
+    """Something on the page."""
 
     macro: ClassVar[str]
 
@@ -98,7 +98,7 @@ class Code(Block):
 
 @dataclass(frozen=True)
 class Folded(Block):
-    """Blocks that are seen when their title is clicked."""
+    """Blocks that open when their title is clicked."""
 
     macro = "folded"
     title: str
@@ -107,7 +107,7 @@ class Folded(Block):
 
 @dataclass(frozen=True)
 class Html(Block):
-    """Markup that stands on the page as it is, and what it needs: style and script are in the page once.
+    """Markup that is put on the page as it is; its style and script are in the page once.
 
     Whoever makes it escapes what is not markup (`html.escape`). Reports are one file: nothing may be fetched.
     """

@@ -62,7 +62,7 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
 
 
 def _asked(directory: Path) -> Report | None:
-    """Return what study.toml asks of the report."""
+    """Return the block of the report in study.toml."""
     try:
         blocks = tomllib.loads((directory / "study.toml").read_text(encoding="utf-8"))
         block = located(blocks, directory).get("report")

@@ -1,4 +1,4 @@
-"""A part of a report: when it applies, and what stands in it. A report is all sections that apply, in their order.
+"""A part of a report: when it applies, and what it shows. A report is all sections that apply, in their order.
 
 The program's own sections are in `workflows.report.sections`, one file each, named here in the order of the page.
 Others come from a module beside the study, which names them (``report = { sections = ["my_sections.Wear"] }``), or
@@ -91,14 +91,14 @@ class Section(ABC):
     Attributes
     ----------
     before
-        Which of the program's own sections one from outside stands before.
+        The program's own section before which a section from outside is placed.
     """
 
     before: ClassVar[str] = "failures"
 
     @abstractmethod
     def applies(self, results: Results) -> bool:
-        """Whether there is something to say of these results."""
+        """Whether there is something to say about these results."""
 
     @abstractmethod
     def content(self, results: Results) -> Iterator[Block]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def stability(counts: dict[str, int]) -> str:
-    """Say how the stability of the states of a study was looked at, from `stability` in summary.json."""
+    """Say how the stability of the states of a study was tested, from `stability` in summary.json."""
     refused = counts["refused"] + counts["missed"]
     parts = [
         f"{counts['counted']:,} by counting negative eigenvalues",

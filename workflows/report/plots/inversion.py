@@ -208,7 +208,7 @@ def _cut(low: float, high: float, posterior: FloatArray, prior: FloatArray) -> t
 
 
 def _worth(one: xr.Dataset) -> float:
-    """How many independent draws the draws are worth."""
+    """Effective sample size of the draws."""
     return float(one["chain_effective"] if int(one["chains"]) else one["effective"])
 
 

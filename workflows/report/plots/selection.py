@@ -99,7 +99,7 @@ def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
 
 
 def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
-    """Draw what each model leaves of the data of a test, over the stated errors, against what was measured."""
+    """Draw the residuals of each model for a test, over the stated errors, against the measurements."""
     from matplotlib.ticker import MaxNLocator
 
     ax = ax or axes(height=3.4)

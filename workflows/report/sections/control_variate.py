@@ -30,7 +30,7 @@ class ControlVariate(Section):
 
 @dataclass(frozen=True)
 class Gain:
-    """What a control variate is worth, in words."""
+    """The gain of a control variate, in words."""
 
     text: str
     hurts: bool

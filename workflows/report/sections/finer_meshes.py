@@ -19,7 +19,7 @@ class FinerMeshes(Section):
     """What a finer mesh of each candidate moves."""
 
     def applies(self, results: Results) -> bool:
-        """Whether meshes were looked at."""
+        """Whether meshes were checked."""
         return "probability" in results.dataset and "mesh_checked" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
