@@ -185,6 +185,8 @@ def write(group: h5py.Group, block: Evaluations) -> None:
     group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
     if block.tangents is not None:
         group["tangents"] = block.tangents
+    if block.mesh_errors is not None:
+        group["mesh_errors"] = block.mesh_errors
     if block.fields.size:
         group["fields"] = block.fields
 
@@ -263,6 +265,7 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 np.asarray(file["converged"]),
                 np.asarray(file["stability"]),
                 np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
+                mesh_errors=np.asarray(file["mesh_errors"]) if "mesh_errors" in file else None,
             )
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

@@ -79,6 +79,8 @@ class Evaluations:
         `CompactSum`, the rows of these points themselves, one point after the other.
     sketches
         What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are put together.
+    mesh_errors
+        Estimated errors of the mesh (n, m) where they were asked for, NaN where a solve failed or nothing is estimated.
     """
 
     points: FloatArray
@@ -92,6 +94,7 @@ class Evaluations:
     stability: NDArray[np.int8]
     fields: FloatArray
     sketches: FloatArray | None = None
+    mesh_errors: FloatArray | None = None
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -201,6 +204,8 @@ class Request:
         Name of the model among those that the evaluation has; `Evaluate.on` sets it.
     joint
         What is summed, in place of `fields`, of the states of points that follow each other.
+    mesh_errors
+        Whether the errors that the mesh makes of the outputs are estimated (`Solution.mesh_error`).
     """
 
     points: FloatArray
@@ -210,6 +215,7 @@ class Request:
     iterations: int | None = None
     model: str = OWN
     joint: JointSum | None = None
+    mesh_errors: bool = False
 
     def blocks(self, most: int | None = None) -> list[Request]:
         """Cut into blocks that depend on the number of points, of those that belong together, and `most` only."""
@@ -308,11 +314,14 @@ class Recorder:
         Every evaluation, in order, of all models; shared by the evaluations of the other models.
     models
         The name of the model of each.
+    first
+        The first evaluation of this model whole, with derivatives and fields: methods begin at the mean parameters.
     """
 
     def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
         self._evaluate = evaluate
         self._model = model
+        self.first: Evaluations | None = None
         self.log: list[Evaluations] = [] if whole is None else whole.log
         self.models: list[str] = [] if whole is None else whole.models
 
@@ -351,6 +360,7 @@ class Recorder:
         """
         evaluations = self._evaluate(request)
         _check_magnitude(evaluations, self.outputs)
+        self.first = self.first or evaluations
         # Derivatives and fields are the method's own business.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0], sketches=None))
         self.models.append(self._model)
@@ -388,7 +398,7 @@ class BlockSolver:
 
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
-        self._tangents = request.tangents
+        self._tangents, self._mesh_errors = request.tangents, request.mesh_errors
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = isinstance(request.fields, CompactSum)
         self._joint = request.joint.on(model) if request.joint is not None else None
@@ -408,6 +418,7 @@ class BlockSolver:
         m, d = len(model.outputs), len(model.parameters)
         outputs = np.full((n, m), np.nan)
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
+        mesh_errors = np.full((n, m), np.nan) if self._mesh_errors else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
@@ -423,6 +434,8 @@ class BlockSolver:
                 solution = next(solutions)
                 if isinstance(solution, SolveError):
                     raise solution
+                if mesh_errors is not None and (estimated := solution.mesh_error()) is not None:
+                    mesh_errors[i] = estimated.outputs
                 if self._row is not None:
                     row = self._row(solution, point)
                 if tangents is not None:
@@ -453,7 +466,17 @@ class BlockSolver:
         if fields is None:
             fields = np.zeros((0, 0))
         return Evaluations(
-            points, outputs, tangents, tuple(failures), seconds, work, residuals, converged, stability, fields
+            points,
+            outputs,
+            tangents,
+            tuple(failures),
+            seconds,
+            work,
+            residuals,
+            converged,
+            stability,
+            fields,
+            mesh_errors=mesh_errors,
         )
 
 
@@ -529,7 +552,7 @@ class Merger:
                 if part is not None:
                     yield part
 
-        tangents = list(joined(lambda b: b.tangents))
+        tangents, mesh_errors = list(joined(lambda b: b.tangents)), list(joined(lambda b: b.mesh_errors))
         return Evaluations(
             np.concatenate(list(joined(lambda b: b.points))),
             np.concatenate(list(joined(lambda b: b.outputs))),
@@ -542,4 +565,5 @@ class Merger:
             np.concatenate([b.stability for b in self._blocks]),
             self._fields,
             np.concatenate(self._sketches) if self._sketches else None,
+            np.concatenate(mesh_errors) if mesh_errors else None,
         )

@@ -201,6 +201,8 @@ class MultilevelMonteCarlo(Amount):
                 "total_error": (by_output, found.total_error),
                 "std_bias_error": (by_output, found.std_bias_error),
                 "std_total_error": (by_output, np.hypot(found.estimates.std_error, found.std_bias_error)),
+                "mesh_error": (by_output, found.signs * found.bias_error),
+                "std_mesh_error": (by_output, found.std_signs * found.std_bias_error),
                 "weak_rate": (by_output, rate(found.differences)),
                 "strong_rate": (by_output, rate(plain[1:])),
                 "cost_rate": ((), float(-rate(seconds[:, None])[0])),
@@ -420,6 +422,8 @@ class _Found:
         The telescoped moments up to each mesh.
     differences
         E[Y_l] (L, m), l = 1 … L.
+    signs, std_signs
+        Whether the last meshes raise (1) or lower (−1) mean and standard deviation (m,): as finer ones will.
     bias_error, std_bias_error
         Estimated errors (m,) of mean and standard deviation on the finest mesh.
     consistency
@@ -428,6 +432,8 @@ class _Found:
 
     by_mesh: tuple[Estimates, ...]
     differences: FloatArray
+    signs: FloatArray
+    std_signs: FloatArray
     bias_error: FloatArray
     std_bias_error: FloatArray
     consistency: FloatArray
@@ -442,7 +448,15 @@ class _Found:
         # The differences at the mean parameters converge at the same rate, without sampling error.
         nominal = np.array([mesh.nominal for mesh in meshes])[1:]
         alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
-        return cls(by_mesh, differences, bias(differences, alpha), bias(std_differences, alpha), consistency)
+        return cls(
+            by_mesh,
+            differences,
+            np.sign(differences[-1]),
+            np.sign(std_differences[-1]),
+            bias(differences, alpha),
+            bias(std_differences, alpha),
+            consistency,
+        )
 
     @property
     def estimates(self) -> Estimates:

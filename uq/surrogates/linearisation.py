@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
-from uq.evaluation.evaluate import Evaluate, Prediction, Request
+from uq.evaluation.evaluate import Evaluate, Evaluations, Prediction, Request
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
 
@@ -109,6 +109,14 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     slopes = derivatives and len(evaluate.parameters) <= MANY
     centre = inputs.mean if point is None else point
     found = evaluate(Request(centre[None, :], tangents=derivatives, fields=_StateAndSlopes(slopes)))
+    return linearised(inputs, evaluate, found, point)
+
+
+def linearised(
+    inputs: Inputs, evaluate: Evaluate, found: Evaluations, point: FloatArray | None = None
+) -> Linearisation:
+    """Return what `linearise` does from what it has solved."""
+    centre = inputs.mean if point is None else point
     for failure in found.failures:
         message = (
             f"the model has no answer at {'the mean' if point is None else 'the given'} parameters: {failure.reason}"

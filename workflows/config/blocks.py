@@ -31,3 +31,16 @@ class Parallel(Settings):
 
     ranks_per_model: Annotated[int, Field(ge=1)] = 1
     blocks: Annotated[int, Field(ge=1, le=1_000_000)] = BLOCKS
+
+
+class Accuracy(Settings):
+    """What is asked of errors beside those of sampling.
+
+    Parameters
+    ----------
+    mesh_error
+        Whether the error that the mesh makes is estimated of all that the study estimates, where the model is a body:
+        at a few parameters, in elements of one degree more, for at most a fifth of the solves or three estimates.
+    """
+
+    mesh_error: bool = True

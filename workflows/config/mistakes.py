@@ -99,6 +99,9 @@ def _place(steps: Sequence[str | int], place: str) -> str:
 
 def _line(item: Any, place: str) -> str:
     message, given = item["msg"], item["input"]
+    elsewhere = _ELSEWHERE.get(place.rpartition(".")[2])
+    if item["type"] == "unknown_key" and elsewhere is not None and elsewhere != place:
+        return f"{place}: unknown key; did you mean '{elsewhere}'?"
     if item["type"] in {"missing", "unknown_key"}:
         return f"{place}: {message}"
     if item["type"] == UNKNOWN_KIND and place == "method.kind" and "." not in given:
@@ -111,6 +114,7 @@ def _line(item: Any, place: str) -> str:
     return f"{message}; given {shown(given)}"
 
 
+_ELSEWHERE = {"mesh_error": "accuracy.mesh_error"}  # keys that are looked for in several blocks, and where they stand
 _WORD = 60  # letters of a key in a message
 
 

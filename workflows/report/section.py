@@ -111,6 +111,7 @@ SECTIONS = Kinds(
     {
         "header": f"{_HERE}.header:Header",
         "findings": f"{_HERE}.findings:Findings",
+        "error-budget": f"{_HERE}.error_budget:ErrorBudget",
         "synthetic-data": f"{_HERE}.synthetic_data:SyntheticData",
         "model": f"{_HERE}.model:Model",
         "nominal": f"{_HERE}.nominal:Nominal",

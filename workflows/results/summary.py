@@ -17,7 +17,11 @@ Part = dict[str, Any]
 OTHER_ESTIMATES = (
     *("variance_ratio", "std_variance_ratio", "loo_error"),
     *("bias_error", "total_error", "std_bias_error", "std_total_error"),
+    *("mesh_error", "mesh_error_doubt", "mean_corrected", "mean_corrected_error"),
+    *("std_mesh_error", "std_mesh_error_doubt", "std_corrected", "std_corrected_error"),
 )
+# Of these, what is not estimated of every output.
+NOT_OF_ALL = {name for name in OTHER_ESTIMATES if any(word in name for word in ("mesh", "corrected", "total"))}
 
 
 def summarise(dataset: xr.Dataset) -> Part:
@@ -69,7 +73,11 @@ def _moments(dataset: xr.Dataset) -> Part:
     names = [name for name in (*ESTIMATES, *OTHER_ESTIMATES) if name in dataset]
     return {
         "outputs": {
-            str(output): {name: float(dataset[name].sel(output=output)) for name in names}
+            str(output): {
+                name: _number(value) if name in NOT_OF_ALL else value
+                for name in names
+                for value in [float(dataset[name].sel(output=output))]
+            }
             for output in dataset.output.values
         }
     }

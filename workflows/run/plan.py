@@ -13,17 +13,9 @@ if TYPE_CHECKING:
     from workflows.studies.study import StudyKind
 
 
-def memory(study: StudyKind) -> float:
-    """Predict the memory (bytes) of a group of ranks, without that of the program; 0 without finite elements.
-
-    A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen has one.
-    """
-    return sum(cost.bytes for cost in (spec.cost() for spec in study.specs) if cost is not None)
-
-
 def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
     """Warn if the memory of this machine may not suffice for a study with so many groups of ranks."""
-    need = memory(study)
+    need = study.memory
     if not need:
         return None
     for limit in sorted(limits(), key=lambda one: one.size):

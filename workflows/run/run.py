@@ -30,7 +30,7 @@ from workflows.results.directory import (
     write_text,
 )
 from workflows.run import own_code
-from workflows.run.plan import memory, of_program, shortage
+from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress
 from workflows.run.summary import closing_words, summarised
 from workflows.run.version import version
@@ -93,7 +93,7 @@ def run(
     except Exception as error:
         if isinstance(error, StopError) or not out_of_memory(error):
             raise
-        reason = reason_to_stop(error, memory(study) + of_program(headroom()))
+        reason = reason_to_stop(error, study.memory + of_program(headroom()))
         raise StopError(reason) from error
 
 

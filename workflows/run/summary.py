@@ -129,6 +129,13 @@ def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any])
             lines[-1] += (
                 f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
             )
+        elif values.get("mean_corrected") is not None:
+            lines.append(
+                f"{' ' * len(output)}  error of the mesh {values['mesh_error']:+.2g} {unit}, in all ± "
+                f"{values['total_error']:.2g} {unit}; corrected mean {values['mean_corrected']:.6g} ± "
+                f"{values['mean_corrected_error']:.2g} {unit}, standard deviation {values['std_corrected']:.4g} ± "
+                f"{values['std_corrected_error']:.2g} {unit}"
+            )
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
     for name, rows in summary.get("methods", {}).items():
         last = rows[-1]

@@ -68,6 +68,8 @@ class MethodJob:
         Whether solves are worth storing: if not, an interrupted study starts again.
     node_volumes
         Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
+    estimates
+        Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
     """
 
     model: ForwardModel
@@ -79,6 +81,7 @@ class MethodJob:
     arviz_groups: ArvizGroups = field(default=lambda _: {})
     texts: Texts = field(default=lambda _: {})
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
+    estimates: Sequence[Evaluations] = ()
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:

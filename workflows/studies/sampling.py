@@ -13,10 +13,11 @@ from forward.model import Finding, ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
+from uq.accuracy.budget import estimates_for
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Correlation, Parallel
+from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
@@ -45,6 +46,8 @@ class Study(StudyKind):
         Correlations between them.
     method
         What is computed and how.
+    accuracy
+        What is asked of errors beside those of sampling. ``mesh_error`` may stand beside the blocks too.
     parallel
         Use of ranks.
     report
@@ -58,6 +61,7 @@ class Study(StudyKind):
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Annotated[Method, OfKind(METHODS)]
+    accuracy: Accuracy = Accuracy()
     parallel: Parallel = Parallel()
     report: Report | None = None
 
@@ -89,6 +93,26 @@ class Study(StudyKind):
     def planned(self) -> int:
         """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
         return self.method.planned(len(self._marginals))
+
+    @property
+    def estimates(self) -> int:
+        """Number of estimates of the error of the mesh with the planned solves: none of models without one.
+
+        Methods on several meshes, and comparisons that are asked to solve on a finer one, estimate it themselves.
+        """
+        theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
+        return estimates_for(self.planned) if self.accuracy.mesh_error and self.spec.meshed and not theirs else 0
+
+    @property
+    def memory(self) -> float:
+        """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
+        estimating = self.spec.mesh_error_cost() if self.estimates else None
+        return super().memory + (0.0 if estimating is None else estimating.bytes)
+
+    @property
+    def solves(self) -> int:
+        """Number of solves, those for the error of the mesh too."""
+        return self.planned + self.estimates
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -128,13 +152,27 @@ class Study(StudyKind):
         return found
 
     def summary(self, job: Job) -> dict[str, Any]:
-        """Return what was solved on each mesh, if there are several."""
-        of_meshes = named("workflows.studies.sampling_job:of_meshes")
-        return {"meshes": of_meshes(self, job)} if len(self.meshes) > 1 else {}
+        """Return what was solved on each mesh, if there are several, and what estimates of its error took."""
+        found: dict[str, Any] = named("workflows.studies.sampling_job:of_estimates")(self, job)
+        if len(self.meshes) > 1:
+            found["meshes"] = named("workflows.studies.sampling_job:of_meshes")(self, job)
+        return found
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
         return super().identity() | {"model": self.model.identity()}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_accuracy(cls, value: Any) -> Any:
+        """Take `mesh_error` from beside the blocks into its own, unless that says it too."""
+        if not isinstance(value, dict) or "mesh_error" not in value:
+            return value
+        accuracy = value.get("accuracy", {})
+        if not isinstance(accuracy, dict) or "mesh_error" in accuracy:
+            return value
+        rest = {name: block for name, block in value.items() if name != "mesh_error"}
+        return rest | {"accuracy": accuracy | {"mesh_error": value["mesh_error"]}}
 
     @model_validator(mode="after")
     def _check(self) -> Study:

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from forward.model import Stability
+from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
 from uq.findings import add
 from uq.inputs.sampling import random_points
+from uq.surrogates.linearisation import linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
 from workflows.studies.findings_solves import measured
@@ -33,11 +35,15 @@ def job(study: Study, ensemble: Ensemble) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
     recorders: dict[str, Recorder] = {}
+    estimates: list[Evaluations] = []
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
-        return method.run(inputs, recorders["/"])
+        found = method.run(inputs, recorders["/"])
+        return (
+            _with_mesh_errors(study, found, inputs, evaluate, recorders["/"], estimates) if study.estimates else found
+        )
 
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
@@ -62,7 +68,28 @@ def job(study: Study, ensemble: Ensemble) -> Job:
         return with_random_fields(found, factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
-    return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes)
+    return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes, estimates=estimates)
+
+
+def _with_mesh_errors(
+    study: Study,
+    found: xr.Dataset,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    recorder: Recorder,
+    estimates: list[Evaluations],
+) -> xr.Dataset:
+    """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
+    from uq.accuracy.effects import with_mesh_errors
+    from uq.accuracy.mesh_errors import estimate
+
+    first = recorder.first
+    assert first is not None  # every method begins at the mean parameters
+    centre = linearised(inputs, evaluate, first)
+    count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
+    errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
+    estimates.append(errors.evaluations)
+    return with_mesh_errors(found, inputs, centre, errors, {one.name: one.unit for one in study.model.outputs})
 
 
 def _without_nodes(found: xr.Dataset) -> xr.Dataset:
@@ -92,6 +119,17 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
         meanings = ", ".join(f"{one.value}: {one.name.lower().replace('_', ' ')}" for one in Stability)
         dataset = dataset.assign(stability=("sample", known, {"meanings": meanings}))
     return dataset
+
+
+def of_estimates(study: Study, job: Job) -> dict[str, Any]:
+    """Number and time of the estimates of the error of the mesh, which `evaluations` does not count."""
+    assert isinstance(job, MethodJob)
+    if not job.estimates:
+        return {}
+    every = merge(job.estimates)
+    seconds = float(every.seconds.sum()) * study.parallel.ranks_per_model
+    failed = len(every.failures)
+    return {"mesh_error": {"estimates": len(every.points), "failed": failed, "cpu_seconds": seconds}}
 
 
 def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:

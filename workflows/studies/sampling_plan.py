@@ -36,11 +36,14 @@ def plan(study: Study, rank_groups: int) -> list[str]:
     ]
     if spec.cost() is None:  # no one knows how long a solve takes
         return lines
-    needed = sum(times_of(one).bytes for one in study.specs) + BYTES_OF_PROGRAM
+    if study.estimates:
+        estimates = f"{study.estimates} estimates in elements of one degree more"
+        lines.append(f"mesh error  {up_to}{estimates}; none with accuracy.mesh_error = false")
+    needed = study.memory + BYTES_OF_PROGRAM
     return [
         *lines,
         f"memory      about {needed / MIB:,.0f} MiB for each group of ranks",
-        *_told(parts(study), rank_groups, up_to, later and ", then more"),
+        *_told(parts(study), rank_groups, up_to, later and ", then more", _compilation(study)),
     ]
 
 
@@ -73,13 +76,32 @@ def parts(study: Study) -> list[Part]:
     further = f"{samples:,} further solves, {found[0].sample:.2g} s each"
     return [
         Part(START, "start of the program"),
-        *([] if _compiled_before() else [Part(COMPILATION, "compilation of the forms")]),
+        *([] if _compiled_before() else [Part(_compilation(study), "compilation of the forms")]),
         Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
         Part(sum(one.tangents(dimension) for one in found), "its tangents"),
         *([Part(sum(one.reference_factor(dimension) for one in found), "reference factor")] if corrected else []),
         *([Part(seconds, further, shared=True)] if samples > 0 else []),
+        *_estimates(study),
         Part(REPORT, "results and report"),
     ]
+
+
+def _estimates(study: Study) -> Iterator[Part]:
+    """Estimates of the error of the mesh, each with its solution."""
+    estimating = study.spec.mesh_error_cost() if study.estimates else None
+    if estimating is None:
+        return
+    each = times_of(study.spec).sample + estimating.seconds
+    yield Part(
+        estimating.once + study.estimates * each,
+        f"{study.estimates} estimates of the mesh error, {each:.2g} s each",
+        True,
+    )
+
+
+def _compilation(study: Study) -> float:
+    """Seconds of the forms of a body, and of those for the error of its mesh."""
+    return COMPILATION * (2 if study.estimates else 1)
 
 
 def _compiled_before() -> bool:
@@ -87,7 +109,7 @@ def _compiled_before() -> bool:
     return any(compiled_forms().glob("forms-*/*/"))
 
 
-def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str) -> list[str]:
+def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str, compilation: float) -> list[str]:
     """Say how long a study takes by the clock, if every group of ranks has a core, and of what this is the sum."""
     by_clock = [part.seconds / (rank_groups if part.shared else 1) for part in found]
     cores = f"{rank_groups} core{'s' if rank_groups > 1 else ''}"
@@ -95,6 +117,6 @@ def _told(found: Sequence[Part], rank_groups: int, up_to: str, more: str) -> lis
     lines += [f"            {duration(s):>8}  {part.what}" for s, part in zip(by_clock, found, strict=True)]
     if _compiled_before():
         lines.append(
-            f"            and {COMPILATION:.0f} s or more where the forms of this kind of body are not compiled yet"
+            f"            and {compilation:.0f} s or more where the forms of this kind of body are not compiled yet"
         )
     return lines

@@ -88,6 +88,14 @@ class StudyKind(Settings):
         return ()
 
     @property
+    def memory(self) -> float:
+        """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements.
+
+        A body that is sampled has a factor for its solutions and one for a reference, each load case of a specimen one.
+        """
+        return sum(cost.bytes for cost in (spec.cost() for spec in self.specs) if cost is not None)
+
+    @property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for its models."""
         return ()

@@ -25,7 +25,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import dump, load, parse
 from workflows.report.sections.finer_meshes import meshes
 from workflows.run import run as study_runs
-from workflows.run.plan import memory, plan
+from workflows.run.plan import plan
 
 pytestmark = pytest.mark.fem
 STUDY = """
@@ -234,5 +234,5 @@ def test_a_plan_counts_searches_derivatives_and_finer_meshes(study):
     least = sum(12 * one.textbook + 32 * one.corrected for one in cost.values())
     assert 1.2 * least < it.seconds_of_solves < 3 * least
     largest = max(finer(specimen).cost().bytes for specimen in it.specimens.values())
-    assert memory(it) - memory(blind) == pytest.approx(largest)
+    assert it.memory - blind.memory == pytest.approx(largest)
     assert any("if it has no answer" in line for line in it.plan(1))

@@ -447,7 +447,7 @@ def test_report_of_a_study(small):
         "a solve, measured",
     ):
         assert text in page, text
-    assert page.count("<figure>") == 2 * 4 + 2
+    assert page.count("<figure>") == 2 + 2 * 4 + 2
     summary = json.loads((small / "out" / "summary.json").read_text())
     unknowns = [mesh["unknowns"] for mesh in summary["meshes"]]
     assert unknowns == [135, 675]

@@ -175,7 +175,7 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         "[model.body]",
     ):
         assert text in page, text
-    assert page.count("<figure>") == 2 * 3 + 4 + 2  # charts, bodies, tornado charts
+    assert page.count("<figure>") == 2 + 2 * 3 + 4 + 2  # error budgets, charts, bodies, tornado charts
     assert "hurts" not in page
 
 
@@ -230,7 +230,7 @@ def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
         f"worth {numbers.worth(float(sag['variance_ratio']))} plain samples for the mean",
     ):
         assert text in page, text
-    assert page.count("<figure>") == 2 * 3 + 4 + 2
+    assert page.count("<figure>") == 2 + 2 * 3 + 4 + 2
 
 
 @pytest.mark.filterwarnings("error")
@@ -362,7 +362,7 @@ def test_bodies_that_cannot_be_drawn_leave_a_line(tmp_path, sampled, monkeypatch
     monkeypatch.setattr(sys, "executable", "/bin/false")
     page = write_report(write(tmp_path / "out", sampled)).read_text()
     assert NO_BODY in page
-    assert page.count("<figure>") == 2 * 3 + 2
+    assert page.count("<figure>") == 2 + 2 * 3 + 2
 
 
 def test_body_is_drawn(sampled):

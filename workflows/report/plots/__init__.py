@@ -7,6 +7,7 @@ Functions that take `ax` draw there, or on a new figure that needs no display: i
 
 from workflows.report.plots import inversion, selection
 from workflows.report.plots.against_cost import Cost, errors
+from workflows.report.plots.budget import error_budget
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span
 from workflows.report.plots.indices import (
     BARS,
@@ -41,6 +42,7 @@ __all__ = [
     "axes",
     "comparison",
     "convergence",
+    "error_budget",
     "errors",
     "grid",
     "histogram",

@@ -78,7 +78,7 @@ def errors(
         ax.axhspan(lowest, reference, color=PLAIN, alpha=0.25, linewidth=0, label="error of the reference")
     floors = {"solver_error": "error of the solver", "mesh_error": "error of the mesh, of the mean"}
     for (floor, label), style in zip(floors.items(), ("-.", "-"), strict=True):
-        size = float(of_output[floor])
+        size = abs(float(of_output[floor]))
         if size > lowest and (estimated == "mean" or floor == "solver_error"):
             ax.axhline(size, color=DARK, linewidth=1, linestyle=style, label=label)
     ax.set_xscale("log")

@@ -24,8 +24,8 @@ class ErrorAgainstCost(Section):
         yield Heading("Error against cost")
         yield Text(
             "The reference, with its own standard errors; what the tolerance of the solver leaves of an output "
-            "(against the textbook, on some draws); what a mesh of twice the cells in each direction changes at "
-            "the mean parameters."
+            "(against the textbook, on some draws); what the mesh errs, by estimate or (`mesh_error` of the "
+            "method) by a mesh of twice the cells in each direction at the mean parameters."
         )
         yield references(results)
         yield Text(
@@ -58,7 +58,7 @@ def references(results: Results) -> Table:
     rows = []
     for output in results.outputs:
         of_output, unit = results.dataset.sel(output=output), results.unit(output)
-        floors = (with_unit(number(float(of_output[f"{name}_error"]), 2), unit) for name in ("solver", "mesh"))
+        floors = (with_unit(number(abs(float(of_output[f"{name}_error"])), 2), unit) for name in ("solver", "mesh"))
         rows.append((output, *(results.estimate(output, name) for name in ("mean", "std")), *floors))
     return Table(("output", "mean", "standard deviation", "error of the solver", "error of the mesh"), rows)
 

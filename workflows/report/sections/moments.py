@@ -11,6 +11,8 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     pass
 
+CORRECTED = ("mean_corrected", "std_corrected")  # with what the mesh is estimated to err
+
 
 class Moments(Section):
     """Mean and standard deviation of the outputs, with their errors."""
@@ -28,10 +30,12 @@ class Moments(Section):
 
 def moments(results: Results) -> Table:
     """Mean and standard deviation of the outputs, and those of plain Monte Carlo beside controlled ones."""
-    names = [n for n in ("mean", "std", "plain_mean", "plain_std") if n in results.dataset]
+    names = [n for n in ("mean", "std", *CORRECTED, "plain_mean", "plain_std") if n in results.dataset]
     words = {
         "mean": "mean",
         "std": "standard deviation",
+        "mean_corrected": "mean, error of the mesh added",
+        "std_corrected": "standard deviation, error of the mesh added",
         "plain_mean": "mean, plain Monte Carlo",
         "plain_std": "standard deviation, plain Monte Carlo",
     }

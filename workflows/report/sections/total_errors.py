@@ -14,7 +14,7 @@ class TotalErrors(Section):
 
     def applies(self, results: Results) -> bool:
         """Whether that of the mesh is known."""
-        return "total_error" in results.dataset
+        return "bias_error" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""

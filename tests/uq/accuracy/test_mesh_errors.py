@@ -1,0 +1,236 @@
+"""Errors of the mesh over the distribution: models of which they are known in closed form."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from forward.model import FunctionModel, FunctionSolution, MeshError, SolveError, Work
+from uq.accuracy.budget import FEWEST, MOST, estimates_for
+from uq.accuracy.effects import DOUBT, with_mesh_errors
+from uq.accuracy.mesh_errors import design, estimate
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.findings import findings
+from uq.inputs.distributions import Beta, LogNormal, Normal, Uniform
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.methods.chaos import Chaos
+from uq.methods.derivative_based import DerivativeBased
+from uq.methods.local_sensitivity import LocalSensitivity
+from uq.methods.monte_carlo import MonteCarlo, SensitivityMonteCarlo
+from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
+from uq.methods.sobol import Sobol
+from uq.surrogates.linearisation import linearised
+
+pytestmark = pytest.mark.unit
+
+INPUTS = Inputs({"a": Beta(a=2, b=2, lower=1.0, upper=1.5), "b": Uniform(lower=1.0, upper=2.0)})
+UNITS = {"u": "m", "v": "Pa"}
+
+
+@dataclass(frozen=True)
+class OnMesh(FunctionModel):
+    """A function, with that which a mesh without error would give."""
+
+    exact: FunctionModel | None = None
+
+    def solve(self, parameters, guess=None):
+        found = super().solve(parameters, guess)
+        return SolvedOnMesh(found.model, found.parameters, found.outputs)
+
+
+@dataclass(frozen=True)
+class SolvedOnMesh(FunctionSolution):
+    """Its value, and what it errs."""
+
+    def mesh_error(self):
+        errors = self.model.exact.function(self.parameters) - self.outputs
+        return MeshError(errors, np.empty(0), 0.0, np.nan, Work())
+
+
+def on_mesh(error, names=("a", "b")):
+    """ψ = a/b and ψ = a²/b of which a mesh makes these errors (p → two numbers)."""
+
+    def coarse(p):
+        return np.array([p[0] / p[1], p[0] ** 2 / p[1]])
+
+    def slopes(p):
+        first = [[1 / p[1], -p[0] / p[1] ** 2], [2 * p[0] / p[1], -((p[0] / p[1]) ** 2)]]
+        return np.hstack([first, np.zeros((2, len(names) - 2))])
+
+    exact = FunctionModel(lambda p: coarse(p) + np.array(error(p)), names, ("u", "v"))
+    return OnMesh(coarse, names, ("u", "v"), slopes, exact)
+
+
+def studied(method, model, count=FEWEST, inputs=INPUTS):
+    recorder = Recorder(SerialEvaluate(model))
+    dataset = method.run(inputs, recorder)
+    centre = linearised(inputs, recorder, recorder.first)
+    found = estimate(inputs, SerialEvaluate(model), centre, count, 0, fields=True)
+    return dataset, with_mesh_errors(dataset, inputs, centre, found, UNITS)
+
+
+def exact_moments(model, inputs=INPUTS):
+    points = inputs.points(sobol_points(9, 0, 0, 2**14, len(inputs.names)))
+    coarse = np.array(model.function(points.T)).T
+    exact = np.array(model.exact.function(points.T)).T
+    return coarse, exact
+
+
+METHODS = (
+    MonteCarlo(samples=400),
+    SensitivityMonteCarlo(samples=100),
+    QuasiMonteCarlo(samples=256),
+    Chaos(samples=24),
+    Sobol(samples=24),
+    Sobol(design="saltelli", samples=256),
+    DerivativeBased(samples=256),
+)
+
+
+def affine(p):
+    """Errors that follow the outputs."""
+    return [0.05 * p[0] / p[1] + 0.02, -0.1 * p[0] ** 2 / p[1]]
+
+
+def other(p):
+    """Errors that do not."""
+    return [0.04 * p[0] - 0.02 * p[1], 0.1 * (p[1] - 1.5) ** 2]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: f"{m.kind}-{getattr(m, 'design', '')}")
+def test_of_every_method_moments_and_quantiles_are_corrected(method):
+    model = on_mesh(affine)
+    before, found = studied(method, model)
+    coarse, exact = exact_moments(model)
+    np.testing.assert_allclose(found["mesh_error"], (exact - coarse).mean(axis=0), rtol=0.05)
+    np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.1)
+    moved = np.quantile(exact, found["quantile"], axis=0) - np.quantile(coarse, found["quantile"], axis=0)
+    np.testing.assert_allclose(found["quantiles_mesh_error"], moved, rtol=0.12)
+    np.testing.assert_allclose(found["mean_corrected"], before["mean"] + found["mesh_error"])
+    whole = np.hypot(before["mean_error"], abs(found["mesh_error"]) + found["mesh_error_doubt"])
+    np.testing.assert_allclose(found["total_error"], whole)
+    for name in before.variables:  # all that was there is the same, to the bit
+        assert before[name].values.tobytes() == found[name].values.tobytes(), name
+    if "sobol_first" in before:  # an error that is a fraction of the output changes no share of its variance
+        np.testing.assert_allclose(found["sobol_first_mesh_error"][1], 0, atol=1e-6)
+
+
+def test_errors_of_their_own_shape_change_moments_and_indices():
+    model = on_mesh(other)
+    before, found = studied(Chaos(samples=64, max_order=8), model, count=12)
+    coarse, exact = exact_moments(model)
+    np.testing.assert_allclose(found["mesh_error"], (exact - coarse).mean(axis=0), rtol=0.01)
+    np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.15)
+    reference = Chaos(samples=64, max_order=8).run(
+        INPUTS, SerialEvaluate(replace(model.exact, jacobian=slopes_of_exact))
+    )
+    for name in ("sobol_first", "sobol_total"):
+        moved = reference[name] - before[name]
+        np.testing.assert_allclose(found[f"{name}_mesh_error"], moved, rtol=0.02, atol=2e-4)
+        assert abs(moved).max() > 0.005
+    local = slopes_of_exact(INPUTS.mean) - before["derivative"]
+    np.testing.assert_allclose(found["derivative_mesh_error"], local, atol=2e-3)
+    nominal = model.exact.solve(INPUTS.mean).outputs - before["nominal"]
+    np.testing.assert_allclose(found["nominal_mesh_error"], nominal, atol=1e-3)
+
+
+def slopes_of_exact(p):
+    first, second = (
+        [1 / p[1] + 0.04, -p[0] / p[1] ** 2 - 0.02],
+        [2 * p[0] / p[1], -((p[0] / p[1]) ** 2) + 0.2 * (p[1] - 1.5)],
+    )
+    return np.array([first, second])
+
+
+def test_correlated_parameters():
+    inputs = Inputs({"a": Normal(mean=1.2, std=0.05), "b": LogNormal(mean=1.5, std=0.2)}, (("a", "b", 0.8),))
+    model = on_mesh(lambda p: [0.3 * (p[0] - 1.2) * np.log(p[1]), 0.1 * p[0]])
+    _, found = studied(QuasiMonteCarlo(samples=256), model, count=12, inputs=inputs)
+    coarse, exact = exact_moments(model, inputs)
+    np.testing.assert_allclose(found["mesh_error"], (exact - coarse).mean(axis=0), rtol=0.1)
+    np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.1)
+
+
+def test_many_parameters_by_few_estimates():
+    names = ("a", "b", *(f"z{i}" for i in range(20)))
+    inputs = Inputs(INPUTS.marginals | {name: Normal(mean=0.0, std=1.0) for name in names[2:]})
+    model = on_mesh(lambda p: [0.05 * p[0] / p[1] * (1 + 0.01 * p[2]), 0.1 * p[0] ** 2 / p[1] + 0.001 * p[3]], names)
+    _, found = studied(Chaos(samples=48, max_order=3), model, count=4, inputs=inputs)
+    coarse, exact = exact_moments(model, inputs)
+    np.testing.assert_allclose(found["mesh_error"], (exact - coarse).mean(axis=0), rtol=0.05)
+    np.testing.assert_allclose(found["std_mesh_error"], exact.std(axis=0) - coarse.std(axis=0), rtol=0.25)
+
+
+def test_local_derivatives_alone():
+    _, found = studied(LocalSensitivity(), on_mesh(lambda p: [0.05 * p[0] / p[1], 0.1 * p[0] ** 2 / p[1]]))
+    np.testing.assert_allclose(found["derivative_mesh_error"][0], 0.05 * found["derivative"][0], rtol=1e-5)
+    assert "mesh_error" not in found
+
+
+def test_what_an_expansion_leaves_is_claimed():
+    rough = lambda p: [0.01 + 0.02 * np.sin(40 * p[0] + 90 * p[1]), 0.05 * p[0] ** 2 / p[1]]  # noqa: E731
+    _, found = studied(Chaos(samples=24), on_mesh(rough), count=8)
+    assert 0.005 < found["mesh_error_doubt"][0] < 0.05
+    assert found["mesh_error_doubt"][1] == pytest.approx(DOUBT * found["mesh_error"][1].item(), rel=0.05)
+    assert any("does not follow" in one.text and "u" in one.text for one in findings(found))
+
+
+def test_failed_estimates_are_said_and_left_out():
+    def error(p):
+        if p[1] > limit:
+            message = "no factor"
+            raise SolveError(message)
+        return affine(p)
+
+    limit = 1.8
+    model = on_mesh(error)
+    _, found = studied(Chaos(samples=24), model, count=10)
+    lost = (found["mesh_error_points"][:, 1] > limit).to_numpy()
+    assert 0 < lost.sum() < 9
+    assert np.isnan(found["mesh_error_values"].values[lost]).all()
+    assert any("of 10 estimates of the error of the mesh failed (no factor)" in one.text for one in findings(found))
+    np.testing.assert_allclose(found["std_mesh_error"] / found["std"], [0.05, -0.1], rtol=0.02)
+    limit = 0.0  # none is left
+    before, found = studied(Chaos(samples=24), model)
+    assert np.isnan(found["mesh_error"]).all()
+    assert np.isnan(found["total_error"]).all()
+    np.testing.assert_array_equal(found["mean"], before["mean"])
+    assert any("nothing is known" in one.text for one in findings(found))
+
+
+def test_what_is_not_estimated_is_said_by_name():
+    _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.0, np.nan]))
+    assert any("not estimated of v" in one.text for one in findings(found))
+    np.testing.assert_array_equal(np.isnan(found["total_error"]), [False, True])
+
+
+def test_where_the_mesh_decides_and_where_it_is_coarse():
+    _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.02 * p[0] / p[1], 0.2 * p[0] ** 2 / p[1]]))
+    said = {one.severity: one.text for one in findings(found)}
+    assert "u 0.017 m against" in said["note"]
+    assert "v 0.22 Pa against" in said["note"]
+    assert "mean: v 20%" in said["warning"] or "standard deviation: v 20%" in said["warning"]
+    assert "u" not in said["warning"].rpartition(":")[2]
+    _, found = studied(MonteCarlo(samples=8), on_mesh(lambda p: [1e-6 * p[0], 1e-6]))
+    assert not any("mesh" in one.text for one in findings(found))
+
+
+@pytest.mark.parametrize(("count", "d"), [(3, 2), (3, 30), (4, 2), (16, 4), (5, 1)])
+def test_designs_begin_at_the_mean_and_are_spread(count, d):
+    inputs = Inputs({f"z{i}": Normal(mean=1.0, std=2.0) for i in range(d)})
+    slopes = np.random.default_rng(1).normal(size=(2, d))
+    points = design(inputs, slopes, count, 3)
+    np.testing.assert_array_equal(points[0], inputs.mean)
+    np.testing.assert_array_equal(points, design(inputs, slopes, count, 3))
+    assert not np.array_equal(points[1:], design(inputs, slopes, count, 4)[1:])
+    t = (
+        (inputs.coordinates.of(points) @ np.linalg.svd(slopes, full_matrices=False)[2][0])
+        if count < d + 2
+        else inputs.coordinates.of(points)[:, 0]
+    )
+    assert 0.5 < t.std() < 1.6
+
+
+def test_the_number_of_estimates_is_a_fifth_of_the_solves():
+    assert [estimates_for(n) for n in (1, 50, 100, 200, 10_000)] == [3, 3, 5, 10, MOST]

@@ -1,0 +1,202 @@
+"""The error of the mesh over the distribution: studies of bodies, against finer meshes."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from forward.words import number
+from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from uq.findings import findings
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, dump, load, parse
+from workflows.run.plan import plan
+
+TINY = ROOT / "configs" / "tiny.toml"
+OFF = "accuracy.mesh_error=false"
+BLOCK = (  # compressed softly enough that the error of the mesh is no fixed share of the outputs
+    "model.body.size=[1.0, 0.5, 0.5]",
+    "model.material.C2=2e4",
+    "parameters={'loads.gravity.density'={kind='uniform', lower=100, upper=300}, "
+    "'material.D1'={kind='uniform', lower=3e4, upper=9e4}}",
+    "method={kind='chaos', samples=16, max_order=4}",
+)
+
+
+@cache
+def block(cells, *more):
+    return load(TINY, [*BLOCK, f"model.body.cells={list(cells)}", *more]).run()
+
+
+@pytest.mark.fem
+def test_what_three_estimates_predict_is_what_a_finer_mesh_changes():
+    coarse, fine = block((4, 2, 2)), block((8, 4, 4), OFF)
+    assert coarse.sizes["estimate"] == 3
+    for name in ("mean", "std"):
+        first = "" if name == "mean" else "std_"
+        moved = fine[name] - coarse[name]  # the same points on both meshes: of the error of sampling little is left
+        np.testing.assert_allclose(coarse[f"{first}mesh_error"], moved, rtol=0.25)
+        left = abs(coarse[f"{name}_corrected"] - fine[name])
+        assert (left < 0.25 * moved).all()
+        assert (left < coarse[f"{name}_corrected_error"]).all()
+        assert (moved < coarse[f"{first}total_error"]).all()
+    sag = {"output": "uy_max"}
+    moved = fine["quantiles"].sel(sag) - coarse["quantiles"].sel(sag)
+    np.testing.assert_allclose(coarse["quantiles_mesh_error"].sel(sag), moved, rtol=0.25)
+    for name in ("sobol_first", "sobol_total"):  # the influence of D1 is what a coarse mesh hides
+        np.testing.assert_allclose(coarse[f"{name}_mesh_error"], fine[name] - coarse[name], rtol=0.3)
+    local = fine["derivative"] - coarse["derivative"]
+    np.testing.assert_allclose(coarse["derivative_mesh_error"], local, rtol=0.3)
+
+
+@pytest.mark.fem
+def test_fields_are_corrected_too():
+    coarse, fine = block((4, 2, 2)), block((8, 4, 4), OFF)
+    nodes = {tuple(p): i for i, p in enumerate(np.round(fine["node_position"].values, 9).tolist())}
+    shared = [nodes[tuple(p)] for p in np.round(coarse["node_position"].values, 9).tolist()]
+    for name in ("mean", "std"):
+        moved = fine[f"field_{name}"].values[shared] - coarse[f"field_{name}"].values
+        left = moved - coarse[f"field_{name}_mesh_error"].values
+        assert np.linalg.norm(left) < 0.3 * np.linalg.norm(moved)
+
+
+@pytest.mark.fem
+def test_what_was_there_is_the_same_to_the_bit_without_estimates():
+    small = ["method={kind='chaos', samples=8, max_order=2}", "model.body.cells=[2, 1, 1]"]
+    on, off = (load(TINY, [*small, *more]).run() for more in ([], [OFF]))
+    assert not any(
+        "mesh_error" in name or "corrected" in name or "estimate" in off[name].dims for name in off.variables
+    )
+    for name in off.variables:
+        assert on[name].values.tobytes() == off[name].values.tobytes(), name
+    assert any("mesh" in one.text for one in findings(on))
+    assert not any("The mesh" in one.text for one in findings(off))
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(
+    "method",
+    [
+        "{kind='monte-carlo', samples=8}",
+        "{kind='quasi-monte-carlo', samples=32, scrambles=4}",
+        "{kind='multilevel-chaos', samples=16, order=2}",
+        "{kind='sobol', design='saltelli', samples=32, scrambles=4}",
+        "{kind='derivative-based', samples=32, scrambles=4}",
+        "{kind='local-sensitivity'}",
+        "{kind='compare', repeats=2, textbook=0, methods=[{kind='monte-carlo', budgets=[4]}],"
+        " reference={kind='chaos', samples=8, max_order=2}}",
+        "{kind='multilevel-monte-carlo', samples=4, pilot=4, levels=2}",
+    ],
+)
+def test_every_method_has_them(method):
+    found = load(TINY, [f"method={method}", "model.body.cells=[2, 1, 1]"]).run()
+    error = found["mesh_error" if "mean" in found else "nominal_mesh_error"]
+    assert (error > 0).all()
+    if "mean" in found:
+        assert (found["total_error"] > abs(found["mesh_error"])).all() or "bias_error" in found
+        assert (found["total_error"] >= found["mean_error"]).all()
+        assert (found["std_total_error"] >= found["std_error"]).all()
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_the_same_bits_on_any_number_of_ranks_and_after_a_kill(tmp_path):
+    study = ["run", TINY, "--set", "model.body.cells=[2, 1, 1]", "--set", "method.samples=8", "--no-report", "--out"]
+    for ranks in (1, 3):
+        done = run(ranks, TISSUQ, *study, tmp_path / f"{ranks}")
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "1", tmp_path / "3")
+    # Killed as it writes the first file that holds an estimate.
+    done = run_script(None, KILLED, *study, tmp_path / "killed")
+    assert done.returncode == -9
+    kept = len(list((tmp_path / "killed" / "evaluations").glob("*.h5")))
+    assert kept > 1
+    done = run(2, TISSUQ, *study, tmp_path / "killed")
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "1", tmp_path / "killed")
+
+
+KILLED = """
+import os, sys
+from uq.evaluation.checkpoint import Checkpoint
+save = Checkpoint.save
+
+def killed(self, key, block):
+    save(self, key, block)
+    if getattr(block, "mesh_errors", None) is not None:
+        os.kill(os.getpid(), 9)
+
+Checkpoint.save = killed
+from workflows.__main__ import main
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.fem
+def test_the_summary_and_the_terminal_say_it(tmp_path):
+    study = ["run", TINY, "--set", "model.body.cells=[2, 1, 1]", "--set", "method.samples=8", "--out", tmp_path / "out"]
+    done = run(None, TISSUQ, *study)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["evaluations"] == 9
+    assert summary["mesh_error"]["estimates"] == 3
+    assert summary["mesh_error"]["failed"] == 0
+    assert summary["mesh_error"]["cpu_seconds"] > 0
+    of = summary["outputs"]["uy_max"]
+    assert of["mean_corrected"] == pytest.approx(of["mean"] + of["mesh_error"])
+    assert of["total_error"] == pytest.approx(
+        np.hypot(of["mean_error"], abs(of["mesh_error"]) + of["mesh_error_doubt"])
+    )
+    assert of["std_corrected_error"] == pytest.approx(np.hypot(of["std_error"], of["std_mesh_error_doubt"]), rel=1e-6)
+    assert f"error of the mesh {of['mesh_error']:+.2g} m" in done.stdout
+    assert f"corrected mean {of['mean_corrected']:.6g}" in done.stdout
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Error budget" in page
+    assert page.index("Error budget") < page.index("What was computed")
+    assert number(of["total_error"], 2) in page
+
+
+@pytest.mark.unit
+def test_the_setting():
+    on, off = load(TINY), load(TINY, [OFF])
+    assert (on.estimates, off.estimates) == (3, 0)
+    assert load(TINY, ["mesh_error=false"]) == off
+    assert parse(document(off)) == off
+    assert "[accuracy]\nmesh_error = false" in dump(off)
+    own = load(ROOT / "configs" / "own-model.toml")  # a function has no mesh
+    assert own.estimates == 0
+    assert own.accuracy.mesh_error
+    assert load(ROOT / "configs" / "beam-multilevel.toml").estimates == 0  # which it has several of
+    for wrong in ("accuracy.mesh_error=3", "mesh_error=3", "accuracy.mesh_eror=false"):
+        with pytest.raises(StudyError, match="accuracy"):
+            load(TINY, [wrong])
+    for block_ in ("method", "model", "model.body"):
+        with pytest.raises(StudyError, match=rf"{block_}.mesh_error: unknown key; did you mean 'accuracy.mesh_error'"):
+            load(TINY, [f"{block_}.mesh_error=false"])
+    with pytest.raises(StudyError, match="accuracy: unknown key"):
+        load(ROOT / "configs" / "treloar.toml", [OFF])
+
+
+@pytest.mark.unit
+def test_the_plan_says_what_it_takes():
+    on, off = load(TINY), load(TINY, [OFF])
+    said = "\n".join(plan(on))
+    assert "3 estimates in elements of one degree more" in said
+    assert "estimates of the mesh error" in said
+    assert "estimates" not in "\n".join(plan(off))
+    assert on.memory > off.memory
+    assert on.solves == off.solves + 3
+
+
+@pytest.mark.fem
+def test_a_study_without_it_imports_nothing_of_it():
+    script = f"""
+import sys
+from pathlib import Path
+from workflows.config.study import load
+load(Path({str(TINY)!r}), {[OFF, "model.body.cells=[2,1,1]", "method.samples=2"]!r}).run()
+assert not [name for name in sys.modules if name.startswith("uq.accuracy.") and name != "uq.accuracy.budget"]
+"""
+    done = run_script(None, script)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,1 @@
+"""The error that a mesh makes of what a study estimates."""

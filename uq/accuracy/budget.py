@@ -1,0 +1,12 @@
+"""How many estimates of the error of the mesh a study affords; apart, since plans ask for it."""
+
+from __future__ import annotations
+
+SHARE = 0.2  # of the solves of a study that estimates may cost
+COST = 4  # of an estimate with its solution, in solves
+FEWEST, MOST = 3, 16  # estimates: the fewest of which one can be left out of a line, and more than are needed
+
+
+def estimates_for(solves: int) -> int:
+    """Number of estimates that a study of so many solves affords, `FEWEST` in any case."""
+    return int(min(max(SHARE * solves / COST, FEWEST), MOST))

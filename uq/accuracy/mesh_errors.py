@@ -1,0 +1,234 @@
+"""Estimates of the error of the mesh at a few parameters, and what follows from them everywhere else.
+
+The error e(ω) of an output ψ is smooth in the parameters, so that few estimates say what it is. Either e itself or its
+ratio to ψ, which varies less where an error follows its output, is a Gaussian process: Σ_k c_k p_k(ω) + noise with the
+orthonormal polynomials p_k of order 0 to 2 and independent coefficients c_k of zero mean, of any size for the constant
+and of variances that fall with the order for the others (C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for
+Machine Learning (2006), section 2.7). Given the estimates, c has a mean and a covariance: with few estimates in many
+parameters, or where they disagree, it is the covariance that says so. Of both ways the one is taken that predicts
+estimates best that it has not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from forward.model import FloatArray, ForwardModel, Solution
+from uq.estimators.indices import shares
+from uq.evaluation.evaluate import Evaluate, Evaluations, Request
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.surrogates.basis import Basis, hyperbolic, orthonormal
+from uq.surrogates.linearisation import Linearisation
+
+DESIGNS = 64  # of which the one is taken whose points are spread best
+STREAM = 1 << 20  # of scrambles of the designs, beyond those of the methods
+PRODUCTS = 8  # parameters up to which errors may have terms of second order
+FALL = 0.1  # variance of coefficients of one order more, over those before
+CONSTANT = 1e6  # variance of the constant, over those of first order: any
+EXPECTED, BELIEF = (
+    0.3,
+    2.0,
+)  # how far an error is expected to vary, relative to itself, and the estimates that this is worth
+SMALL = 0.05  # of the largest output at the points: where it is smaller somewhere, no ratio to it is taken
+
+
+def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatArray:
+    """Return points (count, d): the mean, and scrambled Sobol' points that are spread well.
+
+    Of some scrambles that one is taken whose first and second moments are closest to those of the distribution: of all
+    coordinates where points are more than these, or else of the directions in which the outputs vary most.
+
+    Parameters
+    ----------
+    slopes
+        Derivatives (m, d) of the outputs along the coordinates.
+    seed
+        Of the study.
+    """
+    d = len(inputs.names)
+    ways = np.eye(d)
+    if count < d + 1:
+        scaled = slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
+        ways = np.linalg.svd(np.nan_to_num(scaled), full_matrices=False)[2][: count - 1]
+    best, least = np.empty((0, d)), np.inf
+    for scramble in range(DESIGNS):
+        points = np.vstack([inputs.mean, inputs.points(sobol_points(seed, STREAM + scramble, 0, count - 1, d))])
+        along = np.column_stack([np.ones(count), inputs.coordinates.of(points) @ ways.T])
+        unlike = float(np.linalg.norm(along.T @ along / count - np.eye(along.shape[1])))
+        if unlike < least:
+            best, least = points, unlike
+    return best
+
+
+@dataclass(frozen=True)
+class _StateErrors:
+    """Errors of the states at some points (n, d): the sum has a row for each of them, zero where there is none."""
+
+    points: FloatArray
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        def row(solution: Solution, parameters: FloatArray) -> FloatArray:
+            found = solution.mesh_error()
+            return np.zeros((1, 0)) if found is None else found.state[None, :]
+
+        return row
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        found = np.zeros((len(self.points), rows.shape[2]))
+        for point, row in zip(points, rows, strict=True):
+            found[(self.points == point).all(axis=1)] = row[0]
+        return found
+
+    def sketch(self, rows: FloatArray) -> None:
+        return
+
+
+@dataclass(frozen=True)
+class MeshErrors:
+    """Errors of the mesh at some points.
+
+    Attributes
+    ----------
+    evaluations
+        Solutions at all points, the first of which is the mean, with `Evaluations.mesh_errors`.
+    fields
+        Errors (n, U) of the displacements at the points that have an answer; None where they were not asked for.
+    """
+
+    evaluations: Evaluations
+    fields: FloatArray | None
+
+    @property
+    def points(self) -> FloatArray:
+        """Points (n, d) that have an answer."""
+        return self.evaluations.points[self.evaluations.ok]
+
+    @property
+    def outputs(self) -> FloatArray:
+        """Outputs (n, m) there."""
+        return self.evaluations.outputs[self.evaluations.ok]
+
+    @property
+    def errors(self) -> FloatArray:
+        """Errors (n, m) of the outputs there; NaN in columns of what is not estimated."""
+        assert self.evaluations.mesh_errors is not None
+        return self.evaluations.mesh_errors[self.evaluations.ok]
+
+
+def estimate(
+    inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int, seed: int, *, fields: bool
+) -> MeshErrors:
+    """Estimate the error of the mesh at so many points."""
+    points = design(inputs, centre.output_slopes, count, seed)
+    wanted = _StateErrors(points) if fields and centre.state.size else None
+    found = evaluate(Request(points, fields=wanted, start=centre.prediction, mesh_errors=True))
+    states = None
+    if wanted is not None and found.fields.size:
+        states = found.fields[found.ok][:, : evaluate.displacements]
+    return MeshErrors(found, states)
+
+
+# --- between estimates -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Between:
+    """An error of an output as a function of the parameters: a + … in polynomials, or such a multiple of the output.
+
+    Attributes
+    ----------
+    basis
+        The functions p_k.
+    follows
+        Number of the output whose multiple it is; None where it is a function by itself.
+    weights
+        Coefficients (q, n) by the errors at the n points: c = weights @ errors.
+    covariance
+        Of the coefficients (q, q), for errors of a size that `scale` tells.
+    unseen
+        (n, n): times the errors, what is missed at each point by the estimates at the others.
+    precision
+        (n, n) of the errors at the points, without the constant.
+    """
+
+    basis: Basis
+    follows: int | None
+    weights: FloatArray
+    covariance: FloatArray
+    unseen: FloatArray
+    precision: FloatArray
+
+    def functions(self, points: FloatArray, outputs: FloatArray) -> FloatArray:
+        """Return what the coefficients (q,) multiply (n, q), at points (n, d) with outputs (n, m)."""
+        values = self.basis.values(points)
+        return values if self.follows is None else np.asarray(values * outputs[:, [self.follows]])
+
+    def slopes(self, point: FloatArray, outputs: FloatArray, tangents: FloatArray) -> FloatArray:
+        """Return the derivatives (d, q) of these along the parameters at a point (d,), from outputs and tangents."""
+        found = self.basis.derivatives(point[None, :])[0] / self.basis.coordinates.steps(point)[:, None]
+        if self.follows is None:
+            return np.asarray(found)
+        values = self.basis.values(point[None, :])[0]
+        return np.asarray(outputs[self.follows] * found + np.outer(tangents[self.follows], values))
+
+    def scale(self, errors: FloatArray) -> float:
+        """Variance of the coefficients, over that of their prior: as errors (n,) scatter, and as is expected."""
+        expected = EXPECTED**2 * float((self.weights[0] @ errors) ** 2)
+        return float((errors @ self.precision @ errors + BELIEF * expected) / (len(errors) - 1 + BELIEF))
+
+
+def between(
+    inputs: Inputs, slopes: FloatArray, points: FloatArray, outputs: FloatArray, follows: int | None
+) -> Between | None:
+    """Return how an error depends on the parameters, given points (n, d) with outputs (n, m); None where it cannot.
+
+    Parameters
+    ----------
+    slopes
+        Derivatives (m', d) along the coordinates of the outputs in question: errors vary along them rather.
+    follows
+        As of `Between`.
+    """
+    n, d = points.shape
+    sizes = np.ones(n) if follows is None else outputs[:, follows]
+    if not np.abs(sizes).min() > SMALL * np.abs(sizes).max():
+        return None
+    order = 2 if d <= PRODUCTS else 1
+    basis = orthonormal(inputs, hyperbolic(d, order, 1.0))
+    squares = np.nan_to_num(slopes) ** 2
+    along = shares(squares, squares.sum(axis=1, keepdims=True)).mean(axis=0)
+    weight = (along + 1 / d) / (along.sum() + 1)
+    degrees = basis.indices.sum(axis=1)
+    variances = np.prod(np.where(basis.indices > 0, weight**basis.indices, 1.0), axis=1) * FALL ** np.maximum(
+        degrees - 1, 0
+    )
+    variances[degrees == 0] = CONSTANT
+    noise = FALL**order
+    values = basis.values(points)
+    inverse = np.linalg.inv((values * variances) @ values.T + noise * np.eye(n))
+    gain = variances[:, None] * values.T @ inverse
+    ones = np.ones(n)
+    rest = inverse - np.outer(inverse @ ones, inverse @ ones) / (ones @ inverse @ ones)
+    return Between(
+        basis,
+        follows,
+        gain / sizes,
+        np.diag(variances) - gain @ (values * variances),
+        sizes[:, None] * inverse / np.diag(inverse)[:, None] / sizes,
+        rest / np.outer(sizes, sizes),
+    )
+
+
+def best(ways: Sequence[Between | None], errors: FloatArray) -> Between:
+    """Return the way that predicts errors (n, k) best which it has not seen."""
+    able = [way for way in ways if way is not None]
+    return min(able, key=lambda way: float(((way.unseen @ errors) ** 2).sum()))
+
+
+def covariances(values: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the covariances (p, q) of functions (n, p) and others (n, q) over the same points."""
+    return np.asarray((values - values.mean(axis=0)).T @ (others - others.mean(axis=0)) / len(values))

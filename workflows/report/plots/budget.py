@@ -1,0 +1,58 @@
+"""Where the errors of estimates come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, text_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from forward.model import FloatArray
+
+PART_COLOURS = {"sampling": CONTROLLED, "mesh": HIGH, "solver": PLAIN, "total": DARK}
+SHOWN = 12  # outputs that have bars
+SPAN = 1e-9  # of the largest error: smaller ones have no bar, so that the others can be told apart
+
+
+def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax: Axes | None = None) -> Axes:
+    """Draw what each source of error makes of an estimate of each output, relative to the estimate.
+
+    Parameters
+    ----------
+    names
+        Of the outputs.
+    parts
+        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN where one is not known.
+    of
+        The estimate, in words.
+    ax
+        Where to draw.
+    """
+    names, parts = names[:SHOWN], {name: np.asarray(values)[:SHOWN] for name, values in parts.items()}
+    ax = ax or axes(height=1.5 + (0.2 * len(parts) + 0.15) * len(names), width=7.6)
+    places = np.arange(len(names))[::-1]
+    height = 0.8 / len(parts)
+    largest = max((float(v) for values in parts.values() for v in values if np.isfinite(v)), default=0.0) or 1.0
+    floor = max(min((float(v) for values in parts.values() for v in values if v > 0), default=1.0), SPAN * largest)
+    left = floor / 3
+    for row, (name, values) in enumerate(parts.items()):
+        drawn = np.where(values >= floor, values, np.nan)
+        at = places + 0.4 - (row + 0.5) * height
+        ax.barh(at, drawn - left, left=left, height=0.9 * height, color=PART_COLOURS[name], label=name)
+        for y, value in zip(at, drawn, strict=True):
+            if np.isfinite(value):
+                ax.annotate(
+                    f"{value:.1e}", (value, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=7
+                )
+    ax.set_xscale("log")
+    ax.set_xlim(left, 8 * largest)
+    ax.set_yticks(places, [text_of(name) for name in names])
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlabel(f"error of the {of}, relative to it")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=len(parts), frameon=False, fontsize="small")
+    return ax
