@@ -17,9 +17,11 @@ import xarray as xr
 
 ROOT = Path(__file__).parent.parent
 SHORTER = {  # what keeps the kind of study, at less cost
-    "beam-compare": ("method.repeats=2",),
+    "batch": ("method.samples=32", "method.starts=1"),
+    "beam-compare": ("method.repeats=2", "method.textbook=1", "model.body.cells=[4, 1, 2]"),
     "beam-coverage": ("method.repeats=2",),
-    "four-parameters": ("method.repeats=2",),
+    "four-parameters": ("method.repeats=2", "method.textbook=1"),
+    "inclusion-material": ("method.samples=32", "method.starts=1", "model.body.cells=[3, 3, 3]"),
     "beam-monte-carlo": ("method.samples=128",),
     "beam-saltelli": ("method.samples=128",),
     "beam-wide": ("method.samples=200",),

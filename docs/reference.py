@@ -196,7 +196,7 @@ def settings() -> str:
 
     whole = schema()
     blocks = whole["$defs"]
-    roots = [one["$ref"].rpartition("/")[2] for one in whole["anyOf"]]
+    roots = [one["$ref"].rpartition("/")[2] for one in whole["anyOf"] if "$ref" in one]
     order = roots + sorted((name for name in blocks if name not in roots), key=lambda name: _title(name, blocks[name]))
     lines = [
         "# Blocks of a study file",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +70,14 @@ class Kinds:
             raise KindError(f"unknown kind; {nearest(kind, self.names)}")
         return self._imported(kind, found.module, found.attr)
 
+    def __contains__(self, kind: str) -> bool:
+        """Whether there is such a kind; what is not the program's own is imported."""
+        try:
+            self[kind]
+        except KindError:
+            return False
+        return True
+
     def __iter__(self) -> Iterator[str]:
         """Iterate over the program's own."""
         return iter(self.own)
@@ -115,15 +124,31 @@ def named(text: str) -> Any:
 
 def dotted(document: Any) -> Iterator[str]:
     """Return the modules of all kinds in a document that are dotted paths, at any depth."""
+    for kind in _kinds(document):
+        if "." in kind and all(step.isidentifier() for step in kind.split(".")):
+            yield kind.rpartition(".")[0]
+
+
+def installed(document: Any) -> Iterator[str]:
+    """Return the modules of all kinds in a document that installed packages declare, in whichever family."""
+    points: dict[str, list[str]] = {}
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        points.setdefault(point.name.partition(".")[2], []).append(point.module)
+    for kind in _kinds(document):
+        yield from points.get(kind, ())
+
+
+def _kinds(document: Any) -> Iterator[str]:
+    """Return what is written as a kind anywhere in a document."""
     if isinstance(document, Mapping):
         kind = document.get("kind")
-        if isinstance(kind, str) and "." in kind and all(step.isidentifier() for step in kind.split(".")):
-            yield kind.rpartition(".")[0]
+        if isinstance(kind, str):
+            yield kind
         document = document.values()
     elif not isinstance(document, list | tuple):
         return
     for block in document:
-        yield from dotted(block)
+        yield from _kinds(block)
 
 
 @dataclass(frozen=True)
@@ -172,8 +197,11 @@ class OfKind:
         return core_schema.no_info_before_validator_function(self.validate, core_schema.any_schema())
 
     def __get_pydantic_json_schema__(self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        """Any of the named kinds, or a block of a dotted kind, about which nothing is known."""
-        known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.names]
+        """Any of the named kinds that can be used here, or a block of a dotted kind, about which nothing is known."""
+        known = [handler(_with_reference(self.block(kind))) for kind in self.kinds.own]
+        for kind in self.kinds.names[len(known) :]:
+            with suppress(KindError):
+                known.append(handler(_with_reference(self.block(kind))) | {"properties": {"kind": {"const": kind}}})
         other = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}}
         return {"anyOf": [*known, {**other, "required": ["kind"]}]}
 

@@ -26,14 +26,14 @@ def on_ranks(ranks, *command):
     return list(map(str, command if ranks is None else (mpirun, "-n", ranks, *command)))
 
 
-def run(ranks, *command):
-    """Run to the end; exit code and output are in what is returned."""
+def run(ranks, *command, path=None):
+    """Run to the end, with packages in a folder of their own; exit code and output are in what is returned."""
     return subprocess.run(
         on_ranks(ranks, *command),
         capture_output=True,
         text=True,
         timeout=300,  # a hang; busy machines are slow
-        env=environment(),
+        env=environment() | ({} if path is None else {"PYTHONPATH": str(path)}),
         check=False,
         cwd=ROOT,
     )

@@ -33,7 +33,7 @@ def schema():
 def test_the_page_has_one_file_for_each_kind(folder):
     assert {path.name for path in folder.iterdir()} >= {
         "my_tissue.py", "my_loads.py", "my_outputs.py", "my_methods.py", "my_sections.py", "my_models.py",
-        "wound.toml", "beam.toml",
+        "my_studies.py", "wound.toml", "beam.toml", "scan.toml",
     }  # fmt: skip
 
 
@@ -79,6 +79,20 @@ def test_a_model_with_numbers_of_its_own(folder, schema):
     expected = 0.5 * cube / 3 / 2.0 * (1 + 0.1**2)  # the mean of 1/x of a log-normal x of coefficient of variation v
     assert data["mean"].item() == pytest.approx(expected, abs=4 * data["mean_error"].item())
     assert np.isfinite(data["std"]).all()
+
+
+def test_a_kind_of_study(folder, schema):
+    study, out = folder / "scan.toml", folder / "scan"
+    jsonschema.validate(tomllib.loads(study.read_text()), schema)
+    checked = run(None, TISSUQ, "check", study)
+    assert checked.returncode == 0, checked.stderr
+    assert "3 values of length" in checked.stdout
+    done = run(2, TISSUQ, "run", study, "--out", out)
+    assert done.returncode == 0, done.stderr
+    found = xr.load_dataset(out / "results.nc")
+    assert found["scanned"].to_numpy().ravel() == pytest.approx(0.5 * np.array([0.08, 0.1, 0.12]) ** 3 / 3 / 2.0)
+    assert "my_studies" in json.loads((out / "sources.json").read_text())["files"]
+    assert "A number of the model that is varied" in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

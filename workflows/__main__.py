@@ -89,7 +89,8 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from workflows.run.version import version
 
-        parser.exit(message=f"tissuq {version()}\n")
+        sys.stdout.write(f"tissuq {version()}\n")
+        parser.exit()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -203,13 +204,12 @@ def _report(options: argparse.Namespace) -> int:
 def _serve(options: argparse.Namespace) -> int:
     from workflows.config.mistakes import StudyError
     from workflows.serve import serve
-    from workflows.studies.sampling import Study
 
     study = _load(options)
-    if not isinstance(study, Study):
+    if study.sampled is None:
         message = f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve"
         raise StudyError(message)
-    serve(study, options.port, options.host, quiet=options.quiet)
+    serve(study.sampled, options.port, options.host, quiet=options.quiet)
     return DONE
 
 

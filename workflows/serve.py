@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,13 +28,16 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.surrogates.linearisation import linearise
 from workflows.config.mistakes import StudyError
 from workflows.http import RefusalError, Server
-from workflows.studies.sampling import Study
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel
+    from forward.spec import ModelSpec
+    from uq.inputs.random_parameters import Inputs
+    from workflows.studies.study import Sampled
 
 NAME = "forward"
 OPTIONS = ("level", "tolerance")
+WAKE = 1.0  # seconds after which an idle server looks for signals
 KEPT = 4  # models of different options
 MOST_UNKNOWNS = 2_000_000  # of a mesh that a request may ask for
 STEP = 1e-3  # of differences of gradients, in standard deviations of the parameters
@@ -45,17 +48,15 @@ class Service:
 
     Parameters
     ----------
-    study
-        The study whose model is served; its distributions only determine where the solver starts and how large a
-        difference is.
+    sampled
+        The model; its distributions only determine where the solver starts and how large a difference is.
     """
 
-    def __init__(self, study: Study) -> None:
-        self._study = study
-        self._inputs = study.inputs
+    def __init__(self, sampled: Sampled) -> None:
+        self._inputs, self._spec = sampled
         self._made: dict[str, _Solver] = {}
-        self.parameters = study.inputs.names
-        self.outputs = tuple(output.name for output in study.model.outputs)
+        self.parameters = sampled.inputs.names
+        self.outputs = tuple(output.name for output in sampled.spec.outputs)
         self._differentiable = self._solver({}).model.differentiable
 
     def answer(self, what: str, question: dict[str, Any]) -> dict[str, Any]:
@@ -140,15 +141,15 @@ class Service:
                 raise RefusalError("InvalidInput", message)
         key = json.dumps(options, sort_keys=True)
         if key not in self._made:
-            made = _Solver(self._study, self._specified(options))
+            made = _Solver(self._inputs, self._specified(options))
             while len(self._made) >= KEPT:
                 del self._made[next(iter(self._made))]
             self._made[key] = made
         return self._made[key]
 
-    def _specified(self, options: dict[str, Any]) -> Any:
+    def _specified(self, options: dict[str, Any]) -> ModelSpec:
         """Return the specification of the model with options."""
-        model = self._study.spec
+        model = self._spec
         if not options:
             return model
         if not model.meshed:
@@ -176,10 +177,9 @@ class Service:
 class _Solver:
     """A model whose solves start from the tangent at the mean parameters, if possible."""
 
-    def __init__(self, study: Study, spec: Any) -> None:
+    def __init__(self, inputs: Inputs, spec: ModelSpec) -> None:
         from mpi4py import MPI
 
-        inputs = study.inputs
         self.model: ForwardModel = spec.build(MPI.COMM_SELF, inputs.names)
         self._guess: Callable[[FloatArray], Guess] | None = None
         self._last: tuple[bytes, Solution] | None = None
@@ -225,13 +225,13 @@ def _first(question: dict[str, Any], *keys: str) -> None:
             raise RefusalError("InvalidInput", message)
 
 
-def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
+def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
     """Serve the model of a study until the process is interrupted.
 
     Parameters
     ----------
-    study
-        The study; its method is not used.
+    sampled
+        The model with its random parameters.
     port, host
         Where requests are accepted: port 0 is any free one, host 0.0.0.0 also accepts those of other machines.
     quiet
@@ -264,7 +264,7 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
     previous = signal.signal(signal.SIGTERM, _interrupt)
     answered, listening = 0, None
     try:
-        service = Service(study)
+        service = Service(sampled)
         if not quiet:
             sys.stdout.write(
                 f"serving '{NAME}' at http://{host}:{server.server_port}, until interrupted\n"
@@ -274,7 +274,10 @@ def serve(study: Study, port: int, host: str = "127.0.0.1", *, quiet: bool = Fal
         listening = Thread(target=server.serve_forever, daemon=True)
         listening.start()
         while True:
-            job = jobs.get()
+            try:
+                job = jobs.get(timeout=WAKE)
+            except Empty:  # by waking, signals are heard that came just as the wait began
+                continue
             try:
                 job.future.set_result(service.answer(job.what, job.question))
             except KeyboardInterrupt:

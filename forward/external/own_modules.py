@@ -13,7 +13,7 @@ import importlib.metadata
 import json
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
@@ -24,7 +24,7 @@ from typing import Any
 from forward.model import ModelError
 
 _texts: dict[str, tuple[str, str]] = {}  # files of imported modules, and the hashes of their contents
-_TISSUQ = ("forward", "uq", "inverse", "workflows")
+_TISSUQ = ("forward", "uq", "inverse", "workflows", "tissuq")
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class Sources:
         found = (
             Path(path).parents[name.count(".") + (Path(path).stem == "__init__")]
             for name, (path, _) in self.files.items()
+            if not _is_installed(Path(path))
         )
         return tuple(dict.fromkeys(found))
 
@@ -86,17 +87,28 @@ class Sources:
         return None
 
 
-def sources(modules: Iterable[str]) -> Sources:
-    """Return the sources of modules, by their dotted names, without running them."""
+def sources(modules: Iterable[str], kinds: Iterable[str] = ()) -> Sources:
+    """Return the sources of modules, by their dotted names, without running them.
+
+    Parameters
+    ----------
+    modules
+        Modules of which what is installed counts by its version.
+    kinds
+        Modules that make kinds of blocks: their packages count by their text too where they are installed, since who
+        writes an energy installs it again and again.
+    """
     files: dict[str, tuple[str, str]] = {}
     versions: dict[str, str] = {}
-    for name, spec, _ in _walk(modules):
+    kinds = list(kinds)
+    tops = {name.partition(".")[0] for name in kinds}
+    for name, spec, _ in _walk([*modules, *kinds], tops):
         file = _file(spec)
         if file is None:
             continue
-        if _is_own(file):
+        if _is_users(name, file, tops):
             files[name] = (str(file), hashed(file))
-        elif _is_installed(file):
+        if _is_installed(file):
             distribution = _distribution(name.partition(".")[0])
             if distribution is None:
                 files[name] = (str(file), hashed(file))
@@ -233,7 +245,7 @@ def _elsewhere(top: str, path: list[str], beside: Path) -> str | None:
     return None if file in {None, beside} else f"another module, {file}"
 
 
-def _walk(modules: Iterable[str]) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
+def _walk(modules: Iterable[str], tops: Collection[str] = ()) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
     """Walk through modules and their imports, as far as they are the user's own: name, location, imports."""
     waiting, seen = list(modules), set[str]()
     while waiting:
@@ -246,7 +258,7 @@ def _walk(modules: Iterable[str]) -> Iterator[tuple[str, ModuleSpec, set[str]]]:
             if spec is None:
                 break
             file = _file(spec)
-            imported = _imports(name, spec, file) if file is not None and _is_own(file) else set()
+            imported = _imports(name, spec, file) if file is not None and _is_users(name, file, tops) else set()
             waiting += sorted(imported - seen)
             yield name, spec, imported
 
@@ -299,6 +311,11 @@ def _is_own(file: Path) -> bool:
     """Whether it is neither installed, nor of the standard library, nor of this program."""
     library = any(file.resolve().is_relative_to(folder) for folder in _library())
     return not (library or _is_installed(file) or _is_tissuq(file))
+
+
+def _is_users(name: str, file: Path, tops: Collection[str]) -> bool:
+    """Whether a module counts by its text: the user's own, or of one of these packages of kinds."""
+    return _is_own(file) or (name.partition(".")[0] in tops and not _is_tissuq(file))
 
 
 @cache

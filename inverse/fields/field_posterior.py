@@ -107,11 +107,6 @@ class FieldPosterior:
         """1/σ (n,) of what was measured."""
         return self.measured / self.sigma
 
-    @property
-    def data_count(self) -> int:
-        """Number of data."""
-        return int(self.measured.sum())
-
     def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
         return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)

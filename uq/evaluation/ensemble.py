@@ -16,9 +16,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from forward.machine import StopError
-from forward.model import FloatArray, ForwardModel, SolveError, displacements
+from forward.model import FloatArray, ForwardModel, SolveError
 from uq.evaluation.checkpoint import Checkpoint
-from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger, Request
+from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger, OfModel, Request
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job
 
 T = TypeVar("T")
@@ -175,7 +175,7 @@ class _Models:
 
 
 @dataclass(frozen=True)
-class EnsembleEvaluate:
+class EnsembleEvaluate(OfModel):
     """The evaluation that a method sees on rank 0, of one of the models."""
 
     worker: _Worker
@@ -185,24 +185,9 @@ class EnsembleEvaluate:
     volumes: Callable[[], FloatArray | None] = lambda: None
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.worker.models[self.name].parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.worker.models[self.name].outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
-        return self.worker.models[self.name].differentiable
-
-    @property
-    def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
-        return displacements(self.worker.models[self.name])
+    def model(self) -> ForwardModel:
+        """The model, in the group of rank 0."""
+        return self.worker.models[self.name]
 
     @property
     def node_volumes(self) -> FloatArray | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,30 +254,14 @@ class Evaluate(Protocol):
         """Return the evaluation of another of the models (meshes, solvers), by its name; the first is called `OWN`."""
 
 
-@dataclass(frozen=True)
-class SerialEvaluate:
-    """Evaluation of a model in this process, point after point.
+class OfModel:
+    """What an evaluation of a model says of it."""
 
-    Parameters
-    ----------
-    model
-        The model.
-    progress
-        Told the numbers of points that were done and that failed since it was last told.
-    others
-        Models that a method may ask for, by their names.
-    node_volumes
-        See `Evaluate`.
-    """
+    if TYPE_CHECKING:  # a field, or a property
 
-    model: ForwardModel
-    progress: Callable[[int, int], None] = lambda done, failed: None
-    others: Mapping[str, ForwardModel] = field(default_factory=dict)
-    node_volumes: FloatArray | None = None
-
-    def on(self, model: str) -> SerialEvaluate:
-        """Return the evaluation of another of the models."""
-        return self if model == OWN else replace(self, model=self.others[model])
+        @property
+        def model(self) -> ForwardModel:
+            """The model."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -299,31 +283,11 @@ class SerialEvaluate:
         """Number of displacements at the head of a state."""
         return displacements(self.model)
 
-    def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request."""
-        solver = BlockSolver(self.model, request)
-        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
 
+class OfEvaluate:
+    """What an evaluation that stands around another one passes on from it."""
 
-class Recorder:
-    """An evaluation that keeps what it returned, and says what that has cost.
-
-    Attributes
-    ----------
-    log
-        Every evaluation, in order, of all models; shared by the evaluations of the other models.
-    models
-        The name of the model of each.
-    first
-        The first evaluation of this model whole, with derivatives and fields: methods begin at the mean parameters.
-    """
-
-    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
-        self._evaluate = evaluate
-        self._model = model
-        self.first: Evaluations | None = None
-        self.log: list[Evaluations] = [] if whole is None else whole.log
-        self.models: list[str] = [] if whole is None else whole.models
+    _evaluate: Evaluate
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -347,8 +311,60 @@ class Recorder:
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Share (n_nodes,) of the body that each node stands for, see `Evaluate`."""
+        """Volume (n_nodes,) of the body that each node represents, see `Evaluate`."""
         return self._evaluate.node_volumes
+
+
+@dataclass(frozen=True)
+class SerialEvaluate(OfModel):
+    """Evaluation of a model in this process, point after point.
+
+    Parameters
+    ----------
+    model
+        The model.
+    progress
+        Told the numbers of points that were done and that failed since it was last told.
+    others
+        Models that a method may ask for, by their names.
+    node_volumes
+        See `Evaluate`.
+    """
+
+    model: ForwardModel
+    progress: Callable[[int, int], None] = lambda done, failed: None
+    others: Mapping[str, ForwardModel] = field(default_factory=dict)
+    node_volumes: FloatArray | None = None
+
+    def on(self, model: str) -> SerialEvaluate:
+        """Return the evaluation of another of the models."""
+        return self if model == OWN else replace(self, model=self.others[model])
+
+    def __call__(self, request: Request) -> Evaluations:
+        """Evaluate all points of a request."""
+        solver = BlockSolver(self.model, request)
+        return merge([solver(block.points, self.progress) for block in request.blocks()], request.fields)
+
+
+class Recorder(OfEvaluate):
+    """An evaluation that keeps what it returned, and says what that has cost.
+
+    Attributes
+    ----------
+    log
+        Every evaluation, in order, of all models; shared by the evaluations of the other models.
+    models
+        The name of the model of each.
+    first
+        The first evaluation of this model whole, with derivatives and fields: methods begin at the mean parameters.
+    """
+
+    def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
+        self._evaluate = evaluate
+        self._model = model
+        self.first: Evaluations | None = None
+        self.log: list[Evaluations] = [] if whole is None else whole.log
+        self.models: list[str] = [] if whole is None else whole.models
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request.

@@ -18,11 +18,10 @@ from forward.model import (
     OneByOne,
     Solution,
     SolveError,
-    displacements,
     gathered,
     scattered,
 )
-from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, Request, merge
+from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, Request, merge
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -43,7 +42,7 @@ class _Asked:
 
 
 @dataclass(frozen=True)
-class KeptEvaluate:
+class KeptEvaluate(OfModel):
     """Evaluation of a model in one group of ranks; blocks that are on disk are read. Collective over the group.
 
     Parameters
@@ -78,26 +77,6 @@ class KeptEvaluate:
     def on(self, model: str) -> KeptEvaluate:
         """Return itself: it has one model."""
         return self
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.model.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.model.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
-        return self.model.differentiable
-
-    @property
-    def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
-        return displacements(self.model)
 
     @property
     def node_volumes(self) -> FloatArray | None:

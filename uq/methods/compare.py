@@ -24,7 +24,7 @@ from forward.model import Finding, FloatArray, Severity, SolveError
 from forward.registry import Kinds, OfKind
 from forward.settings import Settings
 from uq.estimators.moments import ESTIMATES, half_width, ratio
-from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request, merge
+from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, OfEvaluate, Recorder, Request, merge
 from uq.findings import add, findings
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
@@ -436,7 +436,7 @@ class _Clock:
     seconds: float = 0.0
 
 
-class _Memory:
+class _Memory(OfEvaluate):
     """An evaluation that solves each point once, and returns the result, with its time, as often as requested.
 
     Sums of fields over several points are not remembered.
@@ -447,31 +447,6 @@ class _Memory:
         self._others: dict[str, _Memory] = {}
         self._known: dict[tuple[bytes, bytes], Evaluations] = {}
         self.clock = clock or _Clock()
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self._evaluate.parameters
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self._evaluate.outputs
-
-    @property
-    def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
-        return self._evaluate.differentiable
-
-    @property
-    def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
-        return self._evaluate.displacements
-
-    @property
-    def node_volumes(self) -> FloatArray | None:
-        """Volume (n_nodes,) of the body that each node represents, see `Evaluate`."""
-        return self._evaluate.node_volumes
 
     def on(self, model: str) -> _Memory:
         """Return the evaluation of another of the models, with its own memory."""

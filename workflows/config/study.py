@@ -6,16 +6,18 @@ import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Union
 
 from pydantic import TypeAdapter, ValidationError
 
 from forward.registry import dotted
 from forward.settings import cut
+from uq.methods.method import METHODS
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import located
 from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
 
+_REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
 DEEPEST = 32  # levels of lists and tables in a study
 LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smallest is one over the first
 MOST_LINES = 50
@@ -59,7 +61,8 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         blocks = located(_located(blocks, folder), folder)
         method = blocks.get("method")
         kind = method.get("kind") if isinstance(method, Mapping) else None
-        found: StudyKind = STUDIES[next((one for one in STUDIES.own if one == kind), SAMPLING)].made(blocks, folder)
+        another = isinstance(kind, str) and kind not in METHODS.own and kind in STUDIES
+        found: StudyKind = STUDIES[str(kind) if another else SAMPLING].made(blocks, folder)
     except ValidationError as error:
         raise StudyError(*lines(error)) from None
     return found
@@ -129,26 +132,21 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a study file, with which editors complete and check it."""
-    from workflows.studies.inversion import Inversion
-    from workflows.studies.material_tests import DataFile
-    from workflows.studies.output_inversion import OutputInversion
-    from workflows.studies.output_selection import OutputFile, OutputSelection
-    from workflows.studies.sampling import Study
-    from workflows.studies.selection import Selection
-    from workflows.studies.specimen_selection import DisplacementFile, SpecimenSelection
-    from workflows.studies.synthesis import Synthesis
-
-    adapter: TypeAdapter[Any] = TypeAdapter(
-        Study | Selection | SpecimenSelection | OutputSelection | Inversion | OutputInversion | Synthesis
-    )
-    found = adapter.json_schema(ref_template="#/$defs/{model}")
-    # A file may name a table instead of containing the data.
-    files = (("Selection", DataFile), ("SpecimenSelection", DisplacementFile), ("OutputSelection", OutputFile))
-    for name, file in files:
-        table = TypeAdapter(file).json_schema(ref_template="#/$defs/{model}")
-        found["$defs"] |= table.pop("$defs", {}) | {file.__name__: table}
-        data = found["$defs"][name]["properties"]
-        data["data"] = {"anyOf": [data["data"], {"$ref": f"#/$defs/{file.__name__}"}]}
+    forms = [form for kind in STUDIES.names for form in STUDIES[kind].forms()]
+    any_form: Any = Union[*forms]
+    found = TypeAdapter(any_form).json_schema(ref_template=_REFERENCE)
+    for form in forms:  # a file may name a table instead of containing the data
+        if form.data_in_file is not None:
+            table = TypeAdapter(form.data_in_file).json_schema(ref_template=_REFERENCE)
+            name = form.data_in_file.__name__
+            found["$defs"] |= table.pop("$defs", {}) | {name: table}
+            data = found["$defs"][form.__name__]["properties"]
+            data["data"] = {"anyOf": [data["data"], {"$ref": _REFERENCE.format(model=name)}]}
+    # Nothing is known about the blocks of a kind of study that is a dotted path.
+    dots = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}, "required": ["kind"]}
+    known = sorted(STUDIES[SAMPLING].model_fields)
+    other = {"properties": {"method": dots}, "required": ["method"], "not": {"propertyNames": {"enum": known}}}
+    found["anyOf"].append({"type": "object", **other})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "A study of tissuq"} | found
 
 

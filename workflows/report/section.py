@@ -74,10 +74,9 @@ class Results:
         """SI unit of an output."""
         return str(self.dataset["unit"].sel(output=output).item())
 
-    def parameter_unit(self, path: str) -> str:
-        """SI unit of a number of the model, by its path; "1" for coefficients of random fields."""
-        scalars = self.study.model.scalars
-        return str(scalars[path].unit) if path in scalars else "1"
+    def parameter_unit(self, path: str, label: str = "/") -> str:
+        """SI unit of a number of the model of some evaluations, by its path; "1" of what is no number of the model."""
+        return str(self.study.units_of(label).get(path, "1"))
 
     @property
     def solves(self) -> int:

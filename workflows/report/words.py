@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from forward.materials.material import MATERIALS, units
 from forward.words import number, with_unit
 
 if TYPE_CHECKING:
@@ -32,29 +31,6 @@ def solves(summary: Mapping[str, Any]) -> int:
 def counted(solves: int) -> str:
     """Write a number of solves."""
     return "1 solve" if solves == 1 else f"{solves:,} solves"
-
-
-def unit_of(path: str) -> str:
-    """SI unit of a number of the model, by its path; "1" for ratios and for models of other programs."""
-    block, _, name = path.partition(".")
-    if block == "material":
-        # A name has the same unit in every material.
-        return next((of[name] for of in map(units, MATERIALS) if name in of), "1")
-    if block == "inclusions":
-        return {"contrast": "1", "volume": "m³", "turn_x": "rad", "turn_y": "rad", "turn_z": "rad"}.get(
-            path.rpartition(".")[2], "m"
-        )
-    if block == "regions":
-        name = path.rpartition(".")[2]
-        return "1" if name == "contrast" else unit_of(f"material.{name}")
-    if path.endswith(".density"):
-        return "kg/m³"
-    return {"displacements": "m", "loads": "Pa"}.get(block, "1")
-
-
-def unit_of_constant(name: str) -> str:
-    """SI unit of a constant of a material, or of a number of a model by its path."""
-    return unit_of(name if "." in name else f"material.{name}")
 
 
 def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import Loaded, Sources, other_code, sources
-from forward.registry import dotted
+from forward.registry import dotted, installed
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document
 from workflows.results.directory import write_text
@@ -20,14 +20,23 @@ FILE = "sources.json"
 
 
 def modules(study: StudyKind) -> tuple[str, ...]:
-    """Return the user's modules that a study names: those of its model, and of kinds that are dotted paths."""
-    return tuple(dict.fromkeys([*study.modules, *dotted(document(study))]))
+    """Return the user's modules that a study names: those of its model, and of kinds from outside the program."""
+    return tuple(dict.fromkeys([*study.modules, *_of_kinds(study)]))
+
+
+def _of_kinds(study: StudyKind) -> list[str]:
+    """Modules of kinds: dotted paths, and those that installed packages declare."""
+    blocks = document(study)
+    return list(dict.fromkeys([*dotted(blocks), *installed(blocks)]))
+
+
+def _sources(study: StudyKind) -> Sources:
+    return sources(study.modules, _of_kinds(study))
 
 
 def digest(study: StudyKind) -> str | None:
     """Return a hash of these modules and of what they import, if there are any."""
-    found = modules(study)
-    return sources(found).digest if found else None
+    return _sources(study).digest if modules(study) else None
 
 
 def identity(study: StudyKind) -> dict[str, Any]:
@@ -44,13 +53,13 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
     StudyError
         If one has changed; the message names it.
     """
-    found, before = modules(study), _kept(directory)
-    if not found or before is None:
+    before = _kept(directory)
+    if before is None or not modules(study):
         return
     if not (directory / "summary.json").exists() and not any(directory.glob("evaluations/*.h5")):
         (directory / FILE).unlink()  # nothing was computed yet
         return
-    change = before.change(sources(found))
+    change = before.change(_sources(study))
     if change is not None:
         message = f"{directory}: {other_code(change)}"
         raise StudyError(message)
@@ -58,9 +67,8 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
 
 def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
     """Record the user's modules, with those that were loaded during a run."""
-    found = modules(study)
-    if found and loaded is not None:
-        known = (_kept(directory) or sources(found)).with_files(loaded())
+    if loaded is not None and modules(study):
+        known = (_kept(directory) or _sources(study)).with_files(loaded())
         write_text(directory / FILE, json.dumps(known.document(), indent=2, ensure_ascii=False) + "\n")
 
 
@@ -73,10 +81,10 @@ def make_visible(directory: Path) -> None:
 
 def listed(study: StudyKind) -> list[str]:
     """Say which kinds of a study are the user's own, and where they come from."""
-    names = list(dict.fromkeys(dotted(document(study))))
+    names = _of_kinds(study)
     if not names:
         return []
-    files = sources(names).files
+    files = sources((), names).files
     code = [f"{name} ({path})" for name, (path, _) in files.items()]
     return [f"own code    {', '.join([*code, *(name for name in names if name not in files)])}"]
 

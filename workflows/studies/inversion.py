@@ -139,6 +139,12 @@ class InversionStudy(StudyKind):
         return each * sum(measurement is not None for measurement in self.measurements)
 
     @classmethod
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """Inversions of displacements, and of outputs."""
+        yield Inversion
+        yield named("workflows.studies.output_inversion:OutputInversion")
+
+    @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> InversionStudy:
         """Check the blocks of an inversion of displacements of a specimen, or of outputs of any model."""
         model = blocks.get("model")

@@ -21,6 +21,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
 from workflows.studies.measured import DataSet
+from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
     from forward.model import Finding
@@ -118,6 +119,11 @@ class OutputInversion(InversionStudy):
     def spec(self) -> ModelSpec:
         """The model, in the form that suits all values of its parameters."""
         return self.model.over(ranges(self.parameters))
+
+    @property
+    def sampled(self) -> Sampled:
+        """The model with its priors."""
+        return Sampled(self.inputs, self.spec)
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.settings import Settings, one_line
 from forward.spec import MODELS, ModelSpec
-from inverse.criticism.comparison import Candidate, Data
+from forward.words import named
+from inverse.criticism.comparison import Data
 from inverse.data.measured_model import MeasuredModel
 from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs, stated
-from inverse.methods.selection import SelectSpecimens
-from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import Parallel
-from workflows.config.mistakes import StudyError, lines, refused
-from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
-from workflows.config.report import Report
+from workflows.config.mistakes import StudyError
 from workflows.studies.material_tests import WHOLE
+from workflows.studies.model_selection import ModelSelection, Positive
 from workflows.studies.output_inversion import derivable
-from workflows.studies.selection import Comparison
-from workflows.studies.specimen_selection import SpecimenCandidate, changed
 
 if TYPE_CHECKING:
-    from forward.model import Finding, ForwardModel
+    from forward.model import ForwardModel
 
-Positive = Annotated[float, Field(gt=0)]
 SECONDS = 1e-3  # of a solve about which nothing is known
 _SPEC: TypeAdapter[ModelSpec] = TypeAdapter(Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")])
 
@@ -62,7 +55,7 @@ class OutputFile(Settings):
             raise ValueError(message)
         return self
 
-    def read(self, folder: Path, outputs: tuple[str, ...]) -> dict[str, Any]:
+    def read(self, folder: Path, spec: ModelSpec) -> dict[str, Any]:
         """Return the block `data` with the outputs themselves.
 
         Raises
@@ -70,6 +63,7 @@ class OutputFile(Settings):
         StudyError
             If the file cannot be used.
         """
+        outputs = tuple(output.name for output in spec.outputs)
         try:
             found = stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs)
         except DataError as error:
@@ -115,71 +109,32 @@ class ListedOutputs(Settings):
         return self
 
 
-class OutputCandidate(SpecimenCandidate):
-    """A model that may be the right one, with its prior: what it changes of the model, and its random parameters."""
-
-    def restricted(self, spec: ModelSpec) -> Inputs:
-        """The random parameters, restricted to those that make materials, where there are some."""
-        materials = spec.materials(self.inputs.names)
-        return self.inputs if materials is None else self.inputs.within(materials)
-
-
-class OutputSelection(Comparison):
-    """What to compare.
+class OutputSelection(ModelSelection):
+    """What to compare: any models, by their outputs.
 
     Parameters
     ----------
-    model
-        The model, as far as the candidates have it in common.
+    model, candidates, method, parallel, report
+        As of `ModelSelection`.
     data
         Outputs that were measured.
-    candidates
-        Models by name.
-    method
-        How the candidates are compared.
-    parallel
-        Use of ranks.
-    report
-        Your own sections of the report.
     """
 
-    model: dict[str, Any]
     data: ListedOutputs
-    candidates: dict[str, OutputCandidate] = Field(min_length=1)
-    method: SelectSpecimens
-    parallel: Parallel = Parallel()
-    report: Report | None = None
 
+    data_in_file: ClassVar[type[Settings] | None] = OutputFile
+    listed_by: ClassVar[str] = "names"
     quantity: ClassVar[str] = "output"
-    costly: ClassVar[bool] = True
 
-    @cached_property
-    def of_candidates(self) -> dict[str, ModelSpec]:
-        """The model of each candidate, in the form that suits all values of its parameters."""
-        return {
-            name: spec_of(changed(self.model, one.model)).over(ranges(one.parameters))
-            for name, one in self.candidates.items()
-        }
+    @classmethod
+    def spec_of(cls, block: Mapping[str, Any]) -> ModelSpec:
+        """Return the model that a block describes; errors as of every comparison."""
+        return _SPEC.validate_python(dict(block))
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The models of all candidates."""
         return tuple(self.of_candidates.values())
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for them."""
-        return tuple(dict.fromkeys(module for spec in self.specs for module in spec.modules))
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings about the models before anything is solved, each once."""
-        of_models = (
-            finding
-            for name, one in self.of_candidates.items()
-            for finding in one.findings_over(ranges(self.candidates[name].parameters))
-        )
-        return tuple(dict.fromkeys([*of_models, *super().findings]))
 
     @cached_property
     def unchecked(self) -> dict[str, str]:
@@ -196,24 +151,6 @@ class OutputSelection(Comparison):
         except ValueError as error:  # without a mesh, with one that is not divided, or that would be too large
             return one_line(str(error))
         return ""
-
-    @property
-    def models(self) -> dict[str, Candidate]:
-        """The candidates as the method needs them."""
-        return {
-            name: Candidate(candidate.restricted(self.of_candidates[name]), candidate.weight)
-            for name, candidate in self.candidates.items()
-        }
-
-    @property
-    def source(self) -> tuple[str, ...]:
-        """Where the data are from."""
-        return self.data.source
-
-    @property
-    def group_names(self) -> tuple[str, ...]:
-        """Names of the groups: there is one."""
-        return (WHOLE,)
 
     @property
     def data_groups(self) -> dict[str, Data]:
@@ -238,6 +175,11 @@ class OutputSelection(Comparison):
             seconds += (self.searches(name) + self.method.samples) * each
         return seconds * self.evidences / len(self.of_candidates)
 
+    def measured_in(self, test: str) -> str:
+        """Name an output with its unit, which is that of the first candidate."""
+        outputs = next(iter(self.of_candidates.values())).outputs
+        return next(named(output.name, output.unit) for output in outputs if output.name == test)
+
     def described(self, name: str) -> str:
         """A candidate in words."""
         return self.of_candidates[name].description
@@ -255,74 +197,9 @@ class OutputSelection(Comparison):
         derivable(model, spec.kind)
         return MeasuredModel(model, tuple(model.outputs.index(output) for output in self.data.names))
 
-    @model_validator(mode="after")
-    def _check(self) -> OutputSelection:
-        refused("OutputSelection", list(self._mistakes()))
-        return self
-
-    def _mistakes(self) -> Iterator[Mistake]:
-        for name, candidate in self.candidates.items():
-            place = ("candidates", name)
-            try:
-                spec = spec_of(changed(self.model, candidate.model))
-            except ValidationError as error:
-                for line in error.errors(include_url=False):
-                    yield (*place, "model", *line["loc"]), line["msg"], line["input"]
-                return
-            for where, message, given in _of_candidate(spec, candidate):
-                yield (*place, *where), message, given
-            if spec.coefficients:
-                message = "random fields, expected numbers only: evidences are of few parameters"
-                yield (*place, "model", "fields"), message, len(spec.coefficients)
-            known = tuple(output.name for output in spec.outputs)
-            strange = next((output for output in self.data.names if output not in known), None)
-            if strange is not None:
-                yield (*place, "model", "outputs"), f"no output '{strange}', of which there are data", list(known)
-            if self.parallel.ranks_per_model > 1 and not spec.shareable:
-                message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
-                yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
-        yield from self.mistakes_of_method()
-
-
-def spec_of(block: Mapping[str, Any]) -> ModelSpec:
-    """Return the model that a block describes.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        For mistakes in it.
-    """
-    return _SPEC.validate_python(dict(block))
-
-
-def _of_candidate(spec: ModelSpec, candidate: OutputCandidate) -> Iterator[Mistake]:
-    materials = spec.materials(candidate.parameters)
-    constants = () if materials is None else materials.names
-    yield from mistakes_of_parameters(spec.scalars, candidate.parameters, constants)
-    if materials is not None and all(path in spec.scalars for path in candidate.parameters):
-        with suppress(ValueError):  # correlations, which are reported elsewhere
-            yield from mistakes_of_materials(candidate.restricted(spec), materials)
-
-
-def expanded(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return blocks of a study whose outputs, from a table or stated by name, are listed.
-
-    Raises
-    ------
-    StudyError
-        If that cannot be done.
-    """
-    data, candidates = blocks.get("data"), blocks.get("candidates")
-    if not isinstance(data, Mapping) or "names" in data or not isinstance(candidates, Mapping) or not candidates:
-        return dict(blocks)
-    try:
-        file = OutputFile.model_validate(dict(data))
-    except ValidationError as error:
-        raise StudyError(*lines(error, "data")) from None
-    name, first = next(iter(candidates.items()))
-    changes = first.get("model", {}) if isinstance(first, Mapping) else {}
-    try:
-        spec = spec_of(changed(blocks["model"], changes))
-    except ValidationError as error:
-        raise StudyError(*lines(error, f"candidates.{name}.model")) from None
-    return {**blocks, "data": file.read(folder, tuple(output.name for output in spec.outputs))}
+    def unobserved(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find outputs of the data that a candidate does not have."""
+        known = tuple(output.name for output in spec.outputs)
+        strange = next((output for output in self.data.names if output not in known), None)
+        if strange is not None:
+            yield ("outputs",), f"no output '{strange}', of which there are data", list(known)

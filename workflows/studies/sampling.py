@@ -21,7 +21,7 @@ from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
-from workflows.studies.study import StudyKind
+from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -78,6 +78,11 @@ class Study(StudyKind):
     def spec(self) -> ModelSpec:
         """The model, in the form that suits all values of its parameters."""
         return self.model.over(ranges(self.parameters))
+
+    @property
+    def sampled(self) -> Sampled:
+        """The model with its random parameters."""
+        return Sampled(self.inputs, self.spec)
 
     @property
     def models(self) -> dict[str, ModelSpec]:

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from forward.bodies.geometry import Vector
 from forward.materials.admissible import Materials
-from forward.materials.material import MATERIALS, constants, incompressible, of_volume
+from forward.materials.material import MATERIALS, constants, incompressible, of_volume, units
 from forward.materials.material_point import HomogeneousModel, MaterialTest, unfit
 from forward.model import Finding, ForwardModel
 from forward.registry import KindError, named
@@ -26,7 +26,7 @@ from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, mistakes_of_materials
 from workflows.config.report import Report
-from workflows.studies.material_tests import MeasuredTest, Measurements, expanded
+from workflows.studies.material_tests import DataFile, MeasuredTest, Measurements, expanded
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -157,6 +157,11 @@ class Comparison(StudyKind):
         """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
         return {}
 
+    @property
+    def mesh_checks(self) -> list[tuple[float, str]]:
+        """Processor time (s) of a solve on a finer mesh of each candidate, and what is solved, where that is known."""
+        return []
+
     def described(self, name: str) -> str:
         """Describe a candidate."""
         raise NotImplementedError
@@ -195,6 +200,10 @@ class Comparison(StudyKind):
         """Names of the tests that were measured in a group."""
         raise NotImplementedError
 
+    def measured_in(self, test: str) -> str:
+        """Say what was measured in a test, with its unit."""
+        return "displacement (m)"
+
     @property
     def pairs(self) -> list[tuple[str, str]]:
         """Candidates and groups, in the order of the models."""
@@ -223,14 +232,23 @@ class Comparison(StudyKind):
         return len(self.pairs) * self.method.variants + len(self.candidates) * held_out
 
     @classmethod
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """Comparisons by stresses, by displacements, and by outputs."""
+        yield Selection
+        yield named("workflows.studies.specimen_selection:SpecimenSelection")
+        yield named("workflows.studies.output_selection:OutputSelection")
+
+    @classmethod
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Comparison:
         """Check the blocks of a comparison on a specimen, on another model, or without one on material points."""
         model = blocks.get("model")
         body = isinstance(model, Mapping) and "outputs" in model and "cases" not in model
         if isinstance(model, Mapping) and model.get("kind", "hyperelastic" if body else "specimen") != "specimen":
-            return _elsewhere("workflows.studies.output_selection", "OutputSelection", blocks, folder)
+            other: type[Comparison] = named("workflows.studies.output_selection:OutputSelection")
+            return other.made(blocks, folder)
         if "model" in blocks:
-            return _elsewhere("workflows.studies.specimen_selection", "SpecimenSelection", blocks, folder)
+            other = named("workflows.studies.specimen_selection:SpecimenSelection")
+            return other.made(blocks, folder)
         return Selection.model_validate(expanded(blocks, folder))
 
     def plan(self, rank_groups: int) -> list[str]:
@@ -301,6 +319,7 @@ class Selection(Comparison):
     parallel: Parallel = Parallel()
     report: Report | None = None
 
+    data_in_file: ClassVar[type[Settings] | None] = DataFile
     quantity: ClassVar[str] = "stress"
     costly: ClassVar[bool] = False
 
@@ -351,6 +370,10 @@ class Selection(Comparison):
         names = tuple(candidate.parameters)
         return HomogeneousModel(candidate.kind, candidate.fixed, self._tests(group), names, candidate.fibres)
 
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of the constants of a candidate."""
+        return units(self.candidates[label.partition("/")[0]].kind)
+
     @property
     def _all_tests(self) -> tuple[MaterialTest, ...]:
         return (*self.data.tests, *self.predict)
@@ -379,9 +402,3 @@ class Selection(Comparison):
             if objection is not None:
                 yield ("candidates", name, "material"), objection, candidate.material
         yield from self.mistakes_of_method()
-
-
-def _elsewhere(module: str, name: str, blocks: Mapping[str, Any], folder: Path) -> Comparison:
-    """Check the blocks of a comparison of another kind, in a module that builds on this one."""
-    kind: type[Comparison] = named(f"{module}:{name}")
-    return kind.model_validate(named(f"{module}:expanded")(blocks, folder))

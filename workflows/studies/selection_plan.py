@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from workflows.studies.predictions import NOT_ASKED, duration, mesh_check
+from workflows.studies.predictions import NOT_ASKED, duration
 
 if TYPE_CHECKING:
     from workflows.studies.selection import Comparison
@@ -23,7 +23,7 @@ def plan(study: Comparison) -> list[str]:
     method = study.method
     evidences = study.evidences
     seconds = study.seconds_of_solves + SECONDS_PER_SURROGATE * evidences
-    meshes = [mesh_check(one) for one in getattr(study, "specimens", {}).values() if study.unchecked]
+    meshes = study.mesh_checks
     if not getattr(method, "mesh_check", True):
         meshes = [(0.0, NOT_ASKED)]
     seconds += sum(once for once, _ in meshes)

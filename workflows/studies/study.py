@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from forward.registry import Kinds, named
 from forward.settings import Settings
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.evaluate import Evaluations
+    from uq.inputs.random_parameters import Inputs
     from workflows.config.blocks import Parallel
     from workflows.config.report import Report
     from workflows.studies.job import Job
@@ -26,17 +27,30 @@ SAMPLING = "sampling"  # the kind of study whose methods solve at points
 WITHOUT_EFFECT = {"parallel", "report"}  # blocks that results do not depend on
 
 
+class Sampled(NamedTuple):
+    """A model with random parameters."""
+
+    inputs: Inputs
+    spec: ModelSpec
+
+
 class StudyKind(Settings):
     """A study: what is computed, from what, and how.
 
+    A kind of one's own is a subclass in a module beside the study or in an installed package (`forward.registry`); a
+    file is of the kind that its `method.kind` names.
+
     Attributes
     ----------
+    data_in_file
+        The block that may stand in a file in place of `data`, which is read before the study is made.
     stopped
         Why it ends, in words, if the results do not say so.
     explains
         Whether it explains data: then parameters without a model have zero likelihood, which is a valid answer.
     """
 
+    data_in_file: ClassVar[type[Settings] | None] = None
     stopped: ClassVar[str] = ""
     explains: ClassVar[bool] = True
 
@@ -66,6 +80,11 @@ class StudyKind(Settings):
             For mistakes in the files.
         """
         return cls.model_validate(blocks)
+
+    @classmethod
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """Go through the classes that files of this kind are read as."""
+        yield cls
 
     @property
     @abstractmethod
@@ -112,6 +131,15 @@ class StudyKind(Settings):
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters of evaluations, by the name under which these are stored."""
 
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of numbers of the model of these evaluations, by their paths."""
+        return {path: number.unit for spec in self.specs[:1] for path, number in spec.scalars.items()}
+
+    @property
+    def sampled(self) -> Sampled | None:
+        """The one model of the study with its random parameters, if it has one: what a server answers for."""
+        return None
+
     def run(self, directory: str | Path | None = None, *, quiet: bool = True, report: bool = False) -> xr.Dataset:
         """Run the study from Python, in memory or to a directory, as `workflows.run.from_python.run` does."""
         found: xr.Dataset = named("workflows.run.from_python:run")(self, directory, quiet=quiet, report=report)
@@ -131,6 +159,12 @@ class StudyKind(Settings):
         return {key: value for key, value in blocks.items() if key not in WITHOUT_EFFECT}
 
 
+def _objection(found: Any) -> str | None:
+    """Say why something is no kind of study, or None if it is one."""
+    made = isinstance(found, type) and issubclass(found, StudyKind)
+    return None if made else f"expected a subclass of {StudyKind.__name__}"
+
+
 STUDIES = Kinds(
     "study",
     {
@@ -139,5 +173,5 @@ STUDIES = Kinds(
         "invert": "workflows.studies.inversion:InversionStudy",
         "synthesize": "workflows.studies.synthesis:Synthesis",
     },
-    StudyKind,
+    objection=_objection,
 )

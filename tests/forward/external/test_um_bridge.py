@@ -23,7 +23,9 @@ from scipy.optimize import minimize
 from forward.conformance import check_derivatives
 from forward.external.models import UmBridgeModel
 from forward.model import ModelError, SolveError
+from tests import launch
 from tests.launch import ROOT, TISSUQ, environment
+from tissuq.model import Model
 from uq.evaluation.evaluate import SerialEvaluate
 from workflows.config.study import load, parse
 from workflows.run.run import run
@@ -287,7 +289,7 @@ def test_models_that_are_not_there(beam, what):
 
 
 def test_derivatives_that_are_not_there():
-    service = Service(parse(tomllib.loads(FUNCTION.format("beam").replace("jacobian", "# jacobian"))))
+    service = Service(parse(tomllib.loads(FUNCTION.format("beam").replace("jacobian", "# jacobian"))).sampled)
     support = service.answer("ModelInfo", {"name": "forward"})["support"]
     assert support == {"Evaluate": True, "Gradient": False, "ApplyJacobian": False, "ApplyHessian": False}
     for what in ("Gradient", "ApplyJacobian", "ApplyHessian"):
@@ -527,3 +529,47 @@ def test_studies_of_other_kinds_are_not_served(capsys, name, kind):
 
     assert main(["serve", str(ROOT / "configs" / f"{name}.toml")]) == 2
     assert f"is of kind '{kind}', expected a study of one model" in capsys.readouterr().err
+
+
+SPECIMEN = """
+[model]
+kind = "specimen"
+body = { kind = "box", size = [0.05, 0.05, 0.05], cells = [2, 2, 2], cell = "hexahedron", degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 4e3 }
+cases = [
+    { name = "shear", clamp = ["z-min"], displacements = [{ on = "z-max", x = 0.005, y = 0, z = 0 }] },
+    { name = "up", clamp = ["z-min"], loads = [{ kind = "traction", on = "z-max", direction = [0, 0, 1], size = 9 }] },
+]
+observed = [{ at = [[0.05, 0.05, 0.05]], components = "xz" }]
+
+[parameters]
+"material.mu" = { kind = "uniform", lower = 800, upper = 1200 }
+[method]
+kind = "monte-carlo"
+samples = 8
+"""
+
+
+@pytest.mark.fem
+def test_a_specimen_is_served(tmp_path):
+    """All load cases in one vector of outputs, with their gradient."""
+    (tmp_path / "specimen.toml").write_text(SPECIMEN)
+    model = Model(parse(tomllib.loads(SPECIMEN)).spec, ["material.mu"])
+    expected = model.solve({"material.mu": 900.0})
+    with command(TISSUQ, "serve", tmp_path / "specimen.toml", "--port", 0) as (url, _):
+        answer = ask(url, "Evaluate", {"name": "forward", "input": [[900.0]]})[1]["output"][0]
+        assert answer == pytest.approx([*expected.values()], rel=1e-7)
+        question = {"name": "forward", "outWrt": 0, "inWrt": 0, "input": [[900.0]], "sens": [0.0, 0.0, 0.0, 1.0]}
+        slope = ask(url, "Gradient", question)[1]["output"]
+    assert slope == pytest.approx([expected.gradient("up.points.0.z")["material.mu"]], rel=1e-5)
+
+
+def test_the_model_of_an_inversion_is_served_and_that_of_a_comparison_is_not(tmp_path):
+    data = "[data]\noutputs = { tip = 0.3 }\nsigma = { tip = 0.01 }\n"
+    blocks, _, _ = FUNCTION.format("beam").partition("[method]")
+    (tmp_path / "inverse.toml").write_text(f'{blocks}{data}[method]\nkind = "invert"\n')
+    with command(TISSUQ, "serve", tmp_path / "inverse.toml", "--port", 0) as (url, _):
+        assert ask(url, "InputSizes", {"name": "forward"})[1] == {"inputSizes": [2]}
+    refused = launch.run(None, TISSUQ, "serve", "configs/treloar.toml", "--port", 0)
+    assert refused.returncode == 2
+    assert "of kind 'select', expected a study of one model" in refused.stderr

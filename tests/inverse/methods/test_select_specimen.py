@@ -142,7 +142,7 @@ def test_one_line_for_a_mistake(study, old, new, told):
 def test_what_a_finer_mesh_does_to_an_evidence(study):
     """Beside the evidence of the candidate that has this mesh, of one candidate that moves little and one that does."""
     it = load(study, ["method.noise.absolute=0.02", "method.samples=64"])
-    meshes = {name: finer(specimen) for name, specimen in it.specimens.items()}
+    meshes = {name: finer(specimen) for name, specimen in it.of_candidates.items()}
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
     fine = {
         name: spec.build(MPI.COMM_SELF, ("material.C1",)).observing(np.array(it.data.places), it._axes, [0] * 12)
@@ -230,9 +230,9 @@ def test_same_bits_after_a_kill(study):
 def test_a_plan_counts_searches_derivatives_and_finer_meshes(study):
     """Time and memory: searches are solved by the textbook, each solve has derivatives; the finer mesh has a factor."""
     it, blind = load(study), load(study, ["method.mesh_check=false"])
-    cost = {name: specimen.cost() for name, specimen in it.specimens.items()}
+    cost = {name: specimen.cost() for name, specimen in it.of_candidates.items()}
     least = sum(12 * one.textbook + 32 * one.corrected for one in cost.values())
     assert 1.2 * least < it.seconds_of_solves < 3 * least
-    largest = max(finer(specimen).cost().bytes for specimen in it.specimens.values())
+    largest = max(finer(specimen).cost().bytes for specimen in it.of_candidates.values())
     assert it.memory - blind.memory == pytest.approx(largest)
     assert any("if it has no answer" in line for line in it.plan(1))

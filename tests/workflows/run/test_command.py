@@ -1,5 +1,6 @@
 """The command line, run as users run it: exit codes, restart, ranks, bad directories."""
 
+import importlib.metadata
 import json
 import os
 import random
@@ -70,6 +71,11 @@ def test_usage_errors_exit_with_2():
     done = tissuq("init", "mcmc")
     assert done.returncode == 2
     assert "expected one of: monte-carlo" in done.stderr or "did you mean 'monte-carlo'" in done.stderr
+
+
+def test_the_version_is_that_of_the_distribution():
+    done = tissuq("--version")
+    assert (done.returncode, done.stdout) == (0, f"tissuq {importlib.metadata.version('tissuq')}\n")
 
 
 def test_init_lists_all_kinds():

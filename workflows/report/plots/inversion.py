@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.words import named
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, grid, span
-from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -164,8 +164,11 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
-    """Draw prior and posterior densities of the parameters, of many those that the data narrow most."""
+def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:
+    """Draw prior and posterior densities of the parameters, of many those that the data narrow most.
+
+    Units of the parameters (``study.units_of("/")``) are shown where they are given.
+    """
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
     names = [str(one.parameter.values[i]) for i in chosen]
@@ -183,7 +186,7 @@ def marginals(one: xr.Dataset, before: dict[str, Density]) -> Axes:
         ax.plot(x, np.interp(x, values, density, left=0.0, right=0.0), color=PLAIN, linestyle="--", label="prior")
         if np.isfinite(of["true"]):
             ax.axvline(float(of["true"]), color=HIGH, label="truth")
-        _finish(ax, named(name, unit_of(name)), x)
+        _finish(ax, named(name, (units or {}).get(name, "1")), x)
     _legend(found)
     return found[0]
 

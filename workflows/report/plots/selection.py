@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.words import named, with_error
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, axes, span
-from workflows.report.words import unit_of_constant
 from workflows.studies.findings_selection import ranking
 
 if TYPE_CHECKING:
@@ -50,8 +50,12 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
-    """Draw the posterior of the constants of a model, each alone and in pairs; large points have large weights."""
+def corner(dataset: xr.Dataset, model: str, group: str, units: Mapping[str, str] | None = None) -> Axes:
+    """Draw the posterior of the constants of a model, each alone and in pairs; large points have large weights.
+
+    Units of the constants (``study.units_of(model)``) are shown where they are given.
+    """
+    labels = {name: named(str(name), (units or {}).get(str(name), "1")) for name in dataset.parameter.values}
     one = dataset.sel(model=model, group=group)
     names = [
         str(name) for name in dataset.parameter.values if np.isfinite(float(one["constant_mode"].sel(parameter=name)))
@@ -89,17 +93,20 @@ def corner(dataset: xr.Dataset, model: str, group: str) -> Axes:
         ax.yaxis.get_offset_text().set_fontsize("x-small")
         ax.spines[["top", "right"]].set_visible(False)
         if i == n - 1:
-            ax.set_xlabel(named(names[j], unit_of_constant(names[j])), fontsize="small")
+            ax.set_xlabel(labels[names[j]], fontsize="small")
         if j == 0 and i > 0:
-            ax.set_ylabel(named(names[i], unit_of_constant(names[i])), fontsize="small")
+            ax.set_ylabel(labels[names[i]], fontsize="small")
         elif j > 0:
             ax.tick_params(labelleft=False)
     corner_axes: Axes = grid[0, 0]
     return corner_axes
 
 
-def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
-    """Draw the residuals of each model for a test, over the stated errors, against the measurements."""
+def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = "displacement (m)") -> Axes:
+    """Draw the residuals of each model for a test, over the stated errors, against the measurements.
+
+    `of` says what was measured, with its unit.
+    """
     from matplotlib.ticker import MaxNLocator
 
     ax = ax or axes(height=3.4)
@@ -112,7 +119,7 @@ def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None) -> Axes:
         ax.plot(measured, left, ".", markersize=4, color=colour, label=f"{model} ({P:.2g})")
     ax.axhspan(-2, 2, color=DARK, alpha=0.08, linewidth=0)
     ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.set_xlabel("measured displacement (m)")
+    ax.set_xlabel(f"measured {of}")
     ax.set_ylabel("residual / σ")
     ax.legend(fontsize="small", frameon=False)
     return ax

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import unit_of
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
 
@@ -32,11 +27,12 @@ class Batch(Section):
             "± is one posterior standard deviation; the same, with more digits, is in batch.csv. The first that could "
             "be inverted follow one by one."
         )
-        yield batch(results.dataset)
+        yield batch(results)
 
 
-def batch(dataset: xr.Dataset) -> Table:
+def batch(results: Results) -> Table:
     """A row for each data set."""
+    dataset = results.dataset
     names = [str(name) for name in dataset.parameter.values]
     rows = []
     for label in dataset.data_set.values:
@@ -58,6 +54,6 @@ def batch(dataset: xr.Dataset) -> Table:
                 number(float(one["log_evidence"]), 6),
             )
         )
-    units = [named(name, unit_of(name)) for name in names]
+    units = [named(name, results.parameter_unit(name)) for name in names]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     return Table(head, rows, text=frozenset({0, 2}))

@@ -18,12 +18,15 @@ class Curves(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """A picture for each test."""
-        dataset = results.dataset
+        dataset, study = results.dataset, results.study
         tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
-        if dataset.attrs["quantity"] == "displacement":
+        if dataset.attrs["quantity"] != "stress":
             yield Heading("What is left of the data")
             drawn = [
-                Picture.drawn(plots.residuals(dataset, str(test)), f"{test}: measured less predicted, over the errors.")
+                Picture.drawn(
+                    plots.residuals(dataset, str(test), of=study.measured_in(str(test))),
+                    f"{test}: measured less predicted, over the errors.",
+                )
                 for _, test in tests
             ]
         else:

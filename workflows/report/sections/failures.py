@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from forward.words import number, with_unit
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
-from workflows.report.words import counted, unit_of
+from workflows.report.words import counted
 
 
 class Failures(Section):
@@ -38,14 +39,17 @@ def failures(results: Results) -> Table:
     every = dict.fromkeys(name for failure in found for name in failure["parameters"])
     names = [name for name in every if not name.startswith("fields.")]
     models = any("model" in failure for failure in found)
-    rows = [
-        (
-            *([failure.get("model", "")] if models else []),
-            *(with_unit(number(failure["parameters"].get(name), 6), unit_of(name)) for name in names),
-            failure["reason"],
-        )
-        for failure in found
-    ]
+
+    def row(failure: Mapping[str, Any]) -> tuple[str, ...]:
+        model, at = str(failure.get("model", "/")), failure["parameters"]
+        shown = (with_unit(number(at.get(name), 6), results.parameter_unit(name, model)) for name in names)
+        return (*([model] if models else []), *shown, failure["reason"])
+
     head = (*(["model"] if models else []), *names, "reason")
     last = len(head) - 1
-    return Table(head, rows, text=frozenset({last, *([0] if models else [])}), long=frozenset({last}))
+    return Table(
+        head,
+        [row(failure) for failure in found],
+        text=frozenset({last, *([0] if models else [])}),
+        long=frozenset({last}),
+    )

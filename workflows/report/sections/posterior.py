@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,6 @@ from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.section import Results, Section
-from workflows.report.words import unit_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,18 +48,18 @@ class Posterior(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """The same for each of the first data sets."""
-        before = prior_densities(results.study)
+        before, units = prior_densities(results.study), results.study.units_of("/")
         for one in first(results):
             yield from verdict(results, one)
             yield Pairs([*amounts(one, one.sizes["direction"])])
-            yield posterior(one)
+            yield posterior(one, units)
             if _words(one) is OUTPUTS:
                 yield measurements(one)
-            yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before)])
+            yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before, units)])
             names = [str(name) for name in one.parameter.values if name != "noise"]
             alone = [[_shown(of["alone_std"].sel(parameter=name), 2) for name in names] for of in each_case(one)]
             together = [_shown(one["together_std"].sel(parameter=name), 2) for name in names]
-            yield from cases(one, [f"± {named(name, unit_of(name))}" for name in names], [*alone, together])
+            yield from cases(one, [f"± {named(name, units.get(name, '1'))}" for name in names], [*alone, together])
             yield Heading("Directions", level=3)
             yield Text(
                 "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
@@ -120,12 +119,12 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
     yield "solves", f"{int(one['solves']):,}"
 
 
-def posterior(one: xr.Dataset) -> Table:
+def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Prior and posterior of every parameter, with the truth where it is known."""
     known = bool(np.isfinite(one["true"]).any())
     laplace = "laplace_std" in one
     rows = [
-        _row(one.sel(parameter=name), str(name), unit_of(str(name)), laplace=laplace, known=known)
+        _row(one.sel(parameter=name), str(name), units.get(str(name), "1"), laplace=laplace, known=known)
         for name in one.parameter.values
     ]
     for label in one["inclusion"].values if "inclusion" in one else ():
@@ -251,14 +250,14 @@ def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
     return plots.misfits(one), words
 
 
-def pictures(one: xr.Dataset, before: dict[str, plots.Density]) -> Iterator[tuple[Axes, str]]:
+def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[str, str]) -> Iterator[tuple[Axes, str]]:
     """Draw what was found for one data set, each with what it shows."""
     if _words(one) is OUTPUTS:
         yield of_spectrum(one)
     else:
         yield from on_a_plane(one, plots.Cut.of(one))
     yield (
-        plots.marginals(one, before),
+        plots.marginals(one, before, units),
         "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",
     )
     yield of_misfits(one)

@@ -40,7 +40,7 @@ class FieldPosterior(Section):
         for one in first(results):
             yield from verdict(results, one)
             yield Pairs([*amounts(one, one.sizes["node"]), *more_amounts(one)])
-            yield posterior(one)
+            yield posterior(one, results.study.units_of("/"))
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one)])
             alone = [of["alone_stiffness_std"].mean() for of in each_case(one)]
             widths = [[number(float(width), 3)] for width in (*alone, one["stiffness_std"].mean())]

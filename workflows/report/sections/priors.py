@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from forward.words import settings
 from workflows.report.blocks import Block, Heading, Table
 from workflows.report.section import Results, Section
-from workflows.report.words import unit_of
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 class Priors(Section):
@@ -25,14 +20,14 @@ class Priors(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
         yield Heading("Priors")
-        yield priors(results.dataset)
+        yield priors(results)
 
 
-def priors(dataset: xr.Dataset) -> Table:
+def priors(results: Results) -> Table:
     """What was believed before."""
-    config = tomllib.loads(dataset.attrs["config"])
+    config = tomllib.loads(results.dataset.attrs["config"])
     rows = [
-        (path, f"{block['kind']}: {settings(block, 'kind')}", unit_of(path))
+        (path, f"{block['kind']}: {settings(block, 'kind')}", results.parameter_unit(path))
         for path, block in config.get("parameters", {}).items()
     ]
     rows += [

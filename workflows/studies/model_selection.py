@@ -1,0 +1,228 @@
+"""Studies that compare models: what those by displacements and those by outputs have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from forward.scalars import Mistake
+from forward.settings import Settings
+from forward.spec import ModelSpec
+from inverse.criticism.comparison import Candidate
+from inverse.methods.selection import SelectSpecimens
+from uq.inputs.distributions import Distribution
+from uq.inputs.random_parameters import Inputs
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import StudyError, lines, refused
+from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.config.report import Report
+from workflows.studies.material_tests import WHOLE
+from workflows.studies.selection import Comparison
+
+if TYPE_CHECKING:
+    from forward.model import Finding
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class ModelCandidate(Settings):
+    """A candidate model, with its prior.
+
+    Parameters
+    ----------
+    model
+        What it changes of the model: blocks and values that replace those there; a block with a kind replaces the whole
+        block.
+    parameters
+        Priors by the paths of the numbers that vary.
+    correlations
+        Correlations between them.
+    weight
+        Its probability before the data, up to a common factor.
+    """
+
+    model: dict[str, Any] = Field(default={})
+    parameters: dict[str, Distribution] = Field(min_length=1)
+    correlations: tuple[Correlation, ...] = ()
+    weight: Positive = 1.0
+
+    @property
+    def inputs(self) -> Inputs:
+        """The random parameters."""
+        return Inputs(self.parameters, tuple((*c.between, c.value) for c in self.correlations))
+
+    def restricted(self, spec: ModelSpec) -> Inputs:
+        """The random parameters, restricted to those that make materials, where there are some."""
+        materials = spec.materials(self.inputs.names)
+        return self.inputs if materials is None else self.inputs.within(materials)
+
+    def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what of the priors does not fit the model."""
+        materials = spec.materials(self.parameters)
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, () if materials is None else materials.names)
+        if materials is not None and all(path in spec.scalars for path in self.parameters):
+            with suppress(ValueError):  # correlations, which are reported elsewhere
+                yield from mistakes_of_materials(self.restricted(spec), materials)
+
+
+class ModelSelection(Comparison):
+    """What to compare: candidates change one model, and all are observed in the same way.
+
+    Parameters
+    ----------
+    model
+        The model, as far as the candidates have it in common.
+    data
+        What was measured.
+    candidates
+        Models by name.
+    method
+        How the candidates are compared.
+    parallel
+        Use of ranks.
+    report
+        Your own sections of the report.
+
+    Attributes
+    ----------
+    listed_by
+        The key of `data` that is there once the data are listed, and no file is to be read any more.
+    """
+
+    model: dict[str, Any]
+    data: Any
+    candidates: dict[str, ModelCandidate] = Field(min_length=1)
+    method: SelectSpecimens
+    parallel: Parallel = Parallel()
+    report: Report | None = None
+
+    costly: ClassVar[bool] = True
+    listed_by: ClassVar[str]
+
+    @classmethod
+    @abstractmethod
+    def spec_of(cls, block: Mapping[str, Any]) -> ModelSpec:
+        """Return the model that a block describes.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            For mistakes in it.
+        """
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
+        """Check the blocks of a study, after its data have been read by the model of the first candidate."""
+        return cls.model_validate(cls._expanded(blocks, folder))
+
+    @classmethod
+    def _expanded(cls, blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        data, candidates = blocks.get("data"), blocks.get("candidates")
+        if not isinstance(data, Mapping) or cls.listed_by in data or not isinstance(candidates, Mapping):
+            return dict(blocks)
+        if not candidates:
+            return dict(blocks)
+        of_file: Any = cls.data_in_file
+        try:
+            file = of_file.model_validate(dict(data))
+        except ValidationError as error:
+            raise StudyError(*lines(error, "data")) from None
+        name, first = next(iter(candidates.items()))
+        changes = first.get("model", {}) if isinstance(first, Mapping) else {}
+        try:
+            spec = cls.spec_of(changed(blocks["model"], changes))
+        except ValidationError as error:
+            raise StudyError(*lines(error, f"candidates.{name}.model")) from None
+        return {**blocks, "data": file.read(folder, spec)}
+
+    @cached_property
+    def of_candidates(self) -> Mapping[str, ModelSpec]:
+        """The model of each candidate, in the form that suits all values of its parameters."""
+        return {
+            name: self.spec_of(changed(self.model, one.model)).over(ranges(one.parameters))
+            for name, one in self.candidates.items()
+        }
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the models."""
+        return tuple(dict.fromkeys(module for spec in self.of_candidates.values() for module in spec.modules))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about the models before anything is solved, each once."""
+        of_models = (
+            finding
+            for name, one in self.of_candidates.items()
+            for finding in one.findings_over(ranges(self.candidates[name].parameters))
+        )
+        return tuple(dict.fromkeys([*of_models, *super().findings]))
+
+    @property
+    def models(self) -> dict[str, Candidate]:
+        """The candidates as the method needs them."""
+        return {
+            name: Candidate(candidate.restricted(self.of_candidates[name]), candidate.weight)
+            for name, candidate in self.candidates.items()
+        }
+
+    @property
+    def source(self) -> tuple[str, ...]:
+        """Where the data are from."""
+        found: tuple[str, ...] = self.data.source
+        return found
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """Names of the groups: there is one."""
+        return (WHOLE,)
+
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of the numbers of a candidate's model."""
+        return {path: number.unit for path, number in self.of_candidates[label.partition("/")[0]].scalars.items()}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refused(type(self).__name__, list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        for name, candidate in self.candidates.items():
+            place = ("candidates", name)
+            try:
+                spec = self.spec_of(changed(self.model, candidate.model))
+            except ValidationError as error:
+                for line in error.errors(include_url=False):
+                    yield (*place, "model", *line["loc"]), line["msg"], line["input"]
+                continue
+            for where, message, given in candidate.mistakes(spec):
+                yield (*place, *where), message, given
+            if spec.coefficients:
+                message = "random fields, expected numbers only: evidences are of few parameters"
+                yield (*place, "model", "fields"), message, len(spec.coefficients)
+            for where, message, given in self.unobserved(spec):
+                yield (*place, "model", *where), message, given
+            if self.parallel.ranks_per_model > 1 and not spec.shareable:
+                message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
+                yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        yield from self.mistakes_of_method()
+
+    @abstractmethod
+    def unobserved(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what was measured that a model does not have."""
+
+
+def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a block with changed values; a block with a kind replaces what was there."""
+    found = dict(block)
+    for key, value in changes.items():
+        here = found.get(key)
+        inside = isinstance(value, Mapping) and isinstance(here, Mapping) and "kind" not in value
+        found[key] = changed(here, value) if inside else value  # type: ignore[arg-type]
+    return found
