@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
+from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
 from inverse.criticism.finer import NOT_LOOKED, Finer
@@ -18,6 +19,7 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
 from uq.evaluation.turns import Progress
+from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_mesh, on_finer_mesh, solved_by
@@ -152,6 +154,14 @@ class _Specimen:
         return None if self.mesh is None else partial(self.mesh.outputs, cast("SpecimenModel", observed)), self.why
 
 
+def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset:
+    """Add what is to be said of the results; on rank 0."""
+    found = judged(found, study)
+    if isinstance(made, _Outputs) and not study.model.meshed:
+        add(found, *contradicted(made.model, study.inputs.mean, study.inputs.std))
+    return found
+
+
 def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:
     """Data sets side by side, each on one group."""
     method, errors = study.method, study.data.errors
@@ -191,7 +201,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         rows.add,
         forget,
         results,
-        lambda found: judged(found, study),
+        partial(_judged, study, made),
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )
@@ -236,7 +246,7 @@ def _one(study: InversionStudy, made: _Made) -> MethodJob:
         others,
         task,
         recorders,
-        lambda found: judged(found, study),
+        partial(_judged, study, made),
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from forward.external.derivatives import contradicted
 from forward.model import Stability
 from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
@@ -50,9 +51,13 @@ def job(study: Study, ensemble: Ensemble) -> Job:
     }
     function = study.spec.build(ensemble.group, inputs.names)
     if not study.spec.meshed:
-        return MethodJob(
-            function, others, task, recorders, lambda found: label(_without_nodes(found), units, None, None, 0)
-        )
+
+        def described(found: xr.Dataset) -> xr.Dataset:
+            found = label(_without_nodes(found), units, None, None, 0)
+            add(found, *contradicted(function, inputs.mean, inputs.std))
+            return found
+
+        return MethodJob(function, others, task, recorders, described)
 
     model = cast("HyperelasticModel", function)
     # Rank 0 may leave the task by an exception: nothing collective may follow it.

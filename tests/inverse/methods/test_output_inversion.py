@@ -135,6 +135,19 @@ def test_tables_are_data_sets_side_by_side(folder):
     assert "All data sets" in (folder / "batch" / "report.html").read_text()
 
 
+def test_a_wrong_jacobian_is_named(folder):
+    """Of inversions and of studies that sample; exit code 3."""
+    wrong = LINES.replace("return A\n", "return A * np.array([1.0, 0.9])\n")
+    (folder / "lines_wrong.py").write_text(wrong)
+    (folder / "wrong.toml").write_text(STUDY.replace("MODULE", "wrong"))
+    sampled = STUDY.replace("MODULE", "wrong").partition("[data]")[0] + '[method]\nkind = "chaos"\nsamples = 12\n'
+    (folder / "wrong-chaos.toml").write_text(sampled)
+    for name in ("wrong", "wrong-chaos"):
+        assert ran(folder / f"{name}.toml", folder / name) == 3
+        found = json.loads((folder / name / "summary.json").read_text())["findings"]
+        assert any("of u by b 10 % off" in one["text"] for one in found if one["severity"] == "error")
+
+
 def test_a_file_that_cannot_be_read_is_refused_alone(folder):
     """One that is there, and neither a folder nor text."""
     found = load(folder / "stated.toml", ["data={files=['/proc/self/mem', 'data/one.csv'], noise={relative=0.1}}"])

@@ -1,0 +1,99 @@
+"""Whether the derivatives that another program's model states are those of its values: one look, at one point.
+
+Two more evaluations along a direction that moves all parameters; only where these contradict the derivatives, four more
+for each parameter, to name it. An output may have a kink at the point, or be rough: a derivative between the slopes to
+both sides is not objected to, nor one that shorter differences do not contradict in the same way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forward.model import Finding, FloatArray, ForwardModel, SolveError
+
+STEP = 1e-2  # of a difference, in standard deviations
+SHORTER = 4  # times, of the differences that confirm
+SLOPE = 1e-2  # relative error of a derivative that is small enough
+ROUGHNESS = 1e-7  # relative to an output, what its values may be off by
+SAME = 0.1  # of the contradiction, by which differences of both lengths may differ
+MANY = 25  # parameters beyond which they are not looked at one by one
+SHOWN = 3
+
+
+def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> tuple[Finding, ...]:
+    """Compare the derivatives of a model with differences of its values; not collective.
+
+    Parameters
+    ----------
+    model
+        Any model of outputs; one without derivatives is not looked at.
+    point, scale
+        Where (d,), and how far parameters matter (d,), such as their standard deviations.
+
+    Returns
+    -------
+    tuple
+        An error that names the worst derivatives, or nothing, as where there is no answer.
+    """
+    if not model.differentiable:
+        return ()
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(point))
+    try:
+        middle = model.solve(point)
+        slopes = np.asarray(middle.tangent(np.diag(scale)))  # (d, m)
+        whole = _against(model, point, scale * signs, middle.outputs, signs @ slopes, STEP)
+        if not whole.any():
+            return ()
+        directions = np.eye(len(point)) if len(point) <= MANY else signs[None]
+        stated = directions @ slopes
+        found = [
+            _confirmed(model, point, scale * d, middle.outputs, s) for d, s in zip(directions, stated, strict=True)
+        ]
+    except SolveError:
+        return ()
+    named = model.parameters if len(point) <= MANY else ("all parameters",)
+    worst = [
+        (abs(wrong[i] - right[i]) / max(abs(wrong[i]), abs(right[i])), output, name, wrong[i], right[i])
+        for name, wrong, right in zip(named, stated, found, strict=True)
+        for i, output in enumerate(model.outputs)
+        if np.isfinite(right[i])
+    ]
+    if not worst:
+        return ()
+    said = "; ".join(
+        f"of {output} by {name} {100 * abs(wrong - right) / abs(right):.3g} % off"
+        if right
+        else f"of {output} by {name}"
+        for _, output, name, wrong, right in sorted(worst, reverse=True)[:SHOWN]
+    )
+    more = f" and {len(worst) - SHOWN} more" if len(worst) > SHOWN else ""
+    return (
+        Finding(
+            "error",
+            f"The derivatives that the model states are not those of its values at the mean parameters: {said}{more}. "
+            "What follows from derivatives (expansions, controls, local sensitivities, modes) is wrong: correct the "
+            "jacobian, or leave it out.",
+        ),
+    )
+
+
+def _against(
+    model: ForwardModel, point: FloatArray, direction: FloatArray, middle: FloatArray, stated: FloatArray, step: float
+) -> FloatArray:
+    """By how much (m,) stated slopes contradict differences over steps to both sides; 0 where they do not."""
+    ahead, behind = (model.solve(point + sign * step * direction).outputs for sign in (1, -1))
+    forward, backward = (ahead - middle) / step, (middle - behind) / step
+    sizes = np.abs([forward, backward, stated]).max(axis=0)
+    rough = ROUGHNESS * np.abs([ahead, middle, behind]).max(axis=0) / step
+    allowed = SLOPE * sizes + rough + np.abs(forward - backward)
+    off = stated - (forward + backward) / 2
+    return np.where(np.abs(off) > allowed, off, 0.0)
+
+
+def _confirmed(
+    model: ForwardModel, point: FloatArray, direction: FloatArray, middle: FloatArray, stated: FloatArray
+) -> FloatArray:
+    """Slopes (m,) by differences where these contradict the stated ones at both lengths alike; NaN elsewhere."""
+    off, closer = (_against(model, point, direction, middle, stated, step) for step in (STEP, STEP / SHORTER))
+    sure = (off != 0) & (closer != 0) & (np.abs(off - closer) <= SAME * np.abs(closer))
+    return np.where(sure, stated - closer, np.nan)
