@@ -24,8 +24,9 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, units: Mapping[str, str]
     names = [str(name) for name in dataset["output"].values]
     yield from _of_estimates(names, estimates)
     if "mesh_error" not in dataset:
-        error, size = np.abs(dataset["nominal_mesh_error"].to_numpy()), np.abs(dataset["nominal"].to_numpy())
-        yield from _large(names, "value at the mean parameters", error, size)
+        if "nominal" in dataset:  # methods from outside may leave it out
+            error, size = np.abs(dataset["nominal_mesh_error"].to_numpy()), np.abs(dataset["nominal"].to_numpy())
+            yield from _large(names, "value at the mean parameters", error, size)
         return
     for first, word in (("", "mean"), ("std_", "standard deviation")):
         estimated = "std" if first else "mean"

@@ -169,7 +169,7 @@ def _of_outputs(
     variables: Variables = {"nominal_mesh_error": (("output",), nominal)}
     if "derivative" in dataset:
         variables["derivative_mesh_error"] = (("output", "parameter"), derivatives)
-    if "mean" not in dataset:
+    if not {"mean", "mean_error", "std", "std_error"} <= set(dataset):  # other methods, from outside too
         return variables
     for estimated, first in (("mean", ""), ("std", "std_")):
         error, rest = nothing.copy(), nothing.copy()
