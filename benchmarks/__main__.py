@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 
 from benchmarks import (
+    adaptive,
     bookkeeping,
     buckling,
     calibration,
@@ -51,6 +52,7 @@ ALL = {
     "coverage": coverage.main,
     "scaling": scaling.main,
     "startup": startup.main,
+    "adaptive": adaptive.main,
 }
 WITH_OPTIONS = {"tails": tails.main, "coverage": coverage.main}
 

@@ -15,21 +15,24 @@ from annotated_types import Ge, Gt, Le
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from forward import adapt as adaptive
+from forward.adapt import Adapt
 from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
 from forward.bodies.inclusions import Inclusion
+from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.cost import Estimate, Times, estimate, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials
 from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
-from forward.model import Finding
+from forward.model import Finding, FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import Settings, nearest
 from forward.solvers.settings import SolverSettings
-from forward.spec import ModelSpec
+from forward.spec import UNREFINED, ModelSpec
 from forward.terms.displacement import Displacement
 from forward.terms.term import Load
 
@@ -121,6 +124,8 @@ class Hyperelastic(ModelSpec):
         Unknowns: "displacement", or "mixed" with pressures, which nearly incompressible bodies need (quadratic cells,
         and a material with a constant D1 or a stated volumetric part). "auto" is mixed where that is possible and κ/μ
         may be above 3: for some values of the inputs in a study, otherwise for the constants as given.
+    adapt
+        Whether the mesh is refined first, and until when; tetrahedra only, in studies that sample.
     """
 
     meshed: ClassVar[bool] = True
@@ -138,6 +143,7 @@ class Hyperelastic(ModelSpec):
     loads: tuple[Load, ...] = ()
     outputs: tuple[Output, ...] = Field(min_length=1)
     solver: SolverSettings = SolverSettings()
+    adapt: Adapt | None = None
 
     @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
     @classmethod
@@ -261,6 +267,38 @@ class Hyperelastic(ModelSpec):
         formulation = "mixed" if self.mixed else "displacement"
         return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
 
+    @property
+    def adaptive(self) -> bool:
+        """Whether the mesh is refined before anything else is solved."""
+        return self.adapt is not None
+
+    @property
+    def unrefined(self) -> bool:
+        """Whether that is still to be done."""
+        return self.adapt is not None and not self.adapt.refined
+
+    @property
+    def largest_bytes(self) -> float:
+        """Predicted memory (bytes) of the largest mesh that it may be refined to; 0 where it is not."""
+        return adaptive.largest_bytes(self) if self.unrefined else 0.0
+
+    def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
+        """Refine the mesh at a point (d,) of parameters by their paths, as `forward.fem.adapt` does; collective."""
+        return named("forward.fem.adapt:adapt")(self, comm, parameters, point, say)
+
+    def on_mesh(self, file: str, contents: Contents | None = None) -> Self:
+        """Return the same problem with the same elements on a refined mesh in a file, or one that holds the same.
+
+        Raises
+        ------
+        ValidationError
+            If the file cannot be read.
+        """
+        elements = {"degree": self.body.degree, "quadrature_degree": self.body.quadrature_degree}
+        body = MeshFile.model_validate({"file": file, "contents": contents, **elements})
+        adapt = None if self.adapt is None else self.adapt.model_copy(update={"refined": True})
+        return self.model_copy(update={"body": body, "adapt": adapt})
+
     def mistakes_of_samples(self) -> Iterator[Mistake]:
         """Find random fields whose coefficients cannot be drawn."""
         for i, field in enumerate(self.fields):
@@ -302,8 +340,11 @@ class Hyperelastic(ModelSpec):
         form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
         unknowns = self.over(ranges).unknowns
         yield from body.listed.items()
-        yield "unknowns", f"{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
+        first = "at first " if self.unrefined else ""
+        yield "unknowns", f"{first}{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+        if self.adapt is not None:
+            yield "mesh", self.adapt.in_words(self)
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
         """Say for a report what was solved."""
@@ -326,7 +367,15 @@ class Hyperelastic(ModelSpec):
         parameters
             Paths of the numbers that the model's parameter vector holds; the others keep their values. Coefficients of
             random fields that it does not hold are zero.
+
+        Raises
+        ------
+        ModelError
+            If its mesh is to be refined first.
         """
+        if self.unrefined:
+            message = f"model.adapt: {UNREFINED}"
+            raise ModelError(message)
         return named("forward.fem.model:HyperelasticModel")(self, comm, parameters)
 
     @model_validator(mode="after")
@@ -378,6 +427,7 @@ class Hyperelastic(ModelSpec):
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
         yield from self._contradictions()
+        yield from adaptive.mistakes(self)
         moved = {axis for item in self.displacements for axis in item.components}
         if not self.clamp and moved != {"x", "y", "z"}:
             free = ", ".join(sorted({"x", "y", "z"} - moved))

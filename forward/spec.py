@@ -17,11 +17,17 @@ from forward.settings import Settings
 from forward.words import named
 
 if TYPE_CHECKING:
+    from forward.bodies.mesh_file import Contents
     from forward.fem.cost import Estimate
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
     from forward.fem.locking import Ranges
     from forward.materials.admissible import Materials
-    from forward.model import Finding, ForwardModel, NamedOutput
+    from forward.model import Finding, FloatArray, ForwardModel, NamedOutput
+
+UNREFINED = (
+    "meshes are refined by studies that sample a model; run one, and name the mesh that it leaves: "
+    "body = { kind = 'mesh', file = 'DIR/mesh.npz' }"
+)
 
 
 class ModelSpec(Settings):
@@ -126,6 +132,36 @@ class ModelSpec(Settings):
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Findings before anything is solved, for values of parameters within ranges, by their paths."""
         return ()
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether it has a mesh that is refined before anything else is solved."""
+        return False
+
+    @property
+    def unrefined(self) -> bool:
+        """Whether that is still to be done."""
+        return False
+
+    @property
+    def largest_bytes(self) -> float:
+        """Predicted memory (bytes) of the largest mesh that it may be refined to; 0 where it is not."""
+        return 0.0
+
+    def mistakes_of_mesh(self) -> Iterator[Mistake]:
+        """Find, for a study that does not refine meshes, that this is asked for."""
+        if self.unrefined:
+            yield ("model", "adapt"), UNREFINED, True
+
+    def adapted(self, comm: Any, parameters: tuple[str, ...], point: FloatArray, say: Callable[[str], None]) -> Any:
+        """Refine its mesh at a point (d,) of parameters by their paths (`forward.fem.adapt.Adapted`); collective."""
+        message = f"a model of kind '{self.kind}' has no mesh that is refined"
+        raise ModelError(message)
+
+    def on_mesh(self, file: str, contents: Contents | None = None) -> Self:
+        """Return the same model on the mesh of a file, of which it may be known what it holds."""
+        message = f"a model of kind '{self.kind}' has no meshes"
+        raise ModelError(message)
 
     def refined(self, level: int) -> Self:
         """Return the same model on a mesh whose cells are divided by 2^level along each edge."""

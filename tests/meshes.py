@@ -1,6 +1,6 @@
 """Meshes as other programs write them."""
 
-from itertools import product
+from itertools import permutations, product
 
 import meshio
 import numpy as np
@@ -53,3 +53,28 @@ def box(kind="hexahedron", scale=1.0):
 def numbered(mesh):
     """The same without names, as formats have it that know none."""
     return meshio.Mesh(mesh.points, mesh.cells, cell_data={"part": mesh.cell_data["gmsh:physical"]})
+
+
+def corner(width=2):
+    """The mesh of an L of 1 m × 1 m × 1/4 m, without the quarter beyond (½, ½); `width` cells (even) along its arms."""
+    counts = np.array((width, width, 1))
+    grid = np.array(list(product(*(range(n + 1) for n in counts))))
+    number = {tuple(place): i for i, place in enumerate(grid)}
+    cells = []
+    for first in product(*map(range, counts)):
+        if min(first[:2]) < width // 2:
+            ways = [np.cumsum([first, *way], axis=0) for way in permutations(np.eye(3, dtype=int))]
+            cells += [[number[tuple(place)] for place in way] for way in ways]
+    cells = np.array(cells)
+    faces = np.sort(cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    outer, count = np.unique(faces, axis=0, return_counts=True)
+    outer = outer[count == 1]
+    ends = {"top": (grid[outer][:, :, 1] == width).all(axis=1), "right": (grid[outer][:, :, 0] == width).all(axis=1)}
+    facets = np.concatenate([outer[on] for on in ends.values()])
+    of_cells = [np.ones(len(cells), dtype=np.int32), np.repeat([10, 11], [on.sum() for on in ends.values()])]
+    return meshio.Mesh(
+        grid / counts * np.array((1.0, 1.0, 0.25)),
+        [("tetra", cells), ("triangle", facets)],
+        cell_data={"gmsh:physical": of_cells, "gmsh:geometrical": of_cells},
+        field_data={"body": np.array([1, 3]), "top": np.array([10, 2]), "right": np.array([11, 2])},
+    )

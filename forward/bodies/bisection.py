@@ -95,10 +95,13 @@ class Bisected:
         )
 
     def loaded(self) -> Loaded:
-        """Return the mesh, with the facets of its boundaries."""
+        """Return the mesh, with the facets of its boundaries; all cells are turned the same way, as VTK has them."""
         faces = self.cells[:, FACES]
         boundaries = {name: faces[np.isin(self.labels, numbers)] for name, numbers in self.groups.items()}
-        return Loaded(self.points, self.cells, "tetrahedron", boundaries, self.regions, self.region)
+        at, cells = self.points[self.cells], self.cells.copy()
+        mirrored = np.linalg.det(at[:, 1:] - at[:, :1]) < 0
+        cells[mirrored, 2:] = cells[mirrored, :1:-1]
+        return Loaded(self.points, cells, "tetrahedron", boundaries, self.regions, self.region)
 
     def refined(self, chosen: IntArray, times: int = 1) -> Bisected:
         """Bisect the chosen cells (k,) so many times, and others as far as that cuts their edges."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from io import BytesIO
 from itertools import permutations
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -13,6 +14,8 @@ from pydantic import PrivateAttr
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.mesh_file import BOUNDARY, Contents, Loaded, MeshFile
 from forward.model import FloatArray
+
+INDICATORS = "indicators"  # name of the array
 
 
 def tetrahedra(body: Body) -> tuple[Loaded, Callable[[FloatArray], FloatArray]]:
@@ -57,11 +60,25 @@ class MeshInMemory(MeshFile):
         return self._mesh
 
 
-def packed(mesh: Loaded) -> bytes:
-    """Return a mesh as a file (.npz) that a `MeshFile` can name; equal meshes give equal bytes."""
+def packed(mesh: Loaded, indicators: FloatArray | None = None) -> bytes:
+    """Return a mesh as a file (.npz) that a `MeshFile` can name; equal meshes give equal bytes.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    indicators
+        How much each cell (c,) adds to errors.
+    """
     facets = {f"{BOUNDARY}{name}": facets for name, facets in mesh.boundaries.items()}
+    shares = {} if indicators is None else {INDICATORS: indicators}
+    arrays = {"points": mesh.points, "cells": mesh.cells, "regions": np.array(mesh.regions), "region": mesh.region}
     file = BytesIO()
-    np.savez_compressed(
-        file, points=mesh.points, cells=mesh.cells, regions=np.array(mesh.regions), region=mesh.region, **facets
-    )
+    np.savez_compressed(file, **arrays, **facets, **shares)
     return file.getvalue()
+
+
+def indicators_of(path: Path) -> FloatArray:
+    """Return how much each cell of a mesh in a file adds to errors."""
+    with np.load(path) as arrays:
+        return np.asarray(arrays[INDICATORS], dtype=float)

@@ -283,6 +283,13 @@ class Forms:
         return self.vector(self.derivative(ufl.action(self._imbalance_form(), self._along)))
 
     @cached_property
+    def stresses_at_vertices(self) -> assembly.PointValues:
+        """P (n_cells, 4 · 9) (Pa) at the vertices of this rank's tetrahedra, at the state that is set."""
+        corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        stress = self._invariants.inserted(self.stress_of(self._potential))
+        return assembly.PointValues(stress, corners, self.space, self.comm)
+
+    @cached_property
     def gradients(self) -> assembly.NodalGradients:
         """Deformation gradients at the nodes, at the current state."""
         return assembly.NodalGradients(self.F, self.space, self.comm)

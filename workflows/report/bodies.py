@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
-from workflows.results.directory import body_grid
+from workflows.results.directory import body_grid, mesh_grid
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,8 +107,51 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     return plotter
 
 
+def mesh(dataset: xr.Dataset, shown: str = "mesh") -> Any:
+    """Draw a mesh that was refined, coloured by what its cells add to errors.
+
+    Parameters
+    ----------
+    dataset
+        Results with such a mesh.
+    shown
+        "mesh": its surface; "mesh cut": what is behind the cell that adds most.
+
+    Returns
+    -------
+    pyvista.Plotter
+        As of `body`.
+    """
+    import pyvista
+
+    grid, up = mesh_grid(dataset), _up(dataset)
+    density = grid.cell_data["indicator by volume"] * grid.volume
+    grid.cell_data["colour"] = np.log10(np.maximum(density, 1e-3 * density.max()))
+    plotter: Any = pyvista.Plotter(
+        off_screen=True, window_size=[1200, 860], shape=(2, 1), row_weights=[6, 1], border=False
+    )
+    plotter.set_background("white")
+    part = grid
+    if shown == "mesh cut":
+        _, front = _sides(up)
+        depth = grid.cell_centers().points @ front
+        part = grid.extract_cells(np.flatnonzero(depth <= depth[density.argmax()]))
+        outline = grid.extract_surface(algorithm="dataset_surface").extract_feature_edges(40, boundary_edges=False)
+        plotter.add_mesh(outline, color=FIRST, line_width=2)
+    surface = part.extract_surface(algorithm="dataset_surface")
+    coloured = plotter.add_mesh(
+        surface, scalars="colour", cmap="viridis", show_edges=True, edge_color=DARK, show_scalar_bar=False, ambient=0.45
+    )
+    _show_lengths(plotter, grid.points, up)
+    _look(plotter, up)
+    plotter.subplot(1, 0)
+    _show_colours(plotter, coloured.mapper, "log10 of what cells add to the error by their volume, 0 on average")
+    plotter.subplot(0, 0)
+    return plotter
+
+
 def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | None:
-    """Draw bodies as PNG, each as `body` does, in a process of its own; None where they cannot be drawn.
+    """Draw bodies as PNG, each as `body` or `mesh` does, in a process of its own; None where they cannot be drawn.
 
     A graphics library that is missing or broken ends a process at once: it must not take a study with it.
     """
@@ -152,7 +195,8 @@ def _edges(grid: Any, displacement: FloatArray | None = None) -> Any:
 
 def _up(dataset: xr.Dataset) -> FloatArray:
     """Return the axis (3,) that is nearest to up: against gravity, or else z (y where the body is a sheet across z)."""
-    extents = np.ptp(dataset["node_position"].to_numpy(), axis=0)
+    points = dataset["node_position" if "node_position" in dataset else "mesh_vertex_position"].to_numpy()
+    extents = np.ptp(points, axis=0)
     up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
     model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
     for load in model.get("loads", ()):
@@ -263,7 +307,8 @@ def _colour_title(shown: str, parameter: str | None) -> str:
 def _draw_for_parent() -> None:
     """Read a dataset and what to show from standard input, and write the pictures to standard output."""
     dataset, shown = pickle.load(sys.stdin.buffer)
-    pickle.dump({name: _png(body(dataset, name)) for name in shown}, sys.stdout.buffer)
+    drawn = {name: (mesh if name.startswith("mesh") else body)(dataset, name) for name in shown}
+    pickle.dump({name: _png(plotter) for name, plotter in drawn.items()}, sys.stdout.buffer)
 
 
 def _png(plotter: Any) -> bytes:

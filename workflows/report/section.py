@@ -113,6 +113,7 @@ SECTIONS = Kinds(
         "error-budget": f"{_HERE}.error_budget:ErrorBudget",
         "synthetic-data": f"{_HERE}.synthetic_data:SyntheticData",
         "model": f"{_HERE}.model:Model",
+        "adapted-mesh": f"{_HERE}.adapted_mesh:AdaptedMesh",
         "nominal": f"{_HERE}.nominal:Nominal",
         "error-against-cost": f"{_HERE}.error_against_cost:ErrorAgainstCost",
         "moments": f"{_HERE}.moments:Moments",

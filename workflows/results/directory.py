@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,20 +122,41 @@ def body_grid(dataset: xr.Dataset) -> Any:
     return grid
 
 
+def mesh_grid(dataset: xr.Dataset) -> Any:
+    """Return a mesh that was refined as a pyvista grid, with what each cell adds to errors, also by its volume."""
+    import pyvista
+
+    cells = dataset["mesh_cell_vertices"].to_numpy()
+    sizes = np.full((len(cells), 1), cells.shape[1])
+    kinds = np.full(len(cells), pyvista.CellType.TETRA)
+    points = dataset["mesh_vertex_position"].to_numpy()
+    grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, points)
+    at = points[cells]
+    shares = dataset["mesh_indicator"].to_numpy()
+    grid.cell_data["indicator"] = shares
+    grid.cell_data["indicator by volume"] = shares / (np.abs(np.linalg.det(at[:, 1:] - at[:, :1])) / 6)
+    return grid
+
+
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
 
-    Displacements are in one file; what each data set says about the interior is in one file each.
+    Displacements are in one file; what each data set says about the interior is in one file each; a mesh that was
+    refined is in one with what its cells add to errors.
     """
-    if "cell_nodes" not in dataset:
-        return None
-    directory.mkdir(exist_ok=True)
-    parts = {"displacement": dataset}
-    if "data_set" in dataset.dims:
-        parts = {str(name): dataset.sel(data_set=name) for name in dataset.data_set.values}
-    for name, part in parts.items():
+    grids: dict[str, Callable[[], Any]] = {}
+    if "cell_nodes" in dataset and "data_set" in dataset.dims:
+        names = dataset.data_set.values
+        grids = {str(name): partial(body_grid, dataset.sel(data_set=name)) for name in names}
+    elif "cell_nodes" in dataset:
+        grids = {"displacement": partial(body_grid, dataset)}
+    path = None
+    if "mesh_indicator" in dataset:
+        grids = {"mesh": partial(mesh_grid, dataset)} | grids
+    for name, grid in grids.items():
+        directory.mkdir(exist_ok=True)
         path = directory / f"{name}.vtu"
-        write_whole(path, _vtu(body_grid(part)))
+        write_whole(path, _vtu(grid()))
     return path
 
 

@@ -117,9 +117,11 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
 
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
-    progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
-    checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
+    say = _say if world.rank == 0 and not quiet else lambda _: None
     try:
+        study = study.prepared(ensemble, directory, say)
+        progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
+        checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
         job = ensemble.together(lambda: study.job(ensemble, name, directory, checkpoint))
         if world.rank == 0:
             own_code.keep(directory, study, loaded)
@@ -135,7 +137,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     progress.close()
     dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
     add(dataset, *study.findings)
-    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study)}
+    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
     evaluations = job.evaluations
     own_code.keep(directory, study, loaded)
     add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
@@ -281,6 +283,11 @@ def _finished(directory: Path) -> int | None:
         sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
         return None
     return exit_code(summary)
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
 
 
 def _note(text: str) -> None:

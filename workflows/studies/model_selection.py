@@ -201,7 +201,7 @@ class ModelSelection(Comparison):
                 for line in error.errors(include_url=False):
                     yield (*place, "model", *line["loc"]), line["msg"], line["input"]
                 continue
-            for where, message, given in candidate.mistakes(spec):
+            for where, message, given in (*candidate.mistakes(spec), *spec.mistakes_of_mesh()):
                 yield (*place, *where), message, given
             if spec.coefficients:
                 message = "random fields, expected numbers only: evidences are of few parameters"

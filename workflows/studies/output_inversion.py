@@ -189,6 +189,7 @@ class OutputInversion(InversionStudy):
         if self.model.kind == "specimen":
             yield ("model", "kind"), "a specimen has no outputs, but displacements that are measured", self.model.kind
             return
+        yield from self.model.mistakes_of_mesh()
         for i, field in enumerate(getattr(self.spec, "fields", ())):
             if field.basis == "nodes":
                 message = "values at the vertices are inverted with the displacements of a specimen, expected 'modes'"

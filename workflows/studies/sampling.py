@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -141,6 +141,26 @@ class Study(StudyKind):
         lines: list[str] = named("workflows.studies.sampling_plan:plan")(self, rank_groups)
         return lines
 
+    def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+        """Refine the mesh, where that is asked for; collective."""
+        if not self.model.unrefined:
+            return self
+        refined = named("workflows.studies.adapted_mesh:on_adapted_mesh")
+        found: Study = refined(self, ensemble, directory, say)
+        return found
+
+    @property
+    def kept(self) -> Study:
+        """The study, with a mesh that was refined where its results are."""
+        if not self.model.adaptive:
+            return self
+        found: Study = named("workflows.studies.adapted_mesh:kept")(self)
+        return found
+
+    def of(self, model: ModelSpec) -> Study:
+        """Return the same study of another model."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | {"model": model})
+
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and others that the method may want, at the points of the method; collective."""
         made: Job = named("workflows.studies.sampling_job:job")(self, ensemble)
@@ -154,14 +174,15 @@ class Study(StudyKind):
         """Add how the stability of each sample was tested."""
         with_stability = named("workflows.studies.sampling_job:with_stability")
         found: xr.Dataset = with_stability(self, dataset, evaluations["/"])
-        return found
+        return named("workflows.studies.adapted_mesh:with_history")(self, found) if self.model.adaptive else found
 
     def summary(self, job: Job) -> dict[str, Any]:
-        """Return what was solved on each mesh, if there are several, and what estimates of its error took."""
+        """Return what was solved on each mesh, if there are several, and what estimates and refinement took."""
         found: dict[str, Any] = named("workflows.studies.sampling_job:of_estimates")(self, job)
         if len(self.meshes) > 1:
             found["meshes"] = named("workflows.studies.sampling_job:of_meshes")(self, job)
-        return found
+        told = named("workflows.studies.adapted_mesh:history")(self) if self.model.adaptive else None
+        return found if told is None else found | {"adapted": told}
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""

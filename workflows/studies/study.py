@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -122,6 +122,15 @@ class StudyKind(Settings):
     @abstractmethod
     def plan(self, rank_groups: int) -> list[str]:
         """Say line by line what the study is and what it will cost with so many groups of ranks."""
+
+    def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Self:
+        """Do once what all ranks need before there is a job, and return the study that is then run; collective."""
+        return self
+
+    @property
+    def kept(self) -> Self:
+        """The study that is run as results have it: files beside these have no folder."""
+        return self
 
     @abstractmethod
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:

@@ -75,7 +75,8 @@ def test_cells_are_refined_towards_a_point(first):
         assert areas(mesh) == pytest.approx(areas(first), rel=1e-12)
         for k in range(len(first.regions)):
             assert volumes(mesh)[mesh.region == k].sum() == pytest.approx(volumes(first)[first.region == k].sum())
-        # Each cell lies in the one that it was in.
+        at = mesh.points[mesh.cells]
+        assert (np.linalg.det(at[:, 1:] - at[:, :1]) > 0).all()
         assert shapes(mesh).max() <= 4 * shapes(first).max()
     assert volumes(mesh).min() < 1e-6 * smallest
     assert len(mesh.cells) < 150 * len(first.cells)  # 2^30 if everywhere

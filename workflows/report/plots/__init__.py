@@ -26,7 +26,7 @@ from workflows.report.plots.moments import (
     running_estimates,
     standard_error,
 )
-from workflows.report.plots.multilevel import levels, mesh_cost, mesh_mean, mesh_samples, mesh_variance
+from workflows.report.plots.multilevel import levels, mesh_cost, mesh_mean, mesh_samples, mesh_variance, refinement
 
 __all__ = [
     "BARS",
@@ -56,6 +56,7 @@ __all__ = [
     "mesh_samples",
     "mesh_variance",
     "png",
+    "refinement",
     "running_estimates",
     "selection",
     "span",

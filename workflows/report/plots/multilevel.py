@@ -1,13 +1,15 @@
-"""Levels of the solver, and of meshes."""
+"""Levels of the solver, of meshes, and meshes that are refined."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, quantity, text_of
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, PLAIN, axes, quantity, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,3 +137,24 @@ def _log2(
 ) -> None:
     some = values != 0
     ax.plot(levels[some], np.log2(np.abs(values[some])), color=colour, marker="o", linestyle=linestyle, label=label)
+
+
+def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax: Axes | None = None) -> Axes:
+    """Draw the estimated relative errors of outputs against the unknowns of the meshes, and what is asked for."""
+    ax = ax or axes()
+    unknowns = dataset["cycle_unknowns"].to_numpy()
+    for output, colour in zip(outputs, cycle(COLOURS), strict=False):
+        found = dataset.sel(output=output)
+        error = found["cycle_mesh_error"].to_numpy()
+        size = np.abs(found["cycle_value"].to_numpy() + error)
+        relative = np.divide(np.abs(error), size, out=np.full(len(size), np.nan), where=size > 0)
+        ax.plot(
+            unknowns, np.where(relative > 0, relative, np.nan), "o-", color=colour, markersize=4, label=text_of(output)
+        )
+    ax.axhline(tolerance, color=PLAIN, linestyle=":", label="tolerance")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("unknowns")
+    ax.set_ylabel("estimated relative error of the mesh")
+    ax.legend()
+    return ax

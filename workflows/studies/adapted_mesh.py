@@ -1,0 +1,138 @@
+"""A mesh that is refined before a study samples on it: once, whatever the ranks, and kept with the results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.machine import write_whole
+from forward.model import Finding
+from forward.registry import named
+from uq.findings import add
+from workflows.results.directory import write_text
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.fem.adapt import Adapted
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.sampling import Study
+
+MESH, HISTORY = "mesh.npz", "mesh.json"
+
+
+def on_adapted_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+    """Refine the mesh of a study at the mean of its parameters, or find what was refined before; collective.
+
+    The first group of ranks does it. What comes of it is a file, which all read.
+    """
+    named("forward.fem.adapt:adapt")  # PETSc begins on all ranks together
+    world, path = ensemble.world, directory.resolve() / MESH
+
+    def refined() -> Adapted | None:
+        found: Adapted | None = None
+        if ensemble.index == 0:
+            inputs = study.inputs
+            found = study.spec.adapted(ensemble.group, inputs.names, inputs.mean, say)
+        return found
+
+    if not world.bcast(path.exists() if world.rank == 0 else None):
+        found = ensemble.together(refined)
+        if world.rank == 0 and found is not None:
+            _keep(study, found, path)
+    read = ensemble.together(lambda: study.model.on_mesh(str(path)) if world.rank == 0 else None)
+    contents = world.bcast(None if read is None else read.body.contents)  # type: ignore[attr-defined]
+    return study.of(study.model.on_mesh(str(path), contents))
+
+
+def kept(study: Study) -> Study:
+    """Return a study on such a mesh as its results have it, which may be moved."""
+    body = study.model.body  # type: ignore[attr-defined]
+    return study.of(study.model.on_mesh(MESH, body.contents))
+
+
+def _keep(study: Study, found: Adapted, path: Path) -> None:
+    """Write down the mesh, at last, and how it came about."""
+    from forward.bodies.tetrahedra import packed
+
+    assert found.mesh is not None
+    assert found.indicators is not None
+    history = {
+        "outputs": [output.name for output in study.model.outputs],
+        "cycles": [
+            {
+                "cells": cycle.cells,
+                "unknowns": cycle.unknowns,
+                "values": cycle.values,
+                "errors": [None if np.isnan(error) else error for error in cycle.errors],
+                "factors": cycle.factors,
+                "cpu_seconds": cycle.seconds,
+            }
+            for cycle in found.cycles
+        ],
+        "stopped": found.stopped,
+    }
+    write_text(path.with_name(HISTORY), json.dumps(history, indent=2, ensure_ascii=False) + "\n")
+    write_whole(path, packed(found.mesh, found.indicators))
+
+
+def history(study: Study) -> dict[str, Any] | None:
+    """Return how the mesh of a study came about, which stands beside it; None where that is not known."""
+    try:
+        found: dict[str, Any] = json.loads(_path(study).with_name(HISTORY).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    return found
+
+
+def _path(study: Study) -> Path:
+    return Path(study.model.body.file)  # type: ignore[attr-defined]  # bodies that are adapted have files
+
+
+def with_history(study: Study, dataset: xr.Dataset) -> xr.Dataset:
+    """Add to results the mesh, what each cell adds to its errors, and what the meshes before were; and say it."""
+    from forward.bodies.tetrahedra import indicators_of
+
+    told = history(study)
+    if told is None:
+        return dataset
+    cycles = told["cycles"]
+    mesh, shares = study.model.body.load(), indicators_of(_path(study))  # type: ignore[attr-defined]
+
+    def of_outputs(name: str) -> tuple[tuple[str, str], Any]:
+        return ("cycle", "output"), np.array([cycle[name] for cycle in cycles], dtype=float)
+
+    add(dataset, _finding(study, told))
+    return dataset.assign(
+        cycle_cells=("cycle", [cycle["cells"] for cycle in cycles]),
+        cycle_unknowns=("cycle", [cycle["unknowns"] for cycle in cycles]),
+        cycle_value=of_outputs("values"),
+        cycle_mesh_error=of_outputs("errors"),
+        mesh_vertex_position=(("mesh_vertex", "axis"), mesh.points),
+        mesh_cell_vertices=(("mesh_cell", "mesh_corner"), mesh.cells),
+        mesh_indicator=("mesh_cell", shares),
+    )
+
+
+def _finding(study: Study, told: dict[str, Any]) -> Finding:
+    """Say what errors are left, and why."""
+    adapt = study.model.adapt  # type: ignore[attr-defined]
+    last, first = told["cycles"][-1], told["cycles"][0]
+    named = [told["outputs"][i] for i in adapt.named(study.model)]
+    left = []
+    for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
+        if name in named:
+            left.append(
+                f"{name} {100 * abs(error / (value + error)):.2g} %" if value + error else f"{name} {error:.2g}"
+            )
+    text = (
+        f"The mesh was refined at the mean of the parameters, from {first['unknowns']:,} to {last['unknowns']:,} "
+        f"unknowns; the errors that it makes there are estimated to be {', '.join(left)}"
+    )
+    if told["stopped"] is None:
+        return Finding("note", f"{text}.")
+    return Finding("warning", f"{text}, above model.adapt.tolerance = {adapt.tolerance:g}: {told['stopped']}.")
