@@ -1,9 +1,9 @@
-"""Local refinement of tetrahedra by bisection, on arrays alone: the same on any number of ranks and with any library.
+"""Local refinement of tetrahedra by bisection, on arrays only: the same on any number of ranks and with any library.
 
 D. N. Arnold, A. Mukherjee, L. Pouly, Locally adapted tetrahedral meshes using bisection, SIAM J. Sci. Comput. 22 (2000)
-431–448. Every face has a marked edge, the same for both of its cells, and one of them is the edge at which its cell is
-cut next. Meshes conform, closing them ends, and the descendants of a cell have at most 72 shapes, however often they
-are divided: angles stay away from 0.
+431–448. Every face has a marked edge, the same for both of its cells; the refinement edge of a cell, where it is cut
+next, is one of these. Meshes are conforming, the closure terminates, and the descendants of a cell have at most 72
+shapes, however often they are divided: angles stay away from 0.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from forward.model import FloatArray, ModelError
 BoolArray = NDArray[np.bool_]
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # each is opposite the vertex of its row
-# What stands in `marks` for a face (a, 2, 3), where a is 0 or 1: its marked edge is (2, 3), (a, 2) or (a, 3).
+# Values of `marks` for a face (a, 2, 3), where a is 0 or 1: its marked edge is (2, 3), (a, 2) or (a, 3).
 OPPOSITE, TO_THIRD, TO_FOURTH = 0, 1, 2
-# Of the vertices of its parent (a, 2, 3) that a half keeps, the order, by the mark of that face: the next cut is first.
+# Order of the vertices (a, 2, 3) that a half keeps of its parent, by the mark of that face: the next cut comes first.
 _ORDER = np.array([[1, 2, 0], [0, 1, 2], [0, 2, 1]])
 _SHIFT = 32  # bits of a vertex in the key of an edge
 
@@ -37,17 +37,17 @@ class Bisected:
     cells
         Vertices (c, 4) of each cell; its next cut is between the first two.
     marks
-        Marked edges (c, 2) of the faces opposite the first and the second vertex; those of the others are the cut.
+        Marked edges (c, 2) of the faces opposite the first and the second vertex; for the others it is the next cut.
     flags
-        Whether each cell (c,), if all of its marked edges lie in one face, has a parent that was so too.
+        Whether each cell (c,) whose marked edges all lie in one face has a parent of that type too.
     labels
-        For each cell (c, 4) the label of the face opposite each vertex, 0 for none.
+        Labels (c, 4) of the faces opposite the vertices of each cell; 0 for none.
     groups
-        Which labels belong to each boundary, by its name.
+        The labels that belong to each boundary, by name.
     regions, region
         Names of the regions, and the number of each cell's (c,).
     origin
-        The cell (c,) that each one was in, before the mesh was last refined.
+        The cell (c,) that contained each one before the last refinement.
     """
 
     points: FloatArray
@@ -62,12 +62,12 @@ class Bisected:
 
     @classmethod
     def of(cls, mesh: Loaded) -> Bisected:
-        """Mark the longest edge of each face and of each cell, of equal ones that with the lowest vertices.
+        """Mark the longest edge of each face and of each cell; among equal ones, the one with the lowest vertices.
 
         Raises
         ------
         ModelError
-            If the cells are no tetrahedra.
+            If the cells are not tetrahedra.
         """
         if mesh.cell != "tetrahedron":
             message = "hexahedra cannot be refined locally, expected tetrahedra"
@@ -104,14 +104,14 @@ class Bisected:
         return Loaded(self.points, cells, "tetrahedron", boundaries, self.regions, self.region)
 
     def refined(self, chosen: IntArray, times: int = 1) -> Bisected:
-        """Bisect the chosen cells (k,) so many times, and others as far as that cuts their edges."""
+        """Bisect the chosen cells (k,) `times` times, and others as needed for a conforming mesh."""
         mesh = replace(self, origin=np.arange(len(self.cells)))
         for _ in range(times):
             mesh = mesh._closed(np.isin(mesh.origin, chosen))
         return mesh
 
     def _closed(self, cut: BoolArray) -> Bisected:
-        """Bisect cells, and others for as long as an edge that was cut is whole in some cell."""
+        """Bisect cells, then others until no cell has an edge with a hanging vertex."""
         mesh = self
         split: IntArray = np.zeros(0, dtype=np.int64)  # keys of the edges that were cut, sorted
         middles: IntArray = np.zeros(0, dtype=np.int64)  # the vertices in their middles
@@ -127,7 +127,7 @@ class Bisected:
         return mesh
 
     def _halved(self, cut: BoolArray, middle: IntArray) -> Bisected:
-        """Put the halves of the cells to be cut, each at its middle (k,), behind the cells that stay."""
+        """Append the halves of the cut cells, each cut at its midpoint (k,), to the cells that stay."""
         cells, marks, labels = self.cells[cut], self.marks[cut], self.labels[cut]
         planar = (marks[:, 0] == marks[:, 1]) & (marks[:, 0] != OPPOSITE)
         again = planar & self.flags[cut]
@@ -136,8 +136,8 @@ class Bisected:
             inherited = marks[:, left]  # the mark of the face without the vertex that is left
             own = np.array([kept, 2, 3])[_ORDER[inherited]]
             found_cells.append(np.column_stack([np.take_along_axis(cells, own, axis=1), middle]))
-            # The marked edge of every face at the middle is opposite it, but for that between the halves of a cell
-            # that was planar for the second time: there it goes from the middle to the cut that comes next.
+            # The marked edge of every face at the midpoint is opposite it, except in the face between the halves of a
+            # cell that was planar for the second time: there it joins the midpoint and an end of the next cut.
             of_first = np.where(again, TO_FOURTH, TO_THIRD)
             found_marks.append(np.stack([of_first, np.full(len(cells), TO_THIRD)], axis=1).astype(np.int8))
             inner = labels.copy()
@@ -161,7 +161,7 @@ def _keys(edges: IntArray) -> IntArray:
 
 
 def _rank_of_edges(points: FloatArray, cells: IntArray) -> IntArray:
-    """Rank the edges (c, 6) of cells by length, rounded so that equal ones are, and then by their vertices."""
+    """Rank the edges (c, 6) of cells by length, rounded so that equal ones tie, and then by their vertices."""
     keys, which = np.unique(_keys(cells[:, EDGES]), return_inverse=True)
     lengths = np.linalg.norm(points[keys >> _SHIFT] - points[keys & (1 << _SHIFT) - 1], axis=1)
     rounded = np.round(lengths / (1e-9 * lengths.max()))
@@ -171,7 +171,7 @@ def _rank_of_edges(points: FloatArray, cells: IntArray) -> IntArray:
 
 
 def _labelled(boundaries: dict[str, IntArray], cells: IntArray) -> tuple[IntArray, dict[str, IntArray]]:
-    """Label the faces (c, 4) of cells by the boundaries that they are on together; return the labels of each too."""
+    """Label the faces (c, 4) of cells by the set of boundaries that they are on; return the labels of each too."""
     faces = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     sizes = [len(facets) for facets in boundaries.values()]
     facets = np.sort(np.concatenate([np.zeros((0, 3), dtype=np.int64), *boundaries.values()]), axis=1)

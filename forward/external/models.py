@@ -1,8 +1,8 @@
-"""Models that are not of this program, as specifications: a Python function, or a server of the UM-Bridge protocol.
+"""Specifications of models outside this program: a Python function, or a server that speaks UM-Bridge.
 
 UM-Bridge: L. Seelinger et al., J. Open Source Softw. 8 (2023) 4748; protocol 1.0.
 
-Functions and servers share this file because they share all but the way a point is evaluated.
+Functions and servers share this file because only the way a point is evaluated differs.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from forward.spec import ModelSpec
 if TYPE_CHECKING:
     from forward.fem.locking import Ranges
 
-SECONDS_TO_ANSWER = 30.0  # of questions that need no solve
+SECONDS_TO_ANSWER = 30.0  # for questions that need no solve
 PROTOCOL = 1.0
-LITTLE = 1024 * MIB  # of memory left, below which it is worth a word
-MISUSED = ("InvalidInput", "UnsupportedFeature", "ModelNotFound")  # errors of a server that no other parameters mend
+LITTLE = 1024 * MIB  # memory left, below which a message mentions it
+MISUSED = ("InvalidInput", "UnsupportedFeature", "ModelNotFound")  # errors of a server at any parameters
 
 
 class Value(Settings):
@@ -39,9 +39,9 @@ class Value(Settings):
     Parameters
     ----------
     name
-        What it is called in results.
+        Its name in results.
     unit
-        Its unit, to be shown.
+        Its unit, for display.
     """
 
     name: str = Field(min_length=1)
@@ -67,12 +67,12 @@ class _External(ModelSpec):
     Parameters
     ----------
     parameters
-        Values of all d parameters by name, in the order that the model takes them; the random parameters of a study
-        take their place.
+        Values of all d parameters by name, in the order in which the model takes them; the random parameters of a
+        study replace them.
     outputs
-        The m outputs in their order: names, or blocks with `name` and `unit`.
+        The m outputs in order: names, or blocks with `name` and `unit`.
     solve_seconds
-        Longest time (s, by the clock) for one evaluation, after which it has failed; none by default.
+        Time limit (s, wall clock) for one evaluation, after which it counts as failed; None by default.
     """
 
     kind: str
@@ -82,7 +82,7 @@ class _External(ModelSpec):
 
     @property
     def scalars(self) -> dict[str, Scalar]:
-        """Every number that can be made a parameter, by its name."""
+        """Every number that can be a parameter, by name."""
         return {name: Scalar(value, _Number, "value") for name, value in self.parameters.items()}
 
     @abstractmethod
@@ -92,11 +92,11 @@ class _External(ModelSpec):
         Raises
         ------
         ModelError
-            If it cannot be found.
+            If the model cannot be found.
         """
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
-        """Find the model, and say what it is; no one knows how long a solve takes."""
+        """Find the model and describe it; the time of a solve is unknown."""
         _, jacobian = self.functions()
         yield "model", f"{self.description}; {'with' if jacobian else 'without'} derivatives"
 
@@ -131,7 +131,7 @@ class _External(ModelSpec):
     def _check_names(self) -> _External:
         for name, count in Counter(output.name for output in self.outputs).items():
             if count > 1:
-                message = f"{count} outputs are called '{name}', expected different names"
+                message = f"{count} outputs have the name '{name}', expected different names"
                 raise ValueError(message)
         return self
 
@@ -142,10 +142,10 @@ Dotted = Annotated[str, Field(pattern=r"^[^\W\d]\w*(\.[^\W\d]\w*)+$")]
 class PythonModel(_External):
     """A Python function of a vector of parameters (d,) that returns the outputs (m,).
 
-    Where it raises an exception, or returns what is not finite, there is no answer: the solve has failed. Modules are
-    found where Python finds them, beside the study, and in the working directory; one that is found at several of these
-    is refused. All modules that they import and that are not installed count as the model's source: results are not
-    continued once one has changed. Data that they read cannot be known; change a module with them.
+    If it raises an exception, or returns values that are not finite, the solve has failed. Modules are looked up on
+    Python's path, beside the study, and in the working directory; one that is found in several of these is refused.
+    All modules that they import and that are not installed count as the model's source: results are not continued once
+    one has changed. Data files that they read are not tracked: when these change, change a module too.
 
     Parameters
     ----------
@@ -154,9 +154,9 @@ class PythonModel(_External):
     jacobian
         Dotted path of the derivatives: (d,) → (m, d). Without it, methods that need derivatives refuse the model.
     parameters, outputs
-        Names, as of every external model.
+        Names, as in every external model.
     solve_seconds
-        Longest time (s) for one call; code that does not come back to Python is not interrupted.
+        Time limit (s) for one call; code that does not return to Python is not interrupted.
     """
 
     kind: Literal["python"] = "python"
@@ -170,20 +170,21 @@ class PythonModel(_External):
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """The modules of function and Jacobian."""
+        """The modules of the function and its Jacobian."""
         return tuple(path.rpartition(".")[0] for path in (self.function, self.jacobian) if path)
 
     def functions(self) -> tuple[Callable[[FloatArray], Any], Callable[[FloatArray], Any] | None]:
-        """Import function and Jacobian."""
+        """Import the function and its Jacobian."""
         names, seconds = tuple(self.parameters), self.solve_seconds
         function = _guarded(self.function, "function", names, seconds)
         return function, _guarded(self.jacobian, "jacobian", names, seconds) if self.jacobian else None
 
 
 def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -> Callable[[FloatArray], Any]:
-    """Import a function; the exceptions that it raises, and longer times than allowed, become failed solves.
+    """Import a function; exceptions that it raises, and calls beyond the time limit, become failed solves.
 
-    Where it ends the process or has no memory, which says nothing of the model there, the run ends with the parameters.
+    If it ends the process or runs out of memory, which says nothing about the model, the run ends and names the
+    parameters.
     """
     module, _, name = path.rpartition(".")
     try:
@@ -239,20 +240,20 @@ def _said(error: BaseException) -> str:
 class UmBridgeModel(_External):
     """A model behind a server of the UM-Bridge protocol.
 
-    Vectors of the server that are several follow one another in `parameters` and `outputs`. Derivatives come from
-    ApplyJacobian or Gradient, whichever the server has (of both, what takes fewer calls). A solve that the server
-    reports as failed is a failed solve; a server that is gone ends the study, which continues with the same command.
+    If the server has several vectors, they follow one another in `parameters` and `outputs`. Derivatives come from
+    ApplyJacobian or Gradient, whichever the server has (of both, the one that takes fewer calls). A solve that the
+    server reports as failed is a failed solve; a server that is gone ends the study, and the same command continues it.
 
     Parameters
     ----------
     url
-        Where the server is, such as ``http://localhost:4242``.
+        Address of the server, such as ``http://localhost:4242``.
     name
-        Which of its models; may be left out where it has one only.
+        One of its models; may be left out if it has only one.
     config
         Options of the model, as the server documents them.
     parameters, outputs
-        Names, as of every external model.
+        Names, as in every external model.
     """
 
     kind: Literal["um-bridge"] = "um-bridge"
@@ -287,11 +288,11 @@ class Client:
     url
         Of the server.
     name
-        Of the model; the only one where it is not given.
+        Of the model; None for the only one.
     config
         Options.
     seconds
-        Longest time for the answer to one question; None to wait for ever.
+        Time limit for the answer to one question; None to wait forever.
 
     Attributes
     ----------
@@ -365,7 +366,7 @@ class Client:
         data = None if question is None else json.dumps({"name": self._model} | question).encode()
         request = Request(f"{self._url}/{what}", data, {"Content-Type": "application/json"})
         try:
-            # The time of urlopen is that of silence: a server that goes on sending may take for ever.
+            # The timeout of urlopen limits silence only: a server that keeps sending may take forever.
             with time_limit(timeout):
                 try:
                     with urlopen(request, timeout=timeout) as answer:
@@ -380,10 +381,10 @@ class Client:
             message = f"model.url: {self._url} does not answer ({error.reason}), expected an UM-Bridge server"
             raise ModelError(message) from None
         except json.JSONDecodeError:
-            message = f"model.url: {self._url} is no UM-Bridge server: its answer to {what} is not JSON"
+            message = f"model.url: {self._url} is not an UM-Bridge server: its answer to {what} is not JSON"
             raise ModelError(message) from None
         except OSError as error:
-            message = f"model.url: {self._url} broke off ({_said(error)})"
+            message = f"model.url: {self._url} broke off the connection ({_said(error)})"
             raise ModelError(message) from None
 
     def _refuse_slowness(self, what: str, timeout: float | None) -> NoReturn:

@@ -1,10 +1,10 @@
-"""The same body on the same mesh in elements of one degree more: what error the mesh makes of a solution.
+"""Error of the mesh in a solution, from the same body on the same mesh in elements of one degree higher.
 
 With u_h the solution on V_h, V⁺ ⊃ V_h the enriched space and F⁺, K⁺ the equations there, one linear solve
 K⁺(u_h) e = −F⁺(u_h) estimates the error of the whole state, and ψ⁺(u_h + e) − ψ(u_h) that of an output ψ. To first
 order this is the dual-weighted residual −F⁺(u_h; z⁺) with the adjoint z⁺ ∈ V⁺ of every output (R. Becker, R. Rannacher,
 An optimal control approach to a posteriori error estimation, Acta Numerica 10 (2001) 1–102), without one adjoint each.
-Prescribed unknowns stay what they are on V_h. Elements of V⁺ err too: what e misses is its saturation.
+Prescribed unknowns keep their values on V_h. V⁺ has an error too: the part that e misses is called saturation.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
 
 
-ROUGH = 0.01  # of solves with the stiffness of the body, relative to the size of what is solved for
-SETTLED = 0.01  # part of the energy of e that a few steps may miss
-STEPS = 100  # of these, at most
-ORTHOGONAL = 1e-6  # part of forces that is nothing to the body
-ITERATIONS = 30  # of these, at most
-CLOSE = 1e-3  # of solves with the factor of a reference in the enriched space
+ROUGH = 0.01  # tolerance of solves with the stiffness of the body, relative to the solution
+SETTLED = 0.01  # part of the energy of e that the conjugate gradients may miss
+STEPS = 100  # of conjugate gradients, at most
+ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
+ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
+CLOSE = 1e-3  # relative tolerance of the same solves
 
 
 class Solved(Protocol):
@@ -45,7 +45,7 @@ class Solved(Protocol):
     parameters, state
         Parameters (d,) and this rank's part (U_local,) of the state.
     reference
-        The solution nearby with whose factor it was found.
+        The nearby solution whose factor was used to find it.
     """
 
     parameters: FloatArray
@@ -57,18 +57,18 @@ class Solved(Protocol):
 
 
 class EnrichedState(NamedTuple):
-    """A state of the enriched space, as one linear solve from a solution of the body has it.
+    """A state of the enriched space, by one linear solve from a solution of the body.
 
     Attributes
     ----------
     state, change
         u_h + e and e (U⁺_local,).
     energy
-        Half of the square of the energy norm of e (J).
+        Half the square of the energy norm of e (J).
     stored
-        Energy (J) that is stored at u_h.
+        Energy (J) stored at u_h.
     work
-        What it has cost.
+        Its cost.
     """
 
     state: FloatArray
@@ -79,12 +79,12 @@ class EnrichedState(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """Energy norm of e relative to the size of the state; NaN where no energy is stored."""
+        """Energy norm of e relative to the size of the state; NaN if no energy is stored."""
         return relative(self.energy, self.stored)
 
 
 def relative(energy: float, stored: float) -> float:
-    """Return the size of an error of such energy (J) relative to a state that stores so much; NaN where it has none."""
+    """Return the size of an error with an energy (J) relative to a state with a stored energy (J); NaN if that is 0."""
     return float(np.sqrt(max(energy, 0.0) / stored)) if stored > 0 else np.nan
 
 
@@ -103,7 +103,7 @@ class Enriched:
     equations
         The equations of the body in the enriched space.
     way
-        How they are solved, which depends on sizes, form and degree only.
+        How they are solved; depends only on sizes, form and degree.
     """
 
     def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
@@ -132,7 +132,7 @@ class Enriched:
         return np.concatenate([down(part) for down, part in zip(self._down, parts, strict=False)])
 
     def restrict(self, forces: FloatArray) -> FloatArray:
-        """Return forces (U⁺_local,) of the enriched space as those (U_local,) of the body: the transpose of `up`."""
+        """Restrict forces (U⁺_local,) of the enriched space to those (U_local,) of the body: the transpose of `up`."""
         parts = np.split(forces, [3 * self.equations.nodes_owned])
         return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
 
@@ -167,7 +167,7 @@ class Enriched:
         forces = -self.imbalance(solution)
         (change,) = self._solve(solution, forces[None])
         start = self.up(solution.state)
-        # In the mixed form the energy is a saddle, in which the pressures count with the other sign.
+        # In the mixed form the energy has a saddle point, and the pressures count with the opposite sign.
         energy = 0.5 * equations.curvature(change, forces)
         equations.set_state(start)
         return EnrichedState(start + change, change, energy, float(self._stored()), equations.work)
@@ -175,7 +175,7 @@ class Enriched:
     def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
 
-        To rounding with a factor of its own, or roughly in one of the other ways.
+        To rounding with its own factor, or roughly in one of the other ways.
         """
         found = None
         if self.way == Way.SMOOTHING:
@@ -190,7 +190,7 @@ class Enriched:
     def _solve_by_smoothing(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray | None:
         """Solve by steps of conjugate gradients and, before and after, with the stiffness of the body.
 
-        The last of these sets right what outputs see most: the residual is orthogonal to V_h then.
+        The solve afterwards corrects what affects outputs most: it makes the residual orthogonal to V_h.
         """
         inverse = self._inverse_blocks(solution)
         if inverse is None:
@@ -218,7 +218,7 @@ class Enriched:
         return found + self._on_the_body(solution, left, transpose=transpose)
 
     def _on_the_body(self, solution: Solved, right: FloatArray, *, transpose: bool) -> FloatArray:
-        """Solve with the stiffness of the body for what rows (k, U⁺_local) are to it, unless that is nothing."""
+        """Solve with the stiffness of the body for the restriction of rows (k, U⁺_local), unless that is negligible."""
         forces = np.array([self.restrict(row) for row in right])
         forces[:, self._coarse.fixed] = 0
         sizes, wholes = self._coarse.norms(forces), self.equations.norms(right)
@@ -232,11 +232,11 @@ class Enriched:
         return found
 
     def _inverse_blocks(self, solution: Solved) -> FloatArray | None:
-        """Inverses of the stiffness of each node at the reference of a solution, which serve all that have it."""
+        """Inverses of the stiffness of each node at the reference of a solution, shared by all that have it."""
         at: ReferenceSolution | Solved = solution.reference or solution
         if self._blocks is None or not _same(self._blocks[0], at):
             equations = self.equations
-            kept, equations.work = equations.work, Work()  # charged to none, as the factor of a reference
+            kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
             equations.set_parameters(at.parameters)
             equations.at_load(1.0)
             equations.set_state(self.up(at.state))
@@ -251,7 +251,7 @@ class Enriched:
     def _solve_near(
         self, solution: Solved, reference: ReferenceSolution, right: FloatArray, *, transpose: bool
     ) -> FloatArray | None:
-        """Solve with the factor of the enriched stiffness at a reference; None if that is too far away."""
+        """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
         equations = self.equations
         known = ReferenceSolution(reference.parameters, self.up(reference.state))
         self._reference.prepare(known)
@@ -284,11 +284,11 @@ class Enriched:
         Raises
         ------
         ValueError
-            If an output is weighted whose error is not estimated.
+            If the error of a weighted output is not estimated.
         """
         known = [i for i, f in enumerate(self._functionals) if f is not None]
         if np.delete(weights, known, axis=1).any():
-            message = "an output is weighted of which no error of the mesh is estimated"
+            message = "the mesh error of a weighted output is not estimated"
             raise ValueError(message)
         self.visit(solution)
         gradients = np.array([f.gradient() for f in self._functionals if f is not None])
@@ -297,12 +297,12 @@ class Enriched:
         return self._solve(solution, loads, transpose=True)
 
     def indicators(self, solution: Solved, weights: FloatArray) -> FloatArray:
-        """Return what each of this rank's cells (k, n_cells) adds to the error of outputs weighted by (k, m); ≥ 0.
+        """Return contributions (k, n_cells) of this rank's cells to the error of outputs weighted by (k, m); ≥ 0.
 
-        The dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i, in equal parts
-        of its size to the cells that meet there: T. Richter, T. Wick, Variational localizations of the dual weighted
-        residual estimator, J. Comput. Appl. Math. 279 (2015) 192–208. (Cut by cells without jumps of stresses, what
-        cancels between neighbours would count.) Cells are in DOLFINx's order.
+        The size of the dual-weighted residual F⁺(u_h; φ_i (z⁺ − I_h z⁺)) of each vertex i with its hat function φ_i is
+        shared equally by the cells that meet there: T. Richter, T. Wick, Variational localizations of the dual weighted
+        residual estimator, J. Comput. Appl. Math. 279 (2015) 192–208. (Split by cell without jumps of stresses, terms
+        that cancel between neighbours would count.) Cells are in DOLFINx's order.
         """
         equations = self.equations
         found = []
@@ -320,7 +320,7 @@ def _same(one: ReferenceSolution | Solved, other: ReferenceSolution | Solved) ->
 
 
 def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:
-    """Share what this rank's vertices have between the cells that meet there, in equal parts; (n_cells,) of them."""
+    """Share values at this rank's vertices equally between the cells that meet there; return them (n_cells,)."""
     space = spaces.scalar_space(equations.mesh, 1)
     corners = version.nodes_of_cells(space, len(spaces.cell_element(space).points))[: owned_cells(equations.mesh)]
     carrier = spaces.function(space)

@@ -1,10 +1,9 @@
 """Strain energies in UFL forms: their arguments, the stress, and derivatives by the state.
 
-Energies of principal stretches are long expressions of two invariants (`kinematics.Shape`). UFL would propagate each of
-their derivatives by the state through these expressions, in nine components. So such an energy has two symbols instead
-of the invariants, its derivatives by these are scalars, and the chain rule is written here. `inserted` replaces the
-symbols by the invariants before compilation. (A stiffness of Ogden's energy takes C compilers seconds rather than
-minutes.)
+Energies of principal stretches are long expressions of two invariants (`kinematics.Shape`). UFL would propagate each
+derivative by the state through these expressions, in nine components. So the invariants in such an energy are replaced
+by two symbols: its derivatives by these are scalars, and the chain rule is applied here. `inserted` puts the invariants
+back before compilation. (The stiffness of Ogden's energy then compiles in seconds rather than minutes.)
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ OPS = SimpleNamespace(
     near=lambda z, limit, inside, outside: ufl.conditional(ufl.lt(abs(z), limit), inside, outside),
 )
 OPS.log1p, OPS.expm1 = kinematics.log1p_of(OPS), kinematics.expm1_of(OPS)
-# Second derivatives have their digits without the series of these.
+# Second derivatives are accurate without the series of these.
 _PLAIN = SimpleNamespace(**vars(OPS) | {"log1p": lambda x: ufl.ln(1 + x), "expm1": lambda x: ufl.exp(x) - 1})
 POINTS = 8
 
@@ -107,13 +106,13 @@ class Invariants:
     def volume(self, factor: Any, values: Mapping[str, Any]) -> tuple[Any, Any]:
         """Return the bulk modulus κ (Pa) and g(J) of the volumetric part U = κ/2 g², used in the mixed form.
 
-        Of D1 (J−1)² that is J−1. Of a part U that is stated, Taylor's theorem with the rest as an integral gives
-        U = κ/2 g² with κ = U''(1) and
+        For D1 (J−1)², g is J−1. For a stated U, Taylor's theorem with the remainder in integral form gives U = κ/2 g²
+        with κ = U''(1) and
 
             g = (J−1) √(2/κ ∫₀¹ (1−t) U''(1 + t(J−1)) dt),
 
-        which is smooth and keeps its digits at J = 1, and whose sign is that of J−1. The integral is one of `POINTS`
-        Gauss points, exact to 1e-12 for J from ½ to 2 where U has no other singularity than J = 0.
+        which is smooth, free of cancellation at J = 1, and has the sign of J−1. The integral uses `POINTS` Gauss
+        points, exact to 1e-12 for J from ½ to 2 if U has no singularity but J = 0.
 
         Parameters
         ----------

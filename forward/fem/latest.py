@@ -1,4 +1,4 @@
-"""What the equations of a body are set to: all that they remember of the last point."""
+"""The point at which the equations of a body are set: all their state that depends on the last point."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from forward.model import FloatArray
 
 @dataclass
 class Latest:
-    """The point that a body is set to, and the one whose stiffness is factorised.
+    """The point at which a body is set, and the one whose stiffness is factorised.
 
-    Whatever changes the body says so here, so that nothing that was set or computed at one point serves at another.
+    Every change of the body is recorded here, so that nothing set or computed at one point is used at another.
 
     Attributes
     ----------
     parameters
-        Parameters (d,) that are set; None if they have to be set anew.
+        Parameters (d,) that are set; None if they must be set again.
     solution
-        The solution whose parameters, load and state are set; None if they are those of no solution.
+        The solution whose parameters, load and state are set; None if there is no such solution.
     factorised
-        The solution that owns the factor at hand; None if it is that of no solution.
+        The solution to which the current factor belongs; None if there is no such solution.
     factorised_at
         State (U_local,) whose stiffness is factorised.
     rounding
-        What the forces of the body without loads are rounded to (N), once it is known.
+        Size of the rounding errors (N) in the forces of the body without loads, once known.
     """
 
     parameters: FloatArray | None = None
@@ -38,9 +38,9 @@ class Latest:
         self.solution = None
 
     def begin(self) -> None:
-        """Another point is solved for."""
+        """A solve at another point begins."""
         self.solution = self.factorised = None
 
     def forget_parameters(self) -> None:
-        """Fields were changed: set the parameters anew next time, whatever they are."""
+        """Fields have changed: the parameters must be set again next time, whatever they are."""
         self.parameters = self.solution = None

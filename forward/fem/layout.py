@@ -1,4 +1,4 @@
-"""The canonical order of nodes: sorted by place, so that fields look the same on any number of ranks.
+"""The canonical order of nodes: sorted by position, so that fields are the same on any number of ranks.
 
 A state (U,) in canonical order holds the displacements of the nodes, interleaved by component, and then, in the mixed
 form, the pressures of the vertices.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Layout:
-    """Where this rank's nodes and unknowns stand in the canonical order (by x, then y, then z).
+    """Positions of this rank's nodes and unknowns in the canonical order (by x, then y, then z).
 
     Parameters
     ----------
@@ -91,11 +91,11 @@ class Layout:
 
 
 def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the sorted places (N, 3) of all nodes of a space, and canonical numbers: by global number, and of ours."""
+    """Return sorted coordinates (N, 3) of all nodes of a space, and canonical numbers: by global number, and ours."""
     parts = comm.allgather(spaces.node_coordinates(space))
     everywhere = np.concatenate(parts)
-    # Coordinates that differ by rounding only must sort alike on every rank; the shift keeps nodes, which stand at
-    # simple fractions of the largest extent, off the ends of the intervals.
+    # Coordinates that differ by rounding only must sort the same way on every rank; the shift keeps nodes, which lie
+    # at simple fractions of the largest extent, away from the ends of the intervals.
     step = 1e-9 * np.ptp(everywhere, axis=0).max()
     keys = np.floor(everywhere / step + 1 / np.pi).astype(np.int64)
     order = np.lexsort(keys.T[::-1])
@@ -108,9 +108,9 @@ def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64
 def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
     """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, vertices in canonical order.
 
-    They are of trilinear hexahedra, whatever the cells of the body: of tetrahedra with these vertices, correlations
-    would depend on how the hexahedra are cut.
-    Each process that calls makes a mesh of its own: the numbers do not depend on how others share theirs.
+    They use trilinear hexahedra, whatever the cells of the body: with tetrahedra on these vertices, correlations would
+    depend on how the hexahedra are cut.
+    Each calling process makes its own mesh: the numbers do not depend on how others share theirs.
     """
     space, matrices = assembly.trilinear_elements(body)
     _, canonical, _ = sorted_by_place(space, space.mesh.comm)

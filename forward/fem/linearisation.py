@@ -1,4 +1,4 @@
-"""The linearised equations of a body: K = ∂F/∂u, what solves with it, and ∂F/∂ω."""
+"""The linearised equations of a body: K = ∂F/∂u, solvers for it, and ∂F/∂ω."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from forward.solvers.linear import LinearSolver
 
 
 class Linearisation(Forms):
-    """Stiffness and forces of the parameters, assembled at the state and the parameters that are set.
+    """Stiffness and derivatives of the forces, assembled at the current state and parameters.
 
     Vectors hold this rank's part (U_local,); rows of prescribed unknowns are those of the identity.
     """
@@ -36,7 +36,7 @@ class Linearisation(Forms):
         trial = ufl.TrialFunction(self.unknowns.whole)
         self._stiffness = self._bilinear(self.derivative(imbalance, trial))
         if beside is None:
-            assert self._solver  # so that memory is looked at before anything else is made
+            assert self._solver  # so that memory is checked before anything else is allocated
 
     @cached_property
     def _matrix(self) -> linear.StiffnessMatrix:
@@ -53,7 +53,7 @@ class Linearisation(Forms):
     def inverse_blocks(self) -> FloatArray | None:
         """Inverses (nodes_owned, 3, 3) of the stiffness of each node at the state that is set, without pressures.
 
-        None where one of all ranks is not positive. This costs an assembly, and no matrix.
+        None if one on any rank is not positive definite. This costs an assembly, but no matrix.
         """
         self.work.assemblies += 1
         found = self._nodal_blocks.inverted()
@@ -99,7 +99,7 @@ class Linearisation(Forms):
         return self.state()[: 3 * self.nodes_owned].reshape(-1, 3)
 
     def with_pressures(self, displacements: FloatArray) -> FloatArray:
-        """Extend this rank's part (3 nodes_owned,) of a vector by zeros for the pressures, where they are unknowns."""
+        """Extend this rank's part (3 nodes_owned,) of a vector by zeros for the pressures, if these are unknowns."""
         return np.append(displacements, np.zeros(self.size - len(displacements)))
 
     def dot(self, x: FloatArray, y: FloatArray) -> float:
@@ -129,7 +129,7 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_stiffness(self) -> Any:
-        """The symmetric part of the stiffness, compiled; the stiffness itself where it is symmetric."""
+        """The symmetric part of the stiffness, compiled; the stiffness itself if it is symmetric."""
         if self.symmetric:
             return self._stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
@@ -168,7 +168,7 @@ class Linearisation(Forms):
         self.latest.factorised_at = u
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Solve K x = right; rows of prescribed unknowns give their values."""
+        """Solve K x = right; rows of prescribed unknowns hold their values."""
         if self._moves or self._movers:
             known = right[self.fixed]
             if ranks.smallest(self.comm, -float(np.abs(known).max(initial=0.0))) < 0:
@@ -194,7 +194,7 @@ class Linearisation(Forms):
     def imbalance_by_vertices(self, w: FloatArray) -> FloatArray:
         """Virtual works F(u; φ_i w) (n_vertices,) of w (U_local,) times the hat function of each own vertex.
 
-        At the state that is set; they sum to wᵀF.
+        At the current state; they sum to wᵀF.
         """
         self.unknowns.give(self._along, w)
         self.work.residuals += 1
@@ -218,9 +218,9 @@ class Linearisation(Forms):
         return self._condensed(self._solver.negative_eigenvalues())
 
     def negative_eigenvalues(self, u: FloatArray) -> int | None:
-        """Factorise at u (U_local,); return the number of negative eigenvalues, of the symmetric part under pressures.
+        """Factorise at u (U_local,) and count negative eigenvalues, of the symmetric part if pressures act.
 
-        Those of the condensed stiffness: in the mixed form each pressure adds one, which does not count.
+        They are those of the condensed stiffness: the one of each pressure in the mixed form is not counted.
         """
         if self.symmetric:
             self.factorise(u)
@@ -278,7 +278,7 @@ class Linearisation(Forms):
         return right + self.field_right_sides(directions) if self.fields else right
 
     def field_right_sides(self, directions: FloatArray) -> FloatArray:
-        """Right-hand sides (k, U_local) of tangents along what directions (k, d) change of fields, at the state set."""
+        """Right-hand sides (k, U_local) of tangents along the fields' part of directions (k, d), at the state set."""
         right = np.zeros((len(directions), self.size))
         for direction in self._directions.values():
             direction.value = 0.0

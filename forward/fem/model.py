@@ -33,8 +33,8 @@ from forward.solvers.rotations import turn
 from forward.solvers.stability import NOT_SCREENED, Screened, draw
 from forward.solvers.system import Found, Residual
 
-FEW = 4  # derivatives up to which products with the stiffness are cheaper than a factor
-ITERATIONS = 20  # of these derivatives, before a factor is made after all
+FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
+ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
 
 
 class HyperelasticModel(OneByOne):
@@ -47,7 +47,7 @@ class HyperelasticModel(OneByOne):
     comm
         Communicator of the ranks that share it.
     parameters
-        Paths of the numbers that vary, in the order of the parameter vectors.
+        Paths of the random parameters, in the order of the parameter vectors.
 
     Raises
     ------
@@ -74,20 +74,21 @@ class HyperelasticModel(OneByOne):
 
     @cached_property
     def reference(self) -> ReferenceFactor:
-        """The factor of the last reference that was given."""
+        """The factor at the last reference given."""
         return ReferenceFactor(self.equations)
 
     @cached_property
     def enriched(self) -> Enriched:
-        """The body in elements of one degree more, which tell the error of its mesh; collective at first."""
+        """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
         return Enriched(self.equations, self.spec.enriched())
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
 
-        The factor of the guess's reference corrects its state. It is factorised when it is first given; the factor is
-        kept until another is. Iterations are corrections with that factor (Newton steps without a reference, or with
-        ``solver = "newton"``); derivatives after so many are those of the equations linearised at the state reached.
+        The state of the guess is corrected with the factor at its reference, which is computed when the reference is
+        first given and kept until another is. Iterations are corrections with that factor (Newton steps without a
+        reference, or with ``solver = "newton"``); if their number is limited, derivatives are those of the equations
+        linearised at the state reached.
 
         Raises
         ------
@@ -119,14 +120,14 @@ class HyperelasticModel(OneByOne):
         way = None if reference is None else _Way(self, reference, parameters, screen=screen)
         with equations.time_limit(self.spec.solver.solve_seconds):
             found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
-        # Where Newton had to take over, the reference is too far away for the derivatives too.
+        # If Newton's method had to take over, the reference is too far away for the derivatives too.
         solution = FiniteElementSolution(self, parameters, found, equations.work, way if found.corrected else None)
         if found.stability >= Stability.COUNTED and equations.symmetric:
             equations.latest.factorised = solution
         return solution
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
-        """Set parameters and state to those of a solution, if they are not."""
+        """Set parameters and state to those of a solution, unless they are already."""
         equations = self.equations
         if equations.latest.solution is not solution:
             equations.set_parameters(solution.parameters)
@@ -137,7 +138,7 @@ class HyperelasticModel(OneByOne):
         return equations
 
     def linearise(self, solution: FiniteElementSolution) -> Discretisation:
-        """Factorise the stiffness at a solution, if the factor at hand is another's."""
+        """Factorise the stiffness at a solution, unless the current factor is its own."""
         equations = self.visit(solution)
         if equations.latest.factorised is not solution:
             equations.factorise(solution.state)
@@ -154,11 +155,11 @@ class HyperelasticModel(OneByOne):
         return equations
 
     def has_factor(self, solution: FiniteElementSolution) -> bool:
-        """Whether the factor at hand is that of a solution."""
+        """Whether the current factor is that of a solution."""
         return self.equations.latest.factorised is solution
 
     def take_reference(self, reference: ReferenceSolution) -> ReferenceFactor:
-        """Return the factor of a reference; this may change parameters and state."""
+        """Return the factor at a reference; this may change parameters and state."""
         self.reference.prepare(reference)
         return self.reference
 
@@ -169,13 +170,13 @@ class _Way:
     Attributes
     ----------
     reference
-        Where it begins.
+        Its start.
     state
         Of the reference.
     rotation
         Rotations of the nodes from the reference to the last prediction, (3, 3, n_owned).
     draw
-        A number in [0, 1) that depends on the parameters asked for.
+        A number in [0, 1) that depends on the requested parameters.
     """
 
     def __init__(
@@ -206,8 +207,8 @@ class _Way:
 class FiniteElementSolution:
     """An equilibrium with its linearisation.
 
-    k derivatives cost one factorisation and k back-substitutions. Few derivatives of a solution that was found with a
-    reference are instead solved for with the factor of the reference, to the solver's `derivative_tolerance`.
+    k derivatives cost one factorisation and k back-substitutions. If the solution was found with a reference, a few
+    derivatives are computed with the factor at the reference instead, to the solver's `derivative_tolerance`.
     """
 
     def __init__(
@@ -258,7 +259,7 @@ class FiniteElementSolution:
     ) -> FloatArray:
         """Solve K x = b, or Kᵀ x = b, for rows b (k, U_local); collective.
 
-        Those of tangents belong to `directions` (k, d). By default the tolerance is that of derivatives.
+        For tangents, `directions` (k, d) are given. By default the tolerance is that of derivatives.
         """
         model = self._model
         near = self.reference is not None and not model.has_factor(self)
@@ -282,13 +283,13 @@ class FiniteElementSolution:
         transpose: bool,
         directions: FloatArray | None,
     ) -> FloatArray | None:
-        """Solve with the factor of the reference, turned as for its prediction; None if that is too far away."""
+        """Solve with the factor at the reference, rotated as for its prediction; None if that is too far away."""
         model = self._model
         factor = model.take_reference(reference)
         fixed = model.equations.fixed
         first = None
         if directions is not None and directions.shape[1] <= FEW:
-            # Turned along, the tangents at the reference are what a first back-substitution would give.
+            # Rotated with the body, the tangents at the reference are what a first back-substitution would give.
             first = turn(directions @ factor.slopes(), R)
             first[:, fixed] = 0
         equations = model.visit(self)
@@ -345,12 +346,12 @@ class FiniteElementSolution:
 
     @cached_property
     def enriched_state(self) -> EnrichedState:
-        """The state in elements of one degree more, as one linear solve from this state has it; collective."""
+        """The state in elements of one degree higher, by one linear solve from this state; collective."""
         self._model.visit(self)
         return self._model.enriched.state(self)
 
     def mesh_error(self) -> MeshError:
-        """Estimate the error that the mesh makes of outputs and state (`forward.fem.enriched`); collective.
+        """Estimate the error of the mesh in outputs and state (`forward.fem.enriched`); collective.
 
         Raises
         ------
@@ -363,7 +364,7 @@ class FiniteElementSolution:
         return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:
-        """Return what each of this rank's cells adds to the mesh error of outputs, by `weights` (m,); collective.
+        """Return contributions of this rank's cells to the mesh error of outputs, by `weights` (m,); collective.
 
         They are (n_cells,), or (k, n_cells) for k rows of weights, in DOLFINx's order, and not negative
         (`Enriched.indicators`).

@@ -1,6 +1,6 @@
-"""The factor of a reference state of a body, which corrects predictions and screens equilibria elsewhere.
+"""The factor at a reference state of a body, which corrects predictions and screens equilibria elsewhere.
 
-It is turned along with the body (`forward.solvers.rotations`).
+It is rotated with the body (`forward.solvers.rotations`).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from forward.solvers.linear import LinearSolver
 from forward.solvers.rotations import rotations, turn, turned
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
 
-STEP = 1e-2  # of the differences of stiffnesses, in standard deviations
-DIRECTIONS = 6  # in which parameters are changed for the screen: one after the other or, if there are more, at random
+STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
+DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
 
 
 class ReferenceFactor:
-    """The factor of a reference state of a body, as an approximate inverse of the stiffness at other states."""
+    """The factor at a reference state of a body, as an approximate inverse of the stiffness at other states."""
 
     def __init__(self, equations: Discretisation) -> None:
         self._equations = equations
@@ -33,7 +33,7 @@ class ReferenceFactor:
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
 
     def prepare(self, reference: ReferenceSolution) -> None:
-        """Factorise at a reference, if the factor at hand is another's; this changes parameters and state."""
+        """Factorise at a reference, unless the current factor is its own; this changes parameters and state."""
         if self._reference is not None and self._reference.same(reference):
             return
         self._reference = self._slopes = self._vectors = None
@@ -54,15 +54,15 @@ class ReferenceFactor:
         if self._slopes is None:
             assert self._reference is not None
             equations = self._set(self._reference)
-            kept, equations.work = equations.work, Work()  # the first solution is charged no more than the others
+            kept, equations.work = equations.work, Work()  # its cost is not counted for the first solution
             self._slopes = self._solver.solve(equations.right_sides_of_all())
             equations.work = kept
         return self._slopes
 
     def prepare_screen(self) -> bool:
-        """Make the vectors that show instabilities, if they are not there; this may change parameters and state.
+        """Compute the vectors that show instabilities, unless they exist; this may change parameters and state.
 
-        False where there are none: without spread of the parameters, or where the reference itself is not stable.
+        False if there are none: without spread of the parameters, or if the reference itself is unstable.
         """
         assert self._reference is not None
         reference, equations = self._reference, self._equations
@@ -75,7 +75,7 @@ class ReferenceFactor:
         if self._definite().negative_eigenvalues() != equations.unknowns.pressures:
             return False
         if self._vectors is None:
-            kept, equations.work = equations.work, Work()  # charged to none, as the factor
+            kept, equations.work = equations.work, Work()  # counted for no solution, as the factor
             random = np.random.default_rng(0)
             forces = equations.layout.scatter(random.standard_normal((BLOCK, equations.layout.size)))
             self._vectors = screening_vectors(
@@ -89,17 +89,17 @@ class ReferenceFactor:
         return True
 
     def _definite(self) -> LinearSolver:
-        """The factor of the symmetric part of the stiffness at the reference."""
+        """Solver for the symmetric part of the stiffness, factorised at the reference."""
         if self._equations.symmetric:
             return self._solver
         assert self._screening is not None
         return self._screening
 
     def _changes(self, reference: ReferenceSolution, random: np.random.Generator) -> Iterator[Rows]:
-        """Products with the changes of the stiffness for one standard deviation of the parameters, along tangents.
+        """Products with the change of the stiffness for one standard deviation of the parameters, along tangents.
 
-        They are differences of differences of forces: a product is two of them, where a stiffness is assembled in the
-        time of forty.
+        They are second differences of forces: a product takes two assemblies of forces; assembling a stiffness takes
+        as long as forty.
         """
         assert reference.spread is not None
         equations, d = self._equations, len(reference.parameters)
@@ -124,7 +124,7 @@ class ReferenceFactor:
             def multiply(
                 rows: FloatArray, ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = ends
             ) -> FloatArray:
-                # As the screen sees it: turned along with the body, so that its rotations are no change.
+                # As in the screen, rotated with the body, so that rotations do not count as a change.
                 total = np.zeros_like(rows)
                 for step, parameters, state, imbalance, R in ends:
                     along = turn(rows, R)
@@ -139,7 +139,7 @@ class ReferenceFactor:
             yield multiply
 
     def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
-        """Return what the screen says of a state u (U_local,), with its imbalance, turned by R from the reference."""
+        """Screen a state u (U_local,) with its imbalance, rotated by R from the reference."""
         assert self._vectors is not None
         equations, free = self._equations, self._equations.free_displacements
         vectors = turn(self._vectors, R)
@@ -159,7 +159,7 @@ class ReferenceFactor:
         return np.asarray(np.einsum("ikn,jkn->ijn", rotations(equations.gradients()), self._rotations))
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
-        """Return the approximate inverse at a state that is turned by R (3, 3, n_owned) from the reference."""
+        """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
         return self._inverse(self._solver, R, transpose=transpose)
 
     def _inverse(self, solver: LinearSolver, R: FloatArray, *, transpose: bool = False) -> Inverse:

@@ -1,7 +1,7 @@
-"""A specimen as a model: every load case has one of its own, and with it a factor of its own.
+"""A specimen as a model: every load case has its own model, and with it its own factor.
 
-Products with the derivatives of all cases, however they alternate, use the factors of one solution. What is observed of
-a case is Bu with a sparse B.
+Products with the derivatives of all cases, in any order, use the factors of one solution. The observations of a case
+are Bu with a sparse B.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from forward.specimen import Observed, Specimen
 
 
 class SpecimenModel(OneByOne):
-    """A specimen as a `ForwardModel`: its outputs are what is observed in all cases, its states those of all cases.
+    """A specimen as a `ForwardModel`: its outputs are the observations of all cases, its states those of all cases.
 
     Attributes
     ----------
     parameters, outputs
         Names.
     places
-        Where (n, 3) each output is observed (m, undeformed).
+        Points (n, 3) at which the outputs are observed (m, undeformed).
     axes
-        Its component (n,): 0, 1 or 2.
+        Their components (n,): 0, 1 or 2.
     cases
-        Which case (n,) it belongs to.
+        Their load cases (n,), by number.
     models
         The models of the cases.
     positions
-        Where the parameters of each case stand among all.
+        Indices of the parameters of each case among all.
     observations
         B (n, U_local) of each case, sparse.
     distances
-        How far (n,) the places lie outside the mesh (m), where the displacements of the nearest ones are observed.
+        Distances (n,) of the points from the mesh (m); outside it, the displacement of the nearest point is observed.
     """
 
     def __init__(self, spec: Specimen, comm: Any, parameters: tuple[str, ...]) -> None:
@@ -79,16 +79,16 @@ class SpecimenModel(OneByOne):
         self._observing(np.concatenate(places) if places else np.zeros((0, 3)), axes, cases, tuple(names))
 
     def observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int]) -> SpecimenModel:
-        """Return the same model with other outputs; collective. Both share meshes, forms and factors.
+        """Return the same model with other outputs, sharing meshes, forms and factors; collective.
 
         Parameters
         ----------
         places
-            Where (n, 3) displacements are observed, in the undeformed body (m).
+            Points (n, 3) at which displacements are observed, in the undeformed body (m).
         axes
             Their components (n,): 0, 1 or 2.
         cases
-            Their load cases (n,) by number, which do not fall.
+            Their load cases (n,) by number, in ascending order.
         """
         other = copy.copy(self)
         labels = [(self.spec.cases[case].name, AXES[axis]) for case, axis in zip(cases, axes, strict=True)]
@@ -110,7 +110,7 @@ class SpecimenModel(OneByOne):
 
     @property
     def enriched_observations(self) -> list[csr_matrix]:
-        """The B (n, U⁺_local) of each case in elements of one degree more; collective when first asked for."""
+        """The B (n, U⁺_local) of each case in elements of one degree higher; collective when first used."""
         if self._enriched_observations is None:
             self._enriched_observations = [
                 _interpolation(model.enriched.equations, self.places[self.cases == n], self.axes[self.cases == n])[0]
@@ -120,14 +120,14 @@ class SpecimenModel(OneByOne):
 
     @cached_property
     def vertices(self) -> Layout:
-        """The vertices of the mesh in the canonical order, and its cells; collective when first asked for."""
+        """The vertices of the mesh in the canonical order, and its cells; collective when first used."""
         equations = self.models[0].equations
         return Layout(spaces.scalar_space(equations.space.mesh, 1), equations.comm)
 
     def log_fields(self, points: FloatArray) -> FloatArray:
-        """Return ln of the random factor on the stiffness (n, N) at the vertices at parameters (n, d); collective.
+        """Return ln (n, N) of the random factor on the stiffness at the vertices at parameters (n, d); collective.
 
-        That of all random fields on it together; on every rank.
+        The factor is the product of all random fields; on every rank.
         """
         model = self.models[0]
         found = np.zeros((len(points), self.spec.body.vertex_count))
@@ -142,7 +142,7 @@ class SpecimenModel(OneByOne):
         Raises
         ------
         SolveError
-            With the case that has no answer.
+            With the name of the case that failed.
         """
         solutions = []
         guesses = self._guesses(guess or Guess())
@@ -171,7 +171,7 @@ class SpecimenModel(OneByOne):
         return np.split(rows, np.cumsum([model.equations.size for model in self.models])[:-1], axis=-1)
 
     def values(self, rows: FloatArray) -> list[FloatArray]:
-        """Split what is observed (…, n) into that of the cases."""
+        """Split observations (…, n) into those of the cases."""
         return np.split(rows, self._ends, axis=-1)
 
 
@@ -183,7 +183,7 @@ class SpecimenSpace:
         first = model.models[0].space
         self.coordinates, self.cells, self.regions = first.coordinates, first.cells, first.regions
         self.variance_kept = first.variance_kept
-        self.displacements = 0  # states of several cases are no displacement field
+        self.displacements = 0  # states of several cases are not one displacement field
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U), case after case, on the first rank."""
@@ -195,7 +195,7 @@ class SpecimenSpace:
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U)."""
         models = self._model.models
-        parts = np.split(rows, len(models), axis=1)  # the cases have as many unknowns
+        parts = np.split(rows, len(models), axis=1)  # all cases have equally many unknowns
         return np.concatenate([case.space.scatter(part) for case, part in zip(models, parts, strict=True)], axis=1)
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
@@ -218,13 +218,13 @@ class SpecimenSolution:
 
     @property
     def stability(self) -> Stability:
-        """What is known of the case of which least is known; an instability that was missed counts more."""
+        """That of the case of which least is known; an instability that was missed counts more."""
         known = [solution.stability for solution in self.solutions]
         return max(known) if Stability.MISSED in known else min(known)
 
     @property
     def work(self) -> Work:
-        """What the solutions of all cases have cost so far."""
+        """Cost of the solutions of all cases so far."""
         return _sum(solution.work for solution in self.solutions)
 
     def _observe(self, states: list[FloatArray], observations: list[csr_matrix]) -> FloatArray:
@@ -253,7 +253,7 @@ class SpecimenSolution:
         return gradients
 
     def mesh_error(self) -> MeshError:
-        """Estimate the error that the mesh makes of what is observed and of the states of all cases; collective.
+        """Estimate the error of the mesh in the observations and the states of all cases; collective.
 
         Raises
         ------
@@ -273,7 +273,7 @@ def _sum(works: Iterable[Work]) -> Work:
 
 
 def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
-    """Where (n, 3) displacements are observed; collective."""
+    """Points (n, 3) at which displacements are observed; collective."""
     if item.on is None:
         return np.array(item.at)
     equations, layout = model.equations, model.equations.layout
@@ -284,12 +284,12 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
 def _interpolation(
     equations: Discretisation, places: FloatArray, axes: NDArray[np.int64]
 ) -> tuple[csr_matrix, FloatArray]:
-    """Return B (n, U_local) of components (n,) at places (n, 3), and how far (n,) these lie outside; collective.
+    """Return B (n, U_local) of components (n,) at points (n, 3), and their distances (n,) from the mesh; collective.
 
     Raises
     ------
     ValueError
-        If a place is farther from the mesh than the mesh can be from the body.
+        If a point is farther from the mesh than the mesh can be from the body.
     """
     layout = equations.layout
     different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)

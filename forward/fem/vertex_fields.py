@@ -1,4 +1,4 @@
-"""Random fields on the mesh of a group of ranks: functions of forms that follow the parameters, and back."""
+"""Random fields on the mesh of a rank group: functions in forms that depend on the parameters, and their transpose."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from forward.model import FloatArray
 class VertexField:
     """The factor of a random field on a mesh.
 
-    Modes are split over the ranks of the group; a white noise is mapped by the first of them.
+    Modes are split over the ranks of the group; white noise is mapped by the first rank.
 
     Parameters
     ----------
     field, body
-        What is expanded.
+        The random field, and the body that it is on.
     msh, comm
         This rank's part of the mesh, and the ranks that share it.
     parameters
-        Names of all parameters, of which the field picks its own.
+        Names of all parameters; the field uses its own.
 
     Attributes
     ----------
     positions
-        Where (k,) its coefficients stand among the parameters.
+        Indices (k,) of its coefficients among the parameters.
     log
         Logarithm of the factor, as a variable of forms.
     direction
@@ -40,7 +40,7 @@ class VertexField:
     test
         Test function on the vertices.
     kept
-        Fraction of the variance that the coefficients make.
+        Fraction of the variance that the coefficients represent.
     """
 
     def __init__(self, field: RandomField, body: Body, msh: Any, comm: Any, parameters: tuple[str, ...]) -> None:
@@ -54,7 +54,7 @@ class VertexField:
         self._numbers = np.array([numbers[parameters[i]] for i in self.positions], dtype=np.int64)
         self._expansion: Expansion | None = (
             field.on(body) if comm.rank == 0 else None
-        )  # on the other ranks of modes too
+        )  # on the other ranks too, for modes
         offset, self.kept, modes = comm.bcast(
             None
             if self._expansion is None
@@ -67,7 +67,7 @@ class VertexField:
         self._offset = offset[self._vertices]
         self._modes = None if modes is None else np.ascontiguousarray(modes[self._vertices])
         if self._modes is not None:
-            self._expansion = None  # every rank keeps its part only
+            self._expansion = None  # every rank keeps only its part
         self._function = spaces.function(self._space)
         self.log = ufl.variable(self._function)
         self.direction = spaces.function(self._space)
@@ -92,7 +92,7 @@ class VertexField:
         _give(self.direction, self._values(direction))
 
     def vjp(self, slopes: FloatArray) -> FloatArray:
-        """Return derivatives (k,) by this field's parameters from this rank's part of those by the vertices."""
+        """Return derivatives (k,) by this field's parameters from this rank's part of those by vertex values."""
         if self._modes is not None:
             return ranks.total(self._comm, slopes @ self._modes)[self._numbers]
         parts = self._comm.gather((self._vertices, slopes))

@@ -247,8 +247,8 @@ Reading = Callable[[FloatArray, FloatArray, FloatArray, bool], tuple[FloatArray,
 def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]]) -> str | None:
     """Say why fibres do not fit a material and a mode, or None if they do.
 
-    Where a face is free, the material must be alike on both sides of each plane of the mode (reflections leave the
-    families of fibres as they are, up to their sign), and in the directions that are stretched alike.
+    If a face is free, the material must be symmetric about each plane of the mode (reflections leave the families of
+    fibres unchanged, up to sign), and the same in directions that are stretched equally.
     """
     if ("i4" in measures(energy)) != bool(fibres):
         return f"material '{energy}': {'expected fibres' if not fibres else 'has no fibres'}"
@@ -263,7 +263,7 @@ def unfit(energy: str, mode: Mode, fibres: Sequence[tuple[float, float, float]])
         changes.append(swap)
     if all(np.isclose(np.abs(families @ change @ families.T).max(axis=0), 1).all() for change in changes):
         return None
-    return f"fibres that a test '{mode}' would shear, or stretch unlike: expected them along axes, or a mirrored pair"
+    return f"fibres that a '{mode}' test would shear or stretch unequally: expected them along axes, or a mirrored pair"
 
 
 @cache
@@ -282,11 +282,11 @@ def reading(
     energy
         Kind of the material.
     names
-        The c constants θ; without those of the volume an energy that has them is read at J = 1.
+        The c constants θ; without those of the volumetric part, an energy that has one is evaluated at J = 1.
     fibres
         Unit vectors along the families of fibres.
     component, cauchy
-        Which stress, as of `MaterialTest`.
+        Which stress, as in `MaterialTest`.
     """
     kinematics = _MODES[mode]
     confined = kinematics.incompressible is None
@@ -297,12 +297,12 @@ def reading(
     share = {"P1": (1, 0), "P2": (0, 1), "P1-P2": (1, -1)}[component]
 
     def shares(x: FloatArray, z: FloatArray, y: FloatArray) -> tuple[Any, Any, Any]:
-        """What the nominal stresses along x and z are multiplied by, and the relative slope of both along y."""
+        """Factors on the nominal stresses along x and z, and the relative slope of both along y."""
         along, across = share[0] / kinematics.share, share[1]
         if not cauchy or confined:
             return along, across, 0.0
         J = 1.0 if kept else 1 + dilation_of(kinematics.stretches(np, x, z, y))
-        both = 2 if mode == "uniaxial" else 1  # faces that are free
+        both = 2 if mode == "uniaxial" else 1  # number of free directions
         return along * (1 + x) / J, across * (1 + z) / J, 0.0 if kept else -both / (1 + y)
 
     def balance(x: FloatArray, z: FloatArray, y: FloatArray, theta: FloatArray) -> tuple[Any, Any]:
@@ -328,7 +328,7 @@ def reading(
             W, by_m = energies.first(m, constants_)
             a, b, slope = shares(x, z, y)
             stress = a * _sum(by_m, by_x) + b * _sum(by_m, by_z)
-            # Beyond where an energy ends, its derivatives may be numbers.
+            # Beyond the limit of an energy, its derivatives may still be finite.
             stress = np.where(np.isfinite(np.broadcast_to(W, shape)), stress, np.nan)
             if not derivatives:
                 return stress, np.zeros((0, *shape))
@@ -392,14 +392,14 @@ def _of_measures(energy: Energy, names: tuple[str, ...], families: int) -> _Ener
 
 
 class _Paths(NamedTuple):
-    """Measures m of a mode, as functions of its stretches (x, z, y) less one."""
+    """Measures m of a mode, as functions of its stretches minus one (x, z, y)."""
 
     first: Callable[[Any, Any, Any], list[list[Any]]]  # m, and its derivatives by x, z and y
     second: Callable[[Any, Any, Any], list[list[Any]]]  # derivatives of that by y, by x, z and y
 
 
 def _joined(parts: Sequence[list[list[Any]]]) -> list[list[Any]]:
-    """Join the lists of several measures, each in its place."""
+    """Join the lists of several measures elementwise."""
     return [[one for found in same for one in found] for same in zip(*parts, strict=True)]
 
 
@@ -464,11 +464,11 @@ def _operators() -> SimpleNamespace:
 
 
 def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
-    """Solve ∂W/∂y = 0 by Newton's method in ln(1 + y), in steps of at most a factor of two; NaN where none settles."""
+    """Solve ∂W/∂y = 0 by Newton's method in ln(1 + y), in steps of at most a factor of two; NaN if that fails."""
     y = np.array(start)
     for _ in range(ITERATIONS):
         g, g_y = balance(y)
-        # At the minimum of W the slope of (1+y) g is (1+y)² g_y + (1+y) g; away from it |·| keeps the way downhill.
+        # At the minimum of W the slope of (1+y) g is (1+y)² g_y + (1+y) g; away from it |·| keeps the step downhill.
         curvature = np.abs((1 + y) ** 2 * g_y + (1 + y) * g)
         step = np.clip(-(1 + y) * g / curvature, -np.log(2), np.log(2))
         y = y + (1 + y) * np.expm1(step)

@@ -34,7 +34,7 @@ def plan(study: Study, rank_groups: int) -> list[str]:
         f"outputs     {', '.join(output.name for output in spec.outputs)}",
         f"solves      {up_to}{planned:,}{later}",
     ]
-    if spec.cost() is None:  # no one knows how long a solve takes
+    if spec.cost() is None:  # the time of a solve is unknown
         return lines
     if study.estimates:
         estimates = f"{study.estimates} estimates in elements of one degree more"

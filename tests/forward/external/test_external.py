@@ -153,7 +153,7 @@ def test_a_value_that_is_not_finite_is_no_answer():
         ("parallel.ranks_per_model=2", "parallel.ranks_per_model: a model of kind 'python' is not shared by ranks"),
         ("parameters.lod={kind='uniform', lower=0, upper=1}", "parameters: not a number of the model; did you mean"),
         ("model.function=beam", "model.function: expected MODULE.FUNCTION; given 'beam'"),
-        ("model.outputs=['a', 'a']", "model: 2 outputs are called 'a'"),
+        ("model.outputs=['a', 'a']", "model: 2 outputs have the name 'a'"),
         ("model.kind=pyton", "model.kind: unknown kind; did you mean 'python'?; given 'pyton'"),
     ],
 )
