@@ -21,6 +21,7 @@ from forward.model import FloatArray
 from uq.accuracy.doubts import doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
 from uq.estimators.indices import coefficient_moments
+from uq.estimators.moments import ESTIMATES
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -47,10 +48,15 @@ class Sketch(NamedTuple):
     outputs: FloatArray
 
 
+def _has(dataset: xr.Dataset, name: str, *dims: str) -> bool:
+    """Whether there is such a variable: methods from outside may give others, or none."""
+    return name in dataset and dataset[name].dims == dims
+
+
 def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch:
     """Draw the expansion of a study, or take its samples, or draw the tangents at the mean."""
     expanded = "multi_index" in dataset
-    if not expanded and "values" in dataset and dataset["values"].dims == ("sample", "output"):
+    if not expanded and _has(dataset, "values", "sample", "output") and _has(dataset, "points", "sample", "parameter"):
         ok = dataset["ok"].to_numpy()
         if ok.sum() >= ENOUGH:
             return Sketch(dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
@@ -167,9 +173,9 @@ def _of_outputs(
             nominal[i] = (one.way.functions(centre.point[None, :], centre.outputs[None, :]) @ one.coefficients)[0]
             derivatives[i] = one.way.slopes(centre.point, centre.outputs, centre.tangents) @ one.coefficients
     variables: Variables = {"nominal_mesh_error": (("output",), nominal)}
-    if "derivative" in dataset:
+    if _has(dataset, "derivative", "output", "parameter"):
         variables["derivative_mesh_error"] = (("output", "parameter"), derivatives)
-    if not {"mean", "mean_error", "std", "std_error"} <= set(dataset):  # other methods, from outside too
+    if not all(_has(dataset, name, "output") for name in ESTIMATES):
         return variables
     for estimated, first in (("mean", ""), ("std", "std_")):
         error, rest = nothing.copy(), nothing.copy()
@@ -184,7 +190,7 @@ def _of_outputs(
             f"{estimated}_corrected": (("output",), dataset[estimated].to_numpy() + error),
             f"{estimated}_corrected_error": (("output",), np.hypot(sampling, doubt)),
         }
-    if "quantiles" in dataset:
+    if _has(dataset, "quantiles", "quantile", "output"):
         probabilities = dataset["quantile"].to_numpy()
         moved = np.full((len(probabilities), len(effects)), np.nan)
         for i, one in enumerate(effects):
@@ -192,7 +198,7 @@ def _of_outputs(
                 exact = one.outputs + one.errors
                 moved[:, i] = np.quantile(exact, probabilities) - np.quantile(one.outputs, probabilities)
         variables["quantiles_mesh_error"] = (("quantile", "output"), moved)
-    if "sobol_first" in dataset and inputs.independent:
+    if all(_has(dataset, name, "output", "parameter") for name in INDICES) and inputs.independent:
         variables |= _indices(dataset, inputs, drawn, effects)
     return variables
 
@@ -237,12 +243,12 @@ def _of_fields(
     way = best([between(inputs, centre.output_slopes, found.points, found.outputs, i) for i in followed], fields)
     at_centre = way.functions(centre.point[None, :], centre.outputs[None, :])[0] @ way.weights
     variables: Variables = {"field_nominal_mesh_error": (by_node, (at_centre @ fields).reshape(-1, 3))}
-    if "field_mean" not in dataset:
+    if not _has(dataset, "field_mean", *by_node):
         return variables
     shares = way.functions(drawn.points, drawn.outputs) @ way.weights
     variables["field_mean_mesh_error"] = (by_node, (shares.mean(axis=0) @ fields).reshape(-1, 3))
     shared = _with_displacements(dataset, centre, drawn, shares)
-    if "field_std" in dataset and shared is not None:
+    if _has(dataset, "field_std", *by_node) and shared is not None:
         std = dataset["field_std"].to_numpy().ravel()
         more = (fields * (2 * shared + covariances(shares, shares) @ fields)).sum(axis=0)
         moved = np.sqrt(np.maximum(std**2 + more, 0.0)) - std

@@ -7,14 +7,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 from forward.external.derivatives import contradicted
-from forward.model import Stability
+from forward.model import Finding, SolveError, Stability
 from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
 from uq.findings import add
 from uq.inputs.sampling import random_points
-from uq.surrogates.linearisation import linearised
+from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
 from workflows.studies.findings_solves import measured
@@ -89,8 +91,15 @@ def _with_mesh_errors(
     from uq.accuracy.mesh_errors import estimate
 
     first = recorder.first
-    assert first is not None  # every method begins at the mean parameters
-    centre = linearised(inputs, evaluate, first)
+    if "output" not in found.coords or first is None:  # a method from outside
+        return found
+    at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()
+    try:
+        whole = at_mean and first.tangents is not None and first.fields.size > 0
+        centre = linearised(inputs, evaluate, first) if whole else linearise(inputs, evaluate)
+    except SolveError as error:
+        add(found, Finding("note", f"The error of the mesh is not estimated: {error}."))
+        return found
     count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
     estimates.append(errors.evaluations)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from forward.model import FunctionModel, FunctionSolution, MeshError, SolveError, Work
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
@@ -234,3 +235,24 @@ def test_designs_begin_at_the_mean_and_are_spread(count, d):
 
 def test_the_number_of_estimates_is_a_fifth_of_the_solves():
     assert [estimates_for(n) for n in (1, 50, 100, 200, 10_000)] == [3, 3, 5, 10, MOST]
+
+
+def test_results_of_other_shapes_are_left_alone():
+    """As methods from outside may give them."""
+    model = on_mesh(affine)
+    recorder = Recorder(SerialEvaluate(model))
+    centre = linearised(INPUTS, recorder, LocalSensitivity().run(INPUTS, recorder) and recorder.first)
+    found = estimate(INPUTS, SerialEvaluate(model), centre, FEWEST, 0, fields=True)
+    strange = xr.Dataset(
+        {
+            "mean": ("output", [1.0, 2.0]),  # without an error
+            "values": (("draw", "output"), np.zeros((5, 2))),
+            "quantiles": ("output", [0.0, 1.0]),
+            "sobol_first": ("parameter", [0.5, 0.5]),
+        },
+        coords={"output": ["u", "v"]},
+    )
+    after = with_mesh_errors(strange, INPUTS, centre, found, UNITS)
+    np.testing.assert_allclose(after["nominal_mesh_error"], affine(INPUTS.mean), rtol=1e-3)
+    assert "mesh_error" not in after
+    assert "quantiles_mesh_error" not in after

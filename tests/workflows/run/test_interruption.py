@@ -52,7 +52,10 @@ kind = "monte-carlo"
 samples = 100
 seed = 1
 """
-FACTORED = ("configs/beam-chaos.toml", "--set", "model.body.cells=[28,6,6]", "--set", 'model.body.cell="tetrahedron"')
+FACTORED = (
+    "configs/beam-chaos.toml",
+    *("--set", "model.body.cells=[28,6,6]", "--set", 'model.body.cell="tetrahedron"', "--set", "mesh_error=false"),
+)
 FEW = ("--set", "method.samples=4", "--set", "method.max_order=1")
 
 
