@@ -26,7 +26,7 @@ from uq.surrogates.linearisation import Linearisation
 
 DESIGNS = 64  # of which the one is taken whose points are spread best
 STREAM = 1 << 20  # of scrambles of the designs, beyond those of the methods
-PRODUCTS = 8  # parameters up to which errors may have terms of second order
+PRODUCTS, LINES = 8, 100  # parameters up to which errors may have terms of second order, and of first
 FALL = 0.1  # variance of coefficients of one order more, over those before
 CONSTANT = 1e6  # variance of the constant, over those of first order: any
 EXPECTED, BELIEF = (
@@ -50,8 +50,9 @@ def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatAr
         Of the study.
     """
     d = len(inputs.names)
-    ways = np.eye(d)
-    if count < d + 1:
+    if count > d:
+        ways = np.eye(d)
+    else:
         scaled = slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
         ways = np.linalg.svd(np.nan_to_num(scaled), full_matrices=False)[2][: count - 1]
     best, least = np.empty((0, d)), np.inf
@@ -197,7 +198,7 @@ def between(
     sizes = np.ones(n) if follows is None else outputs[:, follows]
     if not np.abs(sizes).min() > SMALL * np.abs(sizes).max():
         return None
-    order = 2 if d <= PRODUCTS else 1
+    order = 2 if d <= PRODUCTS else int(d <= LINES)
     basis = orthonormal(inputs, hyperbolic(d, order, 1.0))
     squares = np.nan_to_num(slopes) ** 2
     along = shares(squares, squares.sum(axis=1, keepdims=True)).mean(axis=0)
