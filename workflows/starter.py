@@ -42,6 +42,8 @@ outputs = [
     { name = "sag", kind = "max-displacement", component = "y" },
     { name = "energy", kind = "strain-energy" },
 ]
+# Refine the mesh first, until the errors that it makes of outputs are 1 % (body.cell = "tetrahedron"):
+# adapt = { tolerance = 0.01, outputs = ["sag"] }
 # solver = { tolerance = 1e-8 }  # or solver = "newton": the textbook, from zero with a new factor for every step
 
 [parameters]

@@ -63,11 +63,16 @@ class Cycle:
     seconds: float
 
     @property
-    def relative(self) -> FloatArray:
-        """Sizes (m,) of the errors over those of the corrected values; infinite where these are zero."""
+    def sizes(self) -> FloatArray:
+        """What the errors (m,) are relative to: the corrected outputs, or where these are smaller the errors."""
         errors = np.array(self.errors)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.abs(errors) / np.abs(np.array(self.values) + errors))
+        return np.asarray(np.maximum(np.abs(np.array(self.values) + errors), np.abs(errors)))
+
+    @property
+    def relative(self) -> FloatArray:
+        """Sizes (m,) of the errors over those of the outputs, at most 1; 0 where both are 0, as in symmetric bodies."""
+        errors, sizes = np.abs(self.errors), self.sizes
+        return np.divide(errors, sizes, out=np.where(np.isnan(errors), np.nan, 0.0), where=sizes > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,9 +228,10 @@ def _indicators(
     named = np.array(spec.adapt.named(spec))
     relative = cycle.relative[named]
     open_ones = relative > spec.adapt.tolerance
-    chosen = named[open_ones] if open_ones.any() else named
+    known = named[cycle.sizes[named] > 0]
+    chosen = named[open_ones] if open_ones.any() else known
     weights = np.zeros((len(chosen), len(cycle.values)))
-    weights[np.arange(len(chosen)), chosen] = 1 / np.abs(np.array(cycle.values) + np.array(cycle.errors))[chosen]
+    weights[np.arange(len(chosen)), chosen] = 1 / cycle.sizes[chosen]
     by_output = _by_cell(model, solution.mesh_indicators(weights).T)
     if by_output is None:
         return None

@@ -126,9 +126,8 @@ def _finding(study: Study, told: dict[str, Any]) -> Finding:
     left = []
     for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
         if name in named:
-            left.append(
-                f"{name} {100 * abs(error / (value + error)):.2g} %" if value + error else f"{name} {error:.2g}"
-            )
+            size = max(abs(value + error), abs(error))
+            left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
     text = (
         f"The mesh was refined at the mean of the parameters, from {first['unknowns']:,} to {last['unknowns']:,} "
         f"unknowns; the errors that it makes there are estimated to be {', '.join(left)}"

@@ -100,13 +100,15 @@ def test_a_study_is_a_few_lines_of_python():
 
 def test_what_a_starter_mentions_can_be_used():
     text = starter("monte-carlo")
-    blocks_ = ("inclusions", "displacements", "solver")
+    text = text.replace("hexahedron", "tetrahedron")
+    blocks_ = ("inclusions", "displacements", "solver", "adapt")
     used = "\n".join(
         line.removeprefix("# ") if line.startswith(tuple(f"# {block} = " for block in blocks_)) else line
         for line in text.splitlines()
     )
     model = parse(tomllib.loads(used)).model
     assert model.inclusions[0].label == "tumour"
+    assert model.adapt.outputs == ("sag",)
     assert {"inclusions.tumour.contrast", "inclusions.tumour.x", "displacements.x-max.x"} <= set(model.scalars)
 
 
