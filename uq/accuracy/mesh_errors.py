@@ -24,10 +24,10 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation
 
-DESIGNS = 64  # of which the one is taken whose points are spread best
+DESIGNS, FAR = 64, 1.8  # of which the best is taken, with points so far (standard deviations) from the mean
 STREAM = 1 << 20  # of scrambles of the designs, beyond those of the methods
 PRODUCTS, LINES = 8, 100  # parameters up to which errors may have terms of second order, and of first
-FALL = 0.1  # variance of coefficients of one order more, over those before
+FALL = 0.05  # variance of coefficients of one order more, over those before
 CONSTANT = 1e6  # variance of the constant, over those of first order: any
 EXPECTED, BELIEF = (
     0.3,
@@ -39,8 +39,9 @@ SMALL = 0.05  # of the largest output at the points: where it is smaller somewhe
 def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatArray:
     """Return points (count, d): the mean, and scrambled Sobol' points that are spread well.
 
-    Of some scrambles that one is taken whose first and second moments are closest to those of the distribution: of all
-    coordinates where points are more than these, or else of the directions in which the outputs vary most.
+    Of some scrambles that one is taken from which lines are known best, over the distribution: lines along all
+    coordinates where points are more than these, or else along the directions in which the outputs vary most. Points
+    farther out than `FAR` count against it: there terms that are left out are largest.
 
     Parameters
     ----------
@@ -59,9 +60,10 @@ def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatAr
     for scramble in range(DESIGNS):
         points = np.vstack([inputs.mean, inputs.points(sobol_points(seed, STREAM + scramble, 0, count - 1, d))])
         along = np.column_stack([np.ones(count), inputs.coordinates.of(points) @ ways.T])
-        unlike = float(np.linalg.norm(along.T @ along / count - np.eye(along.shape[1])))
-        if unlike < least:
-            best, least = points, unlike
+        known = np.linalg.inv(along.T @ along + FALL * np.eye(along.shape[1]))
+        score = float(np.trace(known)) + count * float(np.maximum(np.abs(along) - FAR, 0.0).max())
+        if score < least:
+            best, least = points, score
     return best
 
 

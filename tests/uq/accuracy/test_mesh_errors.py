@@ -232,6 +232,8 @@ def test_designs_begin_at_the_mean_and_are_spread(count, d):
         else inputs.coordinates.of(points)[:, 0]
     )
     assert 0.5 < t.std() < 1.6
+    if d == 2:  # no line of points, from which one of two slopes would not be known
+        assert np.linalg.svd(inputs.coordinates.of(points))[1][1] > 0.9
 
 
 def test_the_number_of_estimates_is_a_fifth_of_the_solves():
