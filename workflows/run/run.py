@@ -34,6 +34,7 @@ from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress
 from workflows.run.summary import closing_words, summarised
 from workflows.run.version import version
+from workflows.studies.adapted_mesh import FILES as REFINED
 from workflows.studies.findings_solves import findings_of_solves
 from workflows.studies.job import Job
 
@@ -118,6 +119,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
+    checkpoint = None
     try:
         study = study.prepared(ensemble, directory, say)
         progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)
@@ -128,9 +130,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         dataset = job.run(ensemble, checkpoint, progress, study.parallel.blocks)
     except BaseException as error:
         if world.rank == 0:
-            if isinstance(error, SolveError) and not checkpoint.answers:
-                checkpoint.clear()
-            _withdraw(directory)
+            _withdraw(directory, error, checkpoint)
         raise
     if dataset is None:
         return DONE
@@ -295,8 +295,16 @@ def _note(text: str) -> None:
     sys.stderr.flush()
 
 
-def _withdraw(directory: Path) -> None:
-    """Remove what `_prepare` has made, if nothing else is there, so that the corrected study can use the directory."""
+def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint | None) -> None:
+    """Remove what `_prepare` has made, if nothing else is there, so that the corrected study can use the directory.
+
+    Where no solve has an answer, nothing of them is kept, nor a mesh that was refined.
+    """
+    if isinstance(error, SolveError) and (checkpoint is None or not checkpoint.answers):
+        if checkpoint is not None:
+            checkpoint.clear()
+        for name in REFINED:
+            (directory / name).unlink(missing_ok=True)
     made = ("study.toml", own_code.FILE)
     if {path.name for path in directory.iterdir()} <= set(made):
         for name in made:

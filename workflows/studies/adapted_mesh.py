@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.sampling import Study
 
-MESH, HISTORY = "mesh.npz", "mesh.json"
+FILES = MESH, HISTORY = "mesh.npz", "mesh.json"
 
 
 def on_adapted_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:

@@ -150,6 +150,17 @@ def test_a_limit_that_is_reached_is_a_warning(study):
     assert "above model.adapt.tolerance = 0.2: the next mesh would have" in finding["text"]
 
 
+@pytest.mark.parametrize("ranks", [None, 2])
+def test_a_body_without_an_answer_leaves_no_folder(study, ranks):
+    directory = study.parent / f"failed {ranks}"
+    never = ("--set", "model.solver.solve_seconds=1e-9")
+    done = run(ranks, TISSUQ, "run", study, "--out", directory, "--no-report", *never)
+    assert done.returncode == 1
+    assert "the solve took longer than solve_seconds" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not directory.exists()
+
+
 def test_boxes_and_finer_meshes_of_what_was_refined(study):
     directory = study.parent / "box"
     body = 'model.body={size=[1.0, 0.7, 0.25], cells=[2, 1, 1], cell="tetrahedron", degree=1}'
