@@ -9,7 +9,7 @@ The module is longer than others because the whole contract, most of it document
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from itertools import repeat
 from typing import Literal, NamedTuple, Protocol
@@ -155,6 +155,25 @@ class Guess:
 
 
 @dataclass(frozen=True, eq=False)
+class Saturation:
+    """What part of the error of a mesh an estimate sees, found once at one solution for others of the same model.
+
+    Attributes
+    ----------
+    outputs
+        What the estimated errors of the outputs (m,) have to be multiplied by; NaN where there is no estimate.
+    state
+        The same of the state.
+    energy
+        The same of the energy of the difference.
+    """
+
+    outputs: FloatArray
+    state: float
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
 class MeshError:
     """What error its mesh is estimated to make of a solution: the exact minus the discrete value, so with a sign.
 
@@ -174,6 +193,8 @@ class MeshError:
         where none is.
     work
         What the estimate has cost.
+    seen
+        Errors of the outputs (m,) as elements of one degree more see them, without calibration.
     """
 
     outputs: FloatArray
@@ -181,6 +202,17 @@ class MeshError:
     energy: float
     relative: float
     work: Work
+    seen: FloatArray
+
+    def calibrated(self, saturation: Saturation) -> MeshError:
+        """Return the estimate of the whole error, with what elements of one degree more do not see."""
+        return replace(
+            self,
+            outputs=saturation.outputs * self.seen,
+            state=saturation.state * self.state,
+            energy=saturation.energy * self.energy,
+            relative=float(np.sqrt(saturation.energy)) * self.relative,
+        )
 
 
 class Solution(Protocol):
@@ -229,6 +261,17 @@ class Solution(Protocol):
 
     def mesh_error(self) -> MeshError | None:
         """Estimate the error that the mesh makes of outputs and state; None for a model without a mesh; collective.
+
+        Raises
+        ------
+        SolveError
+            If there is no estimate at this solution.
+        """
+
+    def saturation(self) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh, once for all solutions near this one; collective.
+
+        None for a model without a mesh, or where this would cost too much.
 
         Raises
         ------
@@ -467,6 +510,10 @@ class FunctionSolution:
         return np.empty((*np.shape(direction)[:-1], 0))
 
     def mesh_error(self) -> None:
+        """No mesh."""
+        return
+
+    def saturation(self) -> None:
         """No mesh."""
         return
 

@@ -25,9 +25,11 @@ ROW = {
     ("hexahedron", 1): 81.0,
     ("hexahedron", 2): 192.0,
     ("hexahedron", 3): 380.0,
+    ("hexahedron", 4): 700.0,
     ("tetrahedron", 1): 45.0,
     ("tetrahedron", 2): 84.0,
     ("tetrahedron", 3): 140.0,
+    ("tetrahedron", 4): 220.0,
 }
 SMALLEST = 3.0  # nodes across a part of the lattice that is not cut further
 BYTES_PER_ENTRY = 18.0  # of the working memory of a factorisation, including room for pivoting
@@ -41,19 +43,23 @@ ASSEMBLY = {
     ("hexahedron", 1): 1.4e-5,
     ("hexahedron", 2): 2.4e-4,
     ("hexahedron", 3): 1.7e-3,
+    ("hexahedron", 4): 1.1e-2,
     ("tetrahedron", 1): 2.9e-6,
     ("tetrahedron", 2): 2.3e-5,
     ("tetrahedron", 3): 1.1e-4,
+    ("tetrahedron", 4): 5e-4,
 }
 RESIDUAL = {
     ("hexahedron", 1): 1.2e-6,
     ("hexahedron", 2): 5e-6,
     ("hexahedron", 3): 1.3e-5,
+    ("hexahedron", 4): 3.5e-5,
     ("tetrahedron", 1): 2e-7,
     ("tetrahedron", 2): 8e-7,
     ("tetrahedron", 3): 2e-6,
+    ("tetrahedron", 4): 5e-6,
 }
-HIGHEST = 3  # degree of these; of higher ones they are taken
+HIGHEST = 4  # degree of these; of higher ones they are taken
 OF_PRESSURES = 1.25  # of an assembly with pressures over one without
 PER_ENTRY, PER_OPERATION = 1.6e-8, 4.4e-11  # of a factorisation
 PER_NONZERO = 6e-8  # of the matrix and the analysis before the first factorisation

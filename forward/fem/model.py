@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from forward.fem.cost import MOST_BYTES, estimate
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
+from forward.fem.saturation import factors
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
 from forward.model import (
@@ -23,6 +25,7 @@ from forward.model import (
     MeshError,
     OneByOne,
     ReferenceSolution,
+    Saturation,
     SolveError,
     Stability,
     Work,
@@ -81,6 +84,13 @@ class HyperelasticModel(OneByOne):
     def enriched(self) -> Enriched:
         """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
         return Enriched(self.equations, self.spec.enriched())
+
+    @cached_property
+    def enriched_twice(self) -> Enriched | None:
+        """The same in elements of two degrees more, which calibrate that; None where they take too much memory."""
+        spec = self.spec.enriched().enriched()
+        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        return Enriched(self.equations, spec) if cost.bytes <= MOST_BYTES else None
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -361,7 +371,45 @@ class FiniteElementSolution:
         found, enriched = self.enriched_state, self._model.enriched
         enriched.visit(self)
         errors = enriched.values(found.state) - self.outputs
-        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work)
+        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work, errors)
+
+    def saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
+        """Find the state in elements of two degrees more too, and the factors of state and energy; collective.
+
+        None where that takes too much memory.
+        """
+        model = self._model
+        model.visit(self)
+        twice = model.enriched_twice
+        if twice is None:
+            return None
+        once, found = self.enriched_state, twice.state(self)
+        n = 3 * model.equations.nodes_owned
+        seen, more = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
+        products = model.equations.total(np.array([seen @ seen, seen @ more]))
+        degree = model.spec.body.degree
+        (of_state,) = factors(products[0], products[1], degree)
+        (of_energy,) = factors(once.energy, found.energy, degree)
+        return twice, found, float(of_state), float(of_energy)
+
+    def saturation(self) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh by elements of two degrees more (`forward.fem.saturation`).
+
+        Collective; None where this takes too much memory.
+
+        Raises
+        ------
+        SolveError
+            If a stiffness in an enriched space is singular.
+        """
+        saturated = self.saturated()
+        if saturated is None:
+            return None
+        twice, found, of_state, of_energy = saturated
+        seen = self.mesh_error().seen
+        twice.visit(self)
+        more = twice.values(found.state) - self.outputs
+        return Saturation(factors(seen, more, self._model.spec.body.degree), of_state, of_energy)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:
         """Return contributions of this rank's cells to the mesh error of outputs, by `weights` (m,); collective.

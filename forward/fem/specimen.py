@@ -17,13 +17,26 @@ from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import AXES
 from forward.fem.dolfinx import spaces
-from forward.fem.enriched import relative
+from forward.fem.enriched import Enriched, relative
 from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
+from forward.fem.saturation import factors
 from forward.fem.space import BodySpace
-from forward.model import FloatArray, Guess, MeshError, OneByOne, ReferenceSolution, SolveError, Stability, Work
+from forward.model import (
+    FloatArray,
+    Guess,
+    MeshError,
+    OneByOne,
+    ReferenceSolution,
+    Saturation,
+    SolveError,
+    Stability,
+    Work,
+)
 from forward.specimen import Observed, Specimen
+
+SMALL = 0.05  # error of a datum, over the largest, below which it has no factor of its own
 
 
 class SpecimenModel(OneByOne):
@@ -105,18 +118,18 @@ class SpecimenModel(OneByOne):
             for number, model in zip(numbers, self.models, strict=True)
         ]
         self.observations: list[csr_matrix] = [matrix for matrix, _ in found]
-        self._enriched_observations: list[csr_matrix] | None = None
+        self._enriched_observations: dict[int, list[csr_matrix]] = {}
         self.distances = np.concatenate([distances for _, distances in found])
 
-    @property
-    def enriched_observations(self) -> list[csr_matrix]:
-        """The B (n, U⁺_local) of each case in elements of one degree higher; collective when first used."""
-        if self._enriched_observations is None:
-            self._enriched_observations = [
-                _interpolation(model.enriched.equations, self.places[self.cases == n], self.axes[self.cases == n])[0]
-                for n, model in enumerate(self.models)
+    def enriched_observations(self, bodies: Sequence[Enriched]) -> list[csr_matrix]:
+        """Return the B (n, U⁺_local) of each case in elements of a higher degree; collective."""
+        degree = bodies[0].equations.spec.body.degree
+        if degree not in self._enriched_observations:
+            self._enriched_observations[degree] = [
+                _interpolation(body.equations, self.places[self.cases == n], self.axes[self.cases == n])[0]
+                for n, body in enumerate(bodies)
             ]
-        return self._enriched_observations
+        return self._enriched_observations[degree]
 
     @cached_property
     def vertices(self) -> Layout:
@@ -261,11 +274,34 @@ class SpecimenSolution:
             If the stiffness in the enriched space is singular.
         """
         model, found = self._model, [solution.enriched_state for solution in self.solutions]
-        outputs = self._observe([one.state for one in found], model.enriched_observations) - self.outputs
+        observations = model.enriched_observations([case.enriched for case in model.models])
+        outputs = self._observe([one.state for one in found], observations) - self.outputs
         parts = zip(model.models, found, strict=True)
         state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
-        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found))
+        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found), outputs)
+
+    def saturation(self) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh by elements of two degrees more; collective.
+
+        Data that the mesh hardly changes have the factor of the states. None where this takes too much memory.
+
+        Raises
+        ------
+        SolveError
+            If a stiffness in an enriched space is singular.
+        """
+        model, found = self._model, [solution.saturated() for solution in self.solutions]
+        known = [one for one in found if one is not None]
+        if len(known) < len(found):
+            return None
+        observations = model.enriched_observations([twice for twice, *_ in known])
+        more = self._observe([one.state for _, one, _, _ in known], observations) - self.outputs
+        seen, degree = self.mesh_error().seen, model.spec.body.degree
+        of_states = float(np.mean([factor for _, _, factor, _ in known]))
+        small = np.abs(seen) < SMALL * np.abs(seen).max(initial=0.0)
+        outputs = np.where(small, of_states, factors(seen, more, degree, of_states))
+        return Saturation(outputs, of_states, float(np.mean([factor for *_, factor in known])))
 
 
 def _sum(works: Iterable[Work]) -> Work:

@@ -6,7 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from forward.model import FloatArray, ForwardModel, Guess, MeshError, NodalSpace, OneByOne, Solution, Stability, Work
+from forward.model import (
+    FloatArray,
+    ForwardModel,
+    Guess,
+    MeshError,
+    NodalSpace,
+    OneByOne,
+    Saturation,
+    Solution,
+    Stability,
+    Work,
+)
 
 
 @dataclass(frozen=True)
@@ -108,4 +119,11 @@ class MeasuredSolution:
     def mesh_error(self) -> MeshError | None:
         """Estimate the error that the mesh makes; None without a mesh."""
         found = self.solution.mesh_error()
+        if found is None:
+            return None
+        return replace(found, outputs=found.outputs[self.which], seen=found.seen[self.which])
+
+    def saturation(self) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh; None without a mesh."""
+        found = self.solution.saturation()
         return None if found is None else replace(found, outputs=found.outputs[self.which])

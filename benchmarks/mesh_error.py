@@ -1,0 +1,303 @@
+"""The error of the mesh: what is claimed over what it is, in nine problems; and what an estimate costs.
+
+References are cubic elements on finer meshes, thinner towards edges that are held. Curved bodies are the same polyhedra
+on both meshes: what a coarse mesh cuts off is no error here.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks.beams import beam
+from forward.hyperelastic import Hyperelastic
+from forward.model import FloatArray
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.surrogates.linearisation import linearise
+from workflows.config.study import load
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+SOLVER = {"tolerance": 1e-10}
+SAMPLES = 8
+SIZES = (((20, 4, 4), "tetrahedron"), ((12, 3, 6), "hexahedron"), ((28, 6, 6), "tetrahedron"))
+CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)])[[0, 1, 3, 2, 4, 5, 7, 6]]  # VTK's order
+FACES = ((0, 3, 7, 4), (1, 2, 6, 5), (0, 1, 5, 4), (3, 2, 6, 7), (0, 1, 2, 3), (4, 5, 6, 7))  # x-min, x-max, y-min, …
+
+
+Map = Callable[[FloatArray], FloatArray]
+
+
+class Case(NamedTuple):
+    """A problem on a coarse mesh, and on the one that is its reference."""
+
+    name: str
+    coarse: Hyperelastic
+    fine: Hyperelastic
+
+
+def at(name: str, place: tuple[float, float, float], component: str) -> dict[str, Any]:
+    """An output: a displacement."""
+    return {"name": name, "kind": "displacement", "at": place, "component": component}
+
+
+ENERGY = {"name": "energy", "kind": "strain-energy"}
+VOLUME = {"name": "volume", "kind": "volume-change"}
+SOFT = {"kind": "neo-hookean", "C1": 1e4, "D1": 2e4}
+
+
+def boxed(name: str, blocks: dict[str, Any], times: float, held: tuple[str, ...], grading: float = 6.0) -> Case:
+    """A body with a mesh of its own, and one that is graded towards what is held."""
+    coarse = Hyperelastic.model_validate({"solver": SOLVER} | blocks)
+    finer = coarse.model_copy(update={"body": coarse.body.finer(times, held, grading, 2.0)})
+    return Case(name, coarse, finer.enriched())
+
+
+def beams() -> Case:
+    """The published beam at its mean parameters."""
+    spec = beam((12, 2, 4)).model
+    outputs = (
+        {"name": "uy", "kind": "max-displacement", "component": "y"},
+        at("middle", (0.14, 0.01, 0.04), "y"),
+        ENERGY,
+    )
+    return boxed("beam", spec.model_dump() | {"outputs": outputs}, 1.5, ("x-min",))
+
+
+def cook(name: str, changes: dict[str, Any]) -> Case:
+    """Cook's membrane of one layer."""
+    spec = load(CONFIGS / "cook.toml").model
+    outputs = (at("rise", (0.048, 0.060, 0.0), "y"), ENERGY)
+    body = spec.body.model_dump() | {"cells": (4, 4, 1)}
+    return boxed(name, spec.model_dump() | {"outputs": outputs, "body": body} | changes, 3, ("x-min",), 4.0)
+
+
+def block() -> Case:
+    """A block between two plates that hold it, pressed by a fifth."""
+    blocks = {
+        "body": {"size": (1.0, 1.0, 0.6), "cells": (4, 4, 3)},
+        "material": SOFT,
+        "clamp": ("z-min",),
+        "displacements": ({"on": "z-max", "x": 0.0, "y": 0.0, "z": -0.12},),
+        "outputs": (
+            {"name": "force", "kind": "reaction", "on": "z-max", "component": "z"},
+            at("bulge", (1.0, 0.5, 0.3), "x"),
+            ENERGY,
+        ),
+    }
+    return boxed("pressed block", blocks, 1.5, ("z-min", "z-max"), 4.0)
+
+
+def ball() -> Case:
+    """A cube in shear, with a ball inside that is ten times as stiff."""
+    blocks = {
+        "body": {"size": (1.0, 1.0, 1.0), "cells": (4, 4, 4)},
+        "material": SOFT,
+        "inclusions": (
+            {"kind": "sphere", "x": 0.5, "y": 0.5, "z": 0.5, "radius": 0.25, "width": 0.25, "contrast": 10.0},
+        ),
+        "clamp": ("z-min",),
+        "loads": ({"kind": "traction", "on": "z-max", "direction": (1.0, 0.0, 0.0), "size": 3e3},),
+        "outputs": (
+            {"name": "shear", "kind": "mean-displacement", "on": "z-max", "component": "x"},
+            at("corner", (1.0, 1.0, 1.0), "z"),
+            ENERGY,
+        ),
+    }
+    return boxed("cube with a stiff ball", blocks, 1.75, ("z-min",), 4.0)
+
+
+def organ() -> Case:
+    """The organ of the shipped study without its random field, with a tumour of another stiffness."""
+    spec = load(CONFIGS / "organ.toml").model
+    changes = {"fields": (), "outputs": (*(output.model_dump() for output in spec.outputs), ENERGY), "solver": SOLVER}
+    coarse = Hyperelastic.model_validate(spec.model_dump() | changes)
+    return Case("organ", coarse, coarse.refined(1))
+
+
+def meshed(
+    folder: str, name: str, shape: Map, cells: tuple[int, int, int], blocks: dict[str, Any],
+    kept: Callable[[FloatArray], Any] | None = None, times: int = 3,
+) -> Case:  # fmt: skip
+    """A body from a file: the image of cells of the unit cube whose middle is kept; refined, the same polyhedron."""
+    import meshio
+
+    def write(parts: int) -> str:
+        points, corners, facets = [], [], {}
+        numbers: dict[tuple[float, ...], int] = {}
+
+        def number(x: FloatArray) -> int:
+            key = tuple(np.round(x, 9) + 0.0)
+            if key not in numbers:
+                numbers[key] = len(points)
+                points.append(x)
+            return numbers[key]
+
+        for cell in np.ndindex(*cells):
+            local = (np.array(cell) + CUBE) / cells
+            if kept is not None and not kept(local.mean(axis=0)):
+                continue
+            images = shape(local)
+            for part in np.ndindex(parts, parts, parts):
+                s = (np.array(part) + CUBE) / parts
+                weights = np.array([np.prod(np.where(CUBE == 1, x, 1 - x), axis=1) for x in s])
+                here = [number(x) for x in weights @ images]
+                corners.append(here)
+                for axis in range(3):
+                    for end in (0, 1):
+                        outer = part[axis] == end * (parts - 1) and cell[axis] == end * (cells[axis] - 1)
+                        if outer:
+                            facets.setdefault(2 * axis + end, []).append([here[k] for k in FACES[2 * axis + end]])
+        quads = [quad for numbered in facets.values() for quad in numbered]
+        tags = [10 + number for number, found in facets.items() for _ in found]
+        names = {f"{'xyz'[k // 2]}-{('min', 'max')[k % 2]}": np.array([10 + k, 2]) for k in facets}
+        data = [np.ones(len(corners), dtype=np.int32), np.array(tags, dtype=np.int32)]
+        mesh = meshio.Mesh(
+            np.array(points),
+            [("hexahedron", np.array(corners)), ("quad", np.array(quads))],
+            cell_data={"gmsh:physical": data, "gmsh:geometrical": data},
+            field_data=names | {"all": np.array([1, 3])},
+        )
+        path = f"{folder}/{name.replace(' ', '-')}-{parts}.msh"
+        meshio.write(path, mesh, file_format="gmsh22", binary=True)
+        return path
+
+    coarse, fine = (
+        Hyperelastic.model_validate({"solver": SOLVER} | blocks | {"body": {"kind": "mesh", "file": write(parts)}})
+        for parts in (1, times)
+    )
+    return Case(name, coarse, fine.enriched())
+
+
+def corner(folder: str) -> Case:
+    """An L of three squares, clamped at one end, pulled at the other."""
+    blocks = {
+        "material": SOFT,
+        "clamp": ("y-max",),
+        "displacements": ({"on": "z-min", "z": 0.0}, {"on": "z-max", "z": 0.0}),
+        "loads": ({"kind": "traction", "on": "x-max", "direction": (0.0, -1.0, 0.0), "size": 500.0},),
+        "outputs": (at("tip", (2.0, 0.0, 0.0), "y"), at("elbow", (0.0, 0.0, 0.0), "x"), ENERGY),
+    }
+    return meshed(
+        folder, "re-entrant corner", lambda x: x * [2.0, 2.0, 0.25], (4, 4, 1), blocks,
+        lambda x: x[0] < 0.5 or x[1] < 0.5, 4,
+    )  # fmt: skip
+
+
+def hole(folder: str) -> Case:
+    """A quarter of a square plate with a round hole, pulled along x."""
+
+    def shape(x: FloatArray) -> FloatArray:
+        angle = math.pi / 2 * x[:, 1]
+        square = np.minimum(1 / np.maximum(np.cos(angle), 1e-12), 1 / np.maximum(np.sin(angle), 1e-12))
+        radius = 0.3 + (square - 0.3) * x[:, 0] ** 1.3
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.2 * x[:, 2]])
+
+    blocks = {
+        "material": SOFT,
+        "displacements": ({"on": "y-min", "y": 0.0}, {"on": "y-max", "x": 0.0}, {"on": "z-min", "z": 0.0}),
+        "loads": ({"kind": "pressure", "on": "x-max", "size": -2e3},),
+        "outputs": (at("hole", (0.3, 0.0, 0.0), "x"), at("top", (0.0, 0.3, 0.0), "y"), ENERGY),
+    }
+    return meshed(folder, "plate with a hole", shape, (3, 4, 1), blocks, times=3)
+
+
+def tube(folder: str) -> Case:
+    """A quarter of a tube with fibres along it under pressure inside, clamped at one end."""
+
+    def shape(x: FloatArray) -> FloatArray:
+        radius, angle = 0.7 + 0.3 * x[:, 0], math.pi / 2 * x[:, 1]
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 2 * x[:, 2]])
+
+    blocks = {
+        "material": {
+            "kind": "holzapfel-gasser-ogden", "c": 1e4, "k1": 5e3, "k2": 0.8, "D1": 2e5,
+            "fibres": ((0.0, 0.0, 1.0),),
+        },
+        "clamp": ("z-min",),
+        "displacements": ({"on": "y-min", "y": 0.0}, {"on": "y-max", "x": 0.0}),
+        "loads": ({"kind": "pressure", "on": "x-min", "size": 2e3},),
+        "outputs": (at("widening", (1.0, 0.0, 1.0), "x"), at("end", (0.7, 0.0, 2.0), "x"), VOLUME, ENERGY),
+    }  # fmt: skip
+    return meshed(folder, "HGO tube", shape, (1, 3, 4), blocks, times=3)
+
+
+def cases(folder: str) -> Iterator[Callable[[], Case]]:
+    """All nine problems."""
+    yield beams
+    yield lambda: cook("Cook, compressible", {"material": {"kind": "neo-hookean", "C1": 40e6, "D1": 80e6}})
+    yield lambda: cook("Cook, nearly incompressible", {})
+    yield lambda: corner(folder)
+    yield lambda: hole(folder)
+    yield ball
+    yield block
+    yield organ
+    yield lambda: tube(folder)
+
+
+def main(only: list[str] | None = None) -> None:
+    """Print effectivities, and costs."""
+    print("| problem | unknowns | output | value | error (%) | seen over true | calibrated over true | error left |")
+    print("|---|---|---|---|---|---|---|---|")
+    found: list[float] = []
+    with TemporaryDirectory() as folder:
+        for make in cases(folder):
+            case = make()
+            if not only or any(word in case.name for word in only):
+                found += effectivities(case)
+    within = [np.mean([low <= one <= high for one in found]) for low, high in ((0.8, 1.25), (0.6, 1.6))]
+    print(f"\n{len(found)} outputs: {within[0]:.0%} within 0.8 and 1.25, {within[1]:.0%} within 0.6 and 1.6\n")
+    if not only:
+        costs()
+
+
+def effectivities(case: Case) -> list[float]:
+    """Print a row for each output of a problem; return what is claimed, calibrated, over what is true."""
+    solution = case.coarse.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+    error, saturation = solution.mesh_error(), solution.saturation()
+    assert saturation is not None
+    calibrated = error.calibrated(saturation).outputs
+    exact = case.fine.build(MPI.COMM_SELF, ()).solve(np.zeros(0)).outputs
+    true = exact - solution.outputs
+    for i, output in enumerate(case.coarse.outputs):
+        print(
+            f"| {case.name} | {case.coarse.unknowns:,} → {case.fine.unknowns:,} | {output.name} | {exact[i]:.5g} "
+            f"| {100 * true[i] / exact[i]:.2g} | {error.seen[i] / true[i]:.2f} | {calibrated[i] / true[i]:.2f} "
+            f"| {abs(1 - calibrated[i] / true[i]):.2f} |",
+            flush=True,
+        )
+    return list(calibrated / true)
+
+
+def costs() -> None:
+    """Print what an estimate takes, over a realisation by prediction and correction, medians of both on each draw."""
+    print("| beam | form | unknowns | realisation (CPU s) | estimate (CPU s) | ratio | over a direct solve | how |")
+    print("|---|---|---|---|---|---|---|---|")
+    for cells, cell in SIZES:
+        for form in ("displacement", "mixed") if math.prod(cells) < 1000 else ("displacement",):
+            study = beam(cells, f'model.body.cell="{cell}"', f'model.formulation="{form}"')
+            model = study.model.build(MPI.COMM_SELF, study.inputs.names)
+            prediction = linearise(study.inputs, SerialEvaluate(model)).prediction
+            assert prediction is not None
+            guess = prediction.on(model)
+            rows = []
+            for point in study.inputs.points(np.random.default_rng(0).uniform(size=(SAMPLES + 1, 2))):
+                begin = time.process_time()
+                solution = model.solve(point, guess(point))
+                middle = time.process_time()
+                error = solution.mesh_error()
+                rows.append([middle - begin, time.process_time() - middle])
+            way, seconds = model.enriched.way, np.median(rows[1:], axis=0)  # the first compiles
+            model.enriched.way = type(way).FACTOR
+            exact = model.solve(point, guess(point)).mesh_error()
+            print(
+                f"| {'×'.join(map(str, cells))} {cell}s | {form} | {model.equations.layout.size:,} | {seconds[0]:.3f} "
+                f"| {seconds[1]:.3f} | {seconds[1] / seconds[0]:.1f} | {error.seen[0] / exact.seen[0]:.3f} | {way} |",
+                flush=True,
+            )
