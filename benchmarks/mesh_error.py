@@ -268,7 +268,7 @@ def effectivities(case: Case) -> list[float]:
     for i, output in enumerate(case.coarse.outputs):
         print(
             f"| {case.name} | {case.coarse.unknowns:,} → {case.fine.unknowns:,} | {output.name} | {exact[i]:.5g} "
-            f"| {100 * true[i] / exact[i]:.2g} | {error.seen[i] / true[i]:.2f} | {calibrated[i] / true[i]:.2f} "
+            f"| {100 * true[i] / exact[i]:.2g} | {error.outputs[i] / true[i]:.2f} | {calibrated[i] / true[i]:.2f} "
             f"| {abs(1 - calibrated[i] / true[i]):.2f} |",
             flush=True,
         )
@@ -296,8 +296,9 @@ def costs() -> None:
             way, seconds = model.enriched.way, np.median(rows[1:], axis=0)  # the first compiles
             model.enriched.way = type(way).FACTOR
             exact = model.solve(point, guess(point)).mesh_error()
+            ratio, near = seconds[1] / seconds[0], error.outputs[0] / exact.outputs[0]
             print(
                 f"| {'×'.join(map(str, cells))} {cell}s | {form} | {model.equations.layout.size:,} | {seconds[0]:.3f} "
-                f"| {seconds[1]:.3f} | {seconds[1] / seconds[0]:.1f} | {error.seen[0] / exact.seen[0]:.3f} | {way} |",
+                f"| {seconds[1]:.3f} | {ratio:.1f} | {near:.3f} | {way} |",
                 flush=True,
             )

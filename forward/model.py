@@ -166,11 +166,14 @@ class Saturation:
         The same of the state.
     energy
         The same of the energy of the difference.
+    measured
+        Whether they were found for this model; typical values if not.
     """
 
     outputs: FloatArray
     state: float
     energy: float
+    measured: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,7 @@ class MeshError:
     work
         What the estimate has cost.
     seen
-        Errors of the outputs (m,) as elements of one degree more see them, without calibration.
+        Errors of the outputs (m,) before they were calibrated; None where they are not.
     """
 
     outputs: FloatArray
@@ -202,13 +205,14 @@ class MeshError:
     energy: float
     relative: float
     work: Work
-    seen: FloatArray
+    seen: FloatArray | None = None
 
     def calibrated(self, saturation: Saturation) -> MeshError:
         """Return the estimate of the whole error, with what elements of one degree more do not see."""
         return replace(
             self,
-            outputs=saturation.outputs * self.seen,
+            outputs=saturation.outputs * self.outputs,
+            seen=self.outputs,
             state=saturation.state * self.state,
             energy=saturation.energy * self.energy,
             relative=float(np.sqrt(saturation.energy)) * self.relative,
@@ -271,7 +275,7 @@ class Solution(Protocol):
     def saturation(self) -> Saturation | None:
         """Calibrate estimates of the error of the mesh, once for all solutions near this one; collective.
 
-        None for a model without a mesh, or where this would cost too much.
+        None for a model without a mesh; typical values where this would take too much memory.
 
         Raises
         ------

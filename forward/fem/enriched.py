@@ -9,6 +9,7 @@ Prescribed unknowns keep their values on V_h. V⁺ has an error too: the part th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -97,6 +98,8 @@ class Enriched:
         Those of the body.
     spec
         Specification of the body in elements of a higher degree.
+    functionals
+        The outputs of the body.
 
     Attributes
     ----------
@@ -106,7 +109,7 @@ class Enriched:
         How they are solved; depends only on sizes, form and degree.
     """
 
-    def __init__(self, equations: Discretisation, spec: Hyperelastic) -> None:
+    def __init__(self, equations: Discretisation, spec: Hyperelastic, functionals: Sequence[Functional]) -> None:
         self._coarse = equations
         self.equations = Discretisation(spec, equations.comm, equations.parameters, equations)
         pairs = [(equations.unknowns.displacement, self.equations.unknowns.displacement)]
@@ -114,8 +117,9 @@ class Enriched:
             pairs.append((equations.unknowns.pressure, self.equations.unknowns.pressure))
         self._up = [Transfer(coarse, fine) for coarse, fine in pairs]
         self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
-        self._functionals: list[Functional | None] = [
-            output.functional(self.equations) if output.estimable else None for output in spec.outputs
+        self._functionals = [
+            output.enriched(functional, self.equations, self.up) if output.estimable else None
+            for output, functional in zip(spec.outputs, functionals, strict=True)
         ]
         self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
         self.way = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric).way

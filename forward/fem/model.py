@@ -15,7 +15,7 @@ from forward.fem.cost import MOST_BYTES, estimate
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
-from forward.fem.saturation import factors
+from forward.fem.saturation import factors, typical
 from forward.fem.space import BodySpace
 from forward.hyperelastic import Hyperelastic
 from forward.model import (
@@ -83,14 +83,14 @@ class HyperelasticModel(OneByOne):
     @cached_property
     def enriched(self) -> Enriched:
         """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
-        return Enriched(self.equations, self.spec.enriched())
+        return Enriched(self.equations, self.spec.enriched(), self._functionals)
 
     @cached_property
     def enriched_twice(self) -> Enriched | None:
         """The same in elements of two degrees more, which calibrate that; None where they take too much memory."""
         spec = self.spec.enriched().enriched()
         cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        return Enriched(self.equations, spec) if cost.bytes <= MOST_BYTES else None
+        return Enriched(self.equations, spec, self._functionals) if cost.bytes <= MOST_BYTES else None
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -358,7 +358,17 @@ class FiniteElementSolution:
     def enriched_state(self) -> EnrichedState:
         """The state in elements of one degree higher, by one linear solve from this state; collective."""
         self._model.visit(self)
-        return self._model.enriched.state(self)
+        return self._estimated(self._model.enriched)
+
+    def _estimated(self, enriched: Enriched) -> EnrichedState:
+        """Find the state in an enriched space; solves with the stiffness of the body are charged to it too."""
+        kept, self.work = self.work, Work()
+        try:
+            found = enriched.state(self)
+            work = found.work.as_array() + self.work.as_array()
+        finally:
+            self.work = kept
+        return found._replace(work=Work(*work.tolist()))
 
     def mesh_error(self) -> MeshError:
         """Estimate the error of the mesh in outputs and state (`forward.fem.enriched`); collective.
@@ -371,7 +381,7 @@ class FiniteElementSolution:
         found, enriched = self.enriched_state, self._model.enriched
         enriched.visit(self)
         errors = enriched.values(found.state) - self.outputs
-        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work, errors)
+        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work)
 
     def saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
         """Find the state in elements of two degrees more too, and the factors of state and energy; collective.
@@ -383,7 +393,7 @@ class FiniteElementSolution:
         twice = model.enriched_twice
         if twice is None:
             return None
-        once, found = self.enriched_state, twice.state(self)
+        once, found = self.enriched_state, self._estimated(twice)
         n = 3 * model.equations.nodes_owned
         seen, more = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
         products = model.equations.total(np.array([seen @ seen, seen @ more]))
@@ -392,21 +402,21 @@ class FiniteElementSolution:
         (of_energy,) = factors(once.energy, found.energy, degree)
         return twice, found, float(of_state), float(of_energy)
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self) -> Saturation:
         """Calibrate estimates of the error of the mesh by elements of two degrees more (`forward.fem.saturation`).
 
-        Collective; None where this takes too much memory.
+        Collective; typical values where this takes too much memory.
 
         Raises
         ------
         SolveError
             If a stiffness in an enriched space is singular.
         """
+        seen = self.mesh_error().outputs
         saturated = self.saturated()
         if saturated is None:
-            return None
+            return typical(seen, self._model.spec.body.degree)
         twice, found, of_state, of_energy = saturated
-        seen = self.mesh_error().seen
         twice.visit(self)
         more = twice.values(found.state) - self.outputs
         return Saturation(factors(seen, more, self._model.spec.body.degree), of_state, of_energy)

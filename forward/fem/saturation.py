@@ -13,9 +13,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from forward.model import FloatArray
+from forward.model import FloatArray, Saturation
 
 LEAST, MOST = 0.5, 3.0  # factors
+# Where finding them takes too much memory: of linear elements, which see most, and of others at edges that are held.
+TYPICAL = {1: 1.1, 2: 1.35}
 RATES = np.geomspace(1e-3, 60.0, 2000)  # β
 
 
@@ -42,3 +44,9 @@ def factors(seen: ArrayLike, more: ArrayLike, degree: int, otherwise: float = 1.
     found[good] = np.clip(np.where(step > 0, powers, 1 + step), LEAST, MOST)
     found[np.isnan(one)] = math.nan
     return found
+
+
+def typical(seen: FloatArray, degree: int) -> Saturation:
+    """Return what is typical of elements of a degree, for outputs whose errors (m,) are seen."""
+    factor = TYPICAL[degree]
+    return Saturation(np.where(np.isnan(seen), np.nan, factor), factor, factor, measured=False)

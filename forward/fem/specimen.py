@@ -21,7 +21,7 @@ from forward.fem.enriched import Enriched, relative
 from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
-from forward.fem.saturation import factors
+from forward.fem.saturation import factors, typical
 from forward.fem.space import BodySpace
 from forward.model import (
     FloatArray,
@@ -279,12 +279,12 @@ class SpecimenSolution:
         parts = zip(model.models, found, strict=True)
         state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
-        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found), outputs)
+        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found))
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self) -> Saturation:
         """Calibrate estimates of the error of the mesh by elements of two degrees more; collective.
 
-        Data that the mesh hardly changes have the factor of the states. None where this takes too much memory.
+        Data that the mesh hardly changes have the factor of the states. Typical values where it takes too much memory.
 
         Raises
         ------
@@ -293,11 +293,11 @@ class SpecimenSolution:
         """
         model, found = self._model, [solution.saturated() for solution in self.solutions]
         known = [one for one in found if one is not None]
+        seen, degree = self.mesh_error().outputs, model.spec.body.degree
         if len(known) < len(found):
-            return None
+            return typical(seen, degree)
         observations = model.enriched_observations([twice for twice, *_ in known])
         more = self._observe([one.state for _, one, _, _ in known], observations) - self.outputs
-        seen, degree = self.mesh_error().seen, model.spec.body.degree
         of_states = float(np.mean([factor for _, _, factor, _ in known]))
         small = np.abs(seen) < SMALL * np.abs(seen).max(initial=0.0)
         outputs = np.where(small, of_states, factors(seen, more, degree, of_states))

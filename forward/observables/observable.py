@@ -19,7 +19,7 @@ and FEniCSx are imported inside the methods, so that a study can be checked with
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
@@ -170,6 +170,20 @@ class Observable(Settings):
             If it cannot be evaluated on the mesh.
         """
         raise NotImplementedError
+
+    def enriched(self, coarse: Functional, equations: Equations, up: Callable[[FloatArray], FloatArray]) -> Functional:
+        """Prepare the evaluation in elements of one degree more, for the error of the mesh; collective.
+
+        Parameters
+        ----------
+        coarse
+            The functional of the body.
+        equations
+            The same body in elements of one degree more.
+        up
+            Takes vectors (U_local,) of the body to the same functions there.
+        """
+        return self.functional(equations)
 
 
 OUTPUTS = Kinds(

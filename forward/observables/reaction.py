@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -22,29 +23,35 @@ class Reaction(Observable):
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
-        return _Reaction(equations, self)
+        from forward.fem.dolfinx import spaces
+
+        nodes = spaces.boundary_nodes(equations.space, equations.facets[self.on])
+        owned = nodes[nodes < equations.nodes_owned]
+        w = np.zeros(equations.size)
+        w[3 * owned + AXES.index(self.component)] = 1
+        return _Reaction(equations, w)
+
+    def enriched(self, coarse: Functional, equations: Equations, up: Callable[[FloatArray], FloatArray]) -> Functional:
+        """Prepare the evaluation along the same virtual displacement, so that u_h has the same reaction there."""
+        assert isinstance(coarse, _Reaction)
+        return _Reaction(equations, up(coarse.w))
 
 
 class _Reaction:
     """ψ = wᵀ r(u, ω), with r the imbalance of all unknowns and w = 1 on a component of a boundary's nodes."""
 
-    def __init__(self, equations: Equations, output: Reaction) -> None:
-        from forward.fem.dolfinx import spaces
-
+    def __init__(self, equations: Equations, w: FloatArray) -> None:
         self._equations = equations
-        nodes = spaces.boundary_nodes(equations.space, equations.facets[output.on])
-        owned = nodes[nodes < equations.nodes_owned]
-        self._w = np.zeros(equations.size)
-        self._w[3 * owned + AXES.index(output.component)] = 1
+        self.w = w
 
     def value(self) -> float:
-        return self._equations.dot(self._w, self._equations.imbalance())
+        return self._equations.dot(self.w, self._equations.imbalance())
 
     def gradient(self) -> FloatArray:
-        return self._equations.stiffness_times(self._w, transpose=True)
+        return self._equations.stiffness_times(self.w, transpose=True)
 
     def partial(self) -> FloatArray:
         equations = self._equations
-        slopes = equations.field_products(self._w)
-        slopes[equations.scalars] = [equations.dot(self._w, force) for force in equations.parameter_forces()]
+        slopes = equations.field_products(self.w)
+        slopes[equations.scalars] = [equations.dot(self.w, force) for force in equations.parameter_forces()]
         return slopes

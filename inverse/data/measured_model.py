@@ -121,7 +121,7 @@ class MeasuredSolution:
         found = self.solution.mesh_error()
         if found is None:
             return None
-        return replace(found, outputs=found.outputs[self.which], seen=found.seen[self.which])
+        return replace(found, outputs=found.outputs[self.which])
 
     def saturation(self) -> Saturation | None:
         """Calibrate estimates of the error of the mesh; None without a mesh."""
