@@ -1,1 +1,1 @@
-"""Estimates and their errors: moments, indices, and what speaks against them."""
+"""Estimates and their errors: moments, indices, and reasons to doubt them."""

@@ -1,7 +1,7 @@
-"""Where the model has no answer: what samples that failed, or were refused as unstable, say about the parameters.
+"""Where the model has no answer: what the samples that failed, or were refused as unstable, have in common.
 
-A perfect column under a dead load has no stable straight state beyond its first buckling load, and the one it takes
-then is not found from the straight ones. What is computed from the other samples is about the branch that they are on.
+A perfect column under a dead load has no stable straight state beyond its first buckling load, and its bent state is
+not found from the straight ones. Estimates from the other samples describe the branch on which these are.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from forward.model import Finding, FloatArray, Stability
 from uq.evaluation.evaluate import Evaluations
 from uq.inputs.random_parameters import Inputs
 
-SHOWN = 0.1  # share of the largest that a parameter must have in a direction to be named
+SHOWN = 0.1  # weight of a parameter in a direction, relative to the largest, from which it is named
 
 
 def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> Iterator[Finding]:
@@ -24,9 +24,9 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
     Parameters
     ----------
     inputs, evaluations
-        What was sampled, and what came of it.
+        The random parameters and the evaluated samples.
     continued
-        Whether estimates rest on a function that goes on where the model has no answer (an expansion).
+        Whether estimates use a function that continues where the model has no answer (an expansion).
     """
     known, ok = evaluations.stability, evaluations.ok
     refused = ~ok & (known >= Stability.REFUSED)
@@ -36,12 +36,12 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         text = f"{count} of {total} samples have no stable equilibrium, the body buckles there: {where}. "
         if continued:
             text += (
-                "The expansion goes on where the stable branch has ended: its moments, quantiles and indices cannot be "
-                "trusted. Keep the parameters where all samples have an answer, or give the body the imperfection or "
-                "the small load that decides how it buckles."
+                "The expansion continues beyond the end of the stable branch: its moments, quantiles and indices "
+                "cannot be trusted. Keep the parameters where all samples have an answer, or give the body the "
+                "imperfection or the small load that decides how it buckles."
             )
         else:
-            text += "Estimates are of the stable branch alone, that is, over the samples that have an answer."
+            text += "Estimates are of the stable branch only, that is, over the samples that have an answer."
         yield Finding("error" if continued else "warning", text)
     failed = ~ok & ~refused
     count = int(failed.sum())
@@ -49,11 +49,11 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         text = f"{count} of {total} samples have no answer: {separated(inputs, evaluations.points, failed, ok)}. "
         if continued:
             text += (
-                "The expansion goes on there as it is elsewhere, which neither samples nor errors cover: its moments, "
+                "The expansion continues there smoothly, which neither samples nor errors cover: its moments, "
                 "quantiles and indices hold only if the outputs do so too."
             )
         else:
-            text += "They are missing from the estimates, or are taken to follow the control."
+            text += "They are missing from the estimates, or are assumed to follow the control."
         yield Finding("warning", text)
     missed = int((known == Stability.MISSED).sum())
     if missed:
@@ -67,9 +67,9 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
 
 
 def separated(inputs: Inputs, points: FloatArray, refused: NDArray[np.bool_], ok: NDArray[np.bool_]) -> str:
-    """Say in words what tells the points (n, d) that were refused (n,) from those that have an answer.
+    """Say in words what distinguishes the points (n, d) that were refused (n,) from those that have an answer.
 
-    That is a bound of one parameter, or of a sum of several where that tells them better.
+    That is a bound on one parameter, or on a sum of several if that separates them better.
     """
     if not ok.any():
         return "no sample has an answer"
@@ -116,13 +116,13 @@ def _words(
         return f"all with {what} {sides[0]} {first:.5g}, none with {what} {sides[1]} {last:.5g}"
     inside = int(((sign * x >= sign * first) & ok).sum())
     if 2 * inside > ok.sum():
-        return "no bound of the parameters tells them from the others"
+        return "no bound on the parameters separates them from the others"
     others = "1 other has" if inside == 1 else f"{inside} others have"
     return f"all with {what} {sides[0]} {first:.5g}, where {others} an answer"
 
 
 def counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
-    """Number of states by how their stability was looked at; empty where no model has equilibria."""
+    """Number of states by how their stability was tested; empty if no model has equilibria."""
     known = np.concatenate([np.zeros(0, dtype=np.int8), *(found.stability for found in evaluations)])
     if not known.any():
         return {}
@@ -130,7 +130,7 @@ def counts(evaluations: Iterable[Evaluations]) -> dict[str, int]:
 
 
 def by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
-    """Return what is known (n,) of the stability at points (n, d): of several solves there, that which says least."""
+    """Return what is known (n,) about the stability at points (n, d): the least of several solves at a point."""
     known: dict[bytes, list[int]] = {}
     for point, one in zip(evaluations.points, evaluations.stability.tolist(), strict=True):
         known.setdefault(point.tobytes(), []).append(one)

@@ -1,19 +1,19 @@
-"""Sobol' indices: of expansions, of exchanged samples, and of their fields; each formula once.
+"""Sobol' indices of expansions, of exchanged samples, and of their fields.
 
 With the variance V of a quantity ψ, V_g = Var E[ψ | ω_g] and T_g = E Var(ψ | ω_~g) for a parameter or a group g, the
-index of first order is V_g/V, and the total one T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V over
-the body, summed over the components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
+first-order index is V_g/V, and the total index T_g/V. Generalised indices of a field are ∫V_g/∫V and ∫T_g/∫V over the
+body, summed over the components (F. Gamboa, A. Janon, T. Klein, A. Lagnoux, Electron. J. Stat. 8 (2014) 575–603).
 
-Of an expansion in orthonormal polynomials all these are sums of squares of coefficients (B. Sudret, Reliab. Eng. Syst.
-Safety 93 (2008) 964–979). From samples they come from rows of points: A and B, independent, AB_g, which is A with ω_g
-taken from B, and for products of two parameters BA_i:
+For an expansion in orthonormal polynomials all these are sums of squares of coefficients (B. Sudret, Reliab. Eng. Syst.
+Safety 93 (2008) 964–979). For samples they come from rows of points: A and B, independent, AB_g, which is A with ω_g
+taken from B, and for pairs of parameters BA_i:
 
     V_g = ⟨B (AB_g − A)⟩              A. Saltelli et al., Comput. Phys. Commun. 181 (2010) 259–270
     T_g = ⟨(A − AB_g)²⟩/2             M. J. W. Jansen, Comput. Phys. Commun. 117 (1999) 35–43
     V_ij = ⟨BA_i AB_j − A B⟩ − V_i − V_j      A. Saltelli, Comput. Phys. Commun. 145 (2002) 280–297
 
-where the letters stand for values of ψ less their mean over all points. Everything follows from the means over rows of
-the values and of some of their products, which are sums and so can be added up in any grouping.
+where the letters stand for values of ψ minus their mean over all points. Everything follows from the means over rows of
+the values and of some of their products, which are sums and so can be added in any grouping.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 
 Analysis = Callable[[FloatArray, NDArray[np.int64]], dict[str, FloatArray]]
-MOVES = 1e-12  # of the largest variance: below, a variance at a node is rounding
+MOVES = 1e-12  # of the largest variance: below, a variance at a node is rounding error
 
 
 # --- expansions ----------------------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def partial_variances(
 
 
 def pair_variances(squares: FloatArray, indices: NDArray[np.int64]) -> FloatArray:
-    """Variance V_ij (…, d, d) of what two parameters do together and neither alone, symmetric; zero on the diagonal."""
+    """Variance V_ij (…, d, d) due to interactions of two parameters, symmetric; zero on the diagonal."""
     active = indices > 0
     d = active.shape[1]
     both = np.zeros((len(indices), d, d))
@@ -78,7 +78,7 @@ def coefficient_moments(coefficients: FloatArray, indices: NDArray[np.int64]) ->
 
 
 def shares(parts: FloatArray, variance: FloatArray | float) -> FloatArray:
-    """Parts over a variance, and 0 where nothing varies."""
+    """Parts over a variance; 0 where that is 0."""
     variance = np.asarray(variance)
     return np.asarray(np.where(variance > 0, parts / np.where(variance > 0, variance, 1.0), 0.0))
 
@@ -96,7 +96,7 @@ def exchanged(A: FloatArray, B: FloatArray, members: NDArray[np.bool_], *, pairs
     members
         Which parameters (G, d) each group has.
     pairs
-        Whether products of two parameters are asked for.
+        Whether interactions of two parameters are estimated.
     """
     points = [A, B, *(np.where(group, B, A) for group in members)]
     if pairs:
@@ -106,14 +106,14 @@ def exchanged(A: FloatArray, B: FloatArray, members: NDArray[np.bool_], *, pairs
 
 @dataclass(frozen=True)
 class RowProducts:
-    """What of a row of values is averaged.
+    """The products of values in a row that are averaged.
 
     Attributes
     ----------
     groups
         Number G of parameters and groups; the parameters come first.
     pairs
-        Number d of parameters whose products are asked for, or 0.
+        Number d of parameters whose interactions are estimated, or 0.
     """
 
     groups: int
@@ -125,7 +125,7 @@ class RowProducts:
         return 2 + self.groups + self.pairs
 
     def of(self, row: FloatArray) -> FloatArray:
-        """Return the values (K, …) of a row and their products, (J, …) in all."""
+        """Return the values (K, …) of a row and their products, (J, …) in total."""
         A, B = row[0], row[1]
         AB = row[2 : 2 + self.groups]
         parts = [row, ((A**2 + B**2) / 2)[None], B * (AB - A), (A - AB) ** 2 / 2]
@@ -157,7 +157,7 @@ class RowProducts:
 
 @dataclass(frozen=True)
 class ExchangedVariances:
-    """Variance (…), its parts V_g and T_g (G, …) and, where they were asked for, V_ij (d, d, …)."""
+    """Variance (…), its parts V_g and T_g (G, …) and, if requested, V_ij (d, d, …)."""
 
     variance: FloatArray
     first: FloatArray
@@ -165,25 +165,25 @@ class ExchangedVariances:
     second: FloatArray | None = None
 
 
-# --- errors of what follows from means over independent replicates -------------------------------------------------
+# --- errors of estimates from means over independent replicates ----------------------------------------------------
 
 
 def bootstrap(sums: FloatArray, counts: FloatArray, seed: int, draws: int = 1000) -> FloatArray:
-    """Means (J, draws, …) over replicates that are drawn again, from sums (R, J, …) over each of R replicates.
+    """Means (J, draws, …) over resampled replicates, from sums (R, J, …) over each of R replicates.
 
-    A replicate is a set of points, however these depend on each other; drawing single points of quasi-random sets again
-    would take them for independent ones, and claim too large errors.
+    A replicate is a set of points that may depend on each other; resampling single points of quasi-random sets would
+    treat them as independent, and give too large errors.
 
     Parameters
     ----------
     sums
         Sums over the points of each replicate.
     counts
-        Number (R,) of points of each.
+        Number (R,) of points in each.
     seed
-        Of the draws.
+        Of the resampling.
     draws
-        How often all R are drawn.
+        Number of times that R replicates are drawn.
     """
     R = len(counts)
     times = np.random.default_rng([seed, R]).multinomial(R, np.full(R, 1 / R), size=draws)
@@ -197,7 +197,7 @@ def bootstrap_error(drawn: FloatArray, replicates: int, axis: int) -> FloatArray
 
 
 def jackknife_error(left_out: FloatArray) -> FloatArray:
-    """Standard error from estimates (R, …) that leave one of R replicates out each."""
+    """Standard error from estimates (R, …) that each leave out one of R replicates."""
     R = len(left_out)
     return np.asarray(np.sqrt((R - 1) / R * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)))
 
@@ -208,14 +208,14 @@ def jackknife_error(left_out: FloatArray) -> FloatArray:
 def field_indices(
     variance: FloatArray, first: FloatArray, total: FloatArray, volumes: FloatArray | None = None
 ) -> dict[str, tuple[tuple[str, ...], FloatArray | NDArray[np.int64]]]:
-    """Return the generalised indices of a field, its indices by node, and which parameter dominates there.
+    """Return the generalised indices of a field, its indices by node, and the dominating parameter at each node.
 
     Parameters
     ----------
     variance, first, total
         V (nodes,), and V_i and T_i (d, nodes) of d parameters, sums over the components.
     volumes
-        Share (nodes,) of the body that each node stands for in the integrals; by default all count alike.
+        Share (nodes,) of the body that each node represents in the integrals; by default all count equally.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Mean and standard deviation from sums over samples, with a linear control variate, for scalars and fields alike.
+"""Mean and standard deviation of scalars and fields from sums over samples, with a linear control variate.
 
 Let w = ψ − ψ̄ be the deviation of a quantity from its value at the mean parameters, and its tangent prediction
 L = Σ_i ∂ψ/∂ω_i(ω̄)(ω_i − ω̄_i), with E[L] = 0 and E[L²] = V known exactly. With sample means ⟨·⟩,
@@ -8,15 +8,15 @@ L = Σ_i ∂ψ/∂ω_i(ω̄)(ω_i − ω̄_i), with E[L] = 0 and E[L²] = V know
 
 β₁ = 1 is the estimator of Cao, Hussaini & Zang, AIAA J. 42 (2004) 703–710; β₂ = 0 is its published second moment (see
 docs/decisions/0003-second-moment-control.md), β₁ = β₂ = 0 is plain Monte Carlo. Everything follows from the means of
-w^a L^b, a + b ≤ 4, which are sums and so can be added up in any grouping.
+w^a L^b, a + b ≤ 4, which are sums and so can be added in any grouping.
 
-An error of a control costs efficiency and never bias, but where it grows faster than the quantity (a polynomial of a
-parameter with tails), its second moment is known from where no sample is, and neither scatter nor claim are worth much.
-So a control that leaves more of the scatter than there was is dropped: β = 0, see `_helps`.
+An error of a control costs efficiency but never causes bias. But if the control grows faster than the quantity (a
+polynomial of a parameter with tails), its second moment comes from where no sample is, and neither the scatter nor the
+estimated error is reliable. So a control that increases the scatter is dropped: β = 0, see `_helps`.
 
 Either expectation may also be a sum of independently estimated terms (a telescoping sum over meshes): see `combine`.
 
-Scalars and fields, with and without controls, use the same sums: one file, so that each formula stands once.
+Scalars and fields, with and without controls, use the same sums: one file, so that each formula is written once.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ SecondMoment = Literal["quadratic", "linear"]
 ESTIMATES = ("mean", "mean_error", "std", "std_error")
 ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
-MORE = 0.5  # over n − 1: share of the scatter of n samples by which a control must leave more of it to be dropped
+MORE = 0.5  # over n − 1: relative increase of the scatter of n samples from which a control is dropped
 EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
 
 
 def monomials(w: FloatArray, L: FloatArray | None) -> FloatArray:
-    """Return the products w^a L^b (k, …) in the order of `EXPONENTS`; only those with b = 0 where there is no L."""
+    """Return the products w^a L^b (k, …) in the order of `EXPONENTS`; only those with b = 0 if L is None."""
     if L is None:
         return np.array([w, w**2, w**3, w**4])
     powers_w, powers_l = [np.ones_like(w), w], [np.ones_like(L), L]
@@ -75,7 +75,7 @@ class Estimates:
 
     @property
     def relative_error(self) -> FloatArray:
-        """Standard error of the mean relative to the mean, or to the standard deviation where that is larger."""
+        """Standard error of the mean relative to the mean, or to the standard deviation if that is larger."""
         scale = np.maximum(np.abs(self.mean), self.std)
         return np.where(scale > 0, self.mean_error / np.where(scale > 0, scale, 1), 0)
 
@@ -87,7 +87,7 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Moments(Estimates):
-    """Estimates from independent samples, and what the control variate was worth.
+    """Estimates from independent samples, and the gain of the control variate.
 
     Attributes
     ----------
@@ -124,14 +124,14 @@ class Term:
 
 
 def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, FloatArray] | None = None) -> Term:
-    """Reduce samples to the moments that estimates are made of.
+    """Reduce samples to the moments from which estimates are computed.
 
     Parameters
     ----------
     first, second
-        Samples (n, …) that have the wanted moments as expectations, n ≥ 2.
+        Samples (n, …) whose expectations are the first and second moment, n ≥ 2.
     controls
-        Controls (n, …) of both, with expectation zero; their coefficients are 1, or 0 where they do not help.
+        Controls (n, …) of both, with expectation zero; their coefficients are 1, or 0 if they do not help.
     """
     n = len(first)
     if controls is not None:
@@ -151,7 +151,7 @@ def combine(
     coefficient: float | FloatArray = 1.0,
     second_coefficient: float | FloatArray = 1.0,
 ) -> Estimates:
-    """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each of samples of its own.
+    """Estimate mean and standard deviation from terms that sum to the moments of ψ − ψ̄, each with its own samples.
 
     Parameters
     ----------
@@ -178,22 +178,22 @@ def _sums(terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     """Mean of ψ − ψ̄ and its variance; variance of ψ and its standard error, by linearisation."""
     m1 = _sum(t.first for t in terms)
     mean_variance = _sum(t.variance / t.n for t in terms)
-    # The squared mean exceeds the square of the expectation by its variance, which is added back: plain Monte Carlo
-    # gets the usual n − 1.
+    # The squared mean exceeds the square of the expectation by its variance, which is added back: for plain Monte Carlo
+    # this gives the usual n − 1.
     variance = np.maximum(_sum(t.second for t in terms) - m1**2 + mean_variance, 0)
     scatter = _sum(_scatter_of_variance(t, m1) / t.n for t in terms)
-    # The square of a mean that is known badly errs by more than its slope says.
+    # The error of the square of an inaccurate mean is larger than its slope says.
     return m1, mean_variance, variance, np.sqrt(np.maximum(scatter, 0) + 2 * mean_variance**2)
 
 
 def _scatter_of_variance(one: Term, m1: FloatArray | None = None) -> FloatArray:
-    """Variance of r₂ − 2m₁r₁, by which a sample moves the estimate of σ²; m₁ is the term's own if none is given."""
+    """Variance of r₂ − 2m₁r₁, the influence of a sample on the estimate of σ²; m₁ is the term's own if None."""
     m1 = one.first if m1 is None else m1
     return np.asarray(one.second_variance - 4 * m1 * one.covariance + 4 * m1**2 * one.variance)
 
 
 def _helps(left: FloatArray, whole: FloatArray, n: int) -> NDArray[np.bool_]:
-    """Whether a control leaves less than the whole scatter of n samples; few must show it by more."""
+    """Whether a control does not increase the scatter of n samples, with a margin for small n."""
     return np.asarray(left <= (1 + MORE / (n - 1)) * whole)
 
 
@@ -284,9 +284,9 @@ def estimate_from_replicates(
 ) -> Estimates:
     """Estimate mean and standard deviation from independent replicates, with errors from their scatter.
 
-    A replicate is a set of points, however these depend on each other, over which the mean of every function is
-    unbiased. With means over all replicates ⟨·⟩, the estimators are those of the module for a control C of the
-    deviation and D of its square:
+    A replicate is a set of points, which may depend on each other, over which the mean of every function is unbiased.
+    With means over all replicates ⟨·⟩, the estimators are those of the module for a control C of the deviation and D of
+    its square:
 
         mean:            ψ̄ + ⟨w − β₁(C − E[C])⟩
         second moment:   ⟨w² − β₂(D − E[D])⟩
@@ -300,16 +300,16 @@ def estimate_from_replicates(
     expected
         E[C] and E[D] (…).
     coefficient
-        β = 1, or 0 for a control that does not help; or the slope of the regression over the replicates: not the points
-        but the replicates say what is left for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20
-        (2005) 1–31). Its errors count the fitted slopes and the distance of the controls from what is expected, as in
-        any regression; R > 3.
+        β = 1, or 0 for a control that does not help; or the slope of the regression over the replicates: these, not the
+        points, tell what is left for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20 (2005) 1–31).
+        The errors count the fitted slopes and the distance of the controls from their expectations, as in any
+        regression; R > 3.
 
     Returns
     -------
     Estimates
-        Errors are one standard error, known to R − 1 degrees of freedom (R − 2 for the mean with fitted slopes): a
-        95 % interval is ± 2.13 of them for 16 replicates.
+        Errors are one standard error, with R − 1 degrees of freedom (R − 2 for the mean with fitted slopes): a 95 %
+        interval is ± 2.13 of them for 16 replicates.
     """
     w, square = means[:2]
     R = len(w)
@@ -349,9 +349,9 @@ def estimate_from_replicates(
 def error_of_root(std: FloatArray, variance_error: FloatArray) -> FloatArray:
     """Error of σ given the error e of σ².
 
-    e/(2σ) where that is small. An estimate of σ² that is too small claims too small an error: intervals of ln σ² are
-    better (D. G. Bonett, Comput. Stat. Data Anal. 50 (2006) 775–782), of which the upper side, at two errors, is taken:
-    σ (exp(e/σ²) − 1)/2. At most √e: what σ could be where the estimate of σ² is nothing.
+    It is e/(2σ) if that is small. If σ² is underestimated, so is its error: intervals of ln σ² are better (D. G.
+    Bonett, Comput. Stat. Data Anal. 50 (2006) 775–782), whose upper side, at two errors, is used: σ (exp(e/σ²) − 1)/2.
+    At most √e, the size that σ may have if the estimate of σ² is 0.
     """
     with np.errstate(over="ignore"):
         upper = std / 2 * np.expm1(np.minimum(ratio(variance_error, std**2), 100.0))
@@ -385,7 +385,7 @@ class Quantiles(NamedTuple):
     central, lower, upper
         The quantiles and the ends of their intervals.
     error
-        The longer of the two sides over the factor of `half_width`: what stands for a standard error.
+        The longer of the two sides over the factor of `half_width`, as a standard error.
     """
 
     central: FloatArray
@@ -406,11 +406,11 @@ class Quantiles(NamedTuple):
 
 
 def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> Quantiles:
-    """Quantiles of independent samples (n, m), with the order statistics between which 95 % of the quantiles lie.
+    """Quantiles of independent samples (n, m), with 95 % intervals between order statistics.
 
     X_(a) lies below the p-quantile with probability I_p(a, n + 1 − a), which is also defined for a between whole
-    numbers (A. D. Hutson, J. Appl. Stat. 26 (1999) 343–353). Where a < 1 the interval reaches beyond the samples: there
-    the tail is taken to be exponential, with the mean distance of the outermost quarter.
+    numbers (A. D. Hutson, J. Appl. Stat. 26 (1999) 343–353). If a < 1 the interval extends beyond the samples: there
+    the tail is assumed exponential, with the mean distance of the outermost quarter.
     """
     return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), len(values)), Z)
 
@@ -420,10 +420,10 @@ def quantiles_from_replicates(
 ) -> Quantiles:
     """Quantiles of all values (n, m), with intervals from the scatter of the replicates (n,) that they belong to.
 
-    As `quantiles`, with the number of independent samples in the place of n that know the share of values below the
-    quantile as well: p(1 − p) over the variance of this share by the replicates, times (1.96/t)², since the scatter of
-    R replicates is known to R − 1 degrees of freedom (E. L. Korn, B. I. Graubard, Surv. Methodol. 24 (1998) 193–201). A
-    share of n/R values is known to no better than a rounding error, 1/√12 of R/n.
+    As `quantiles`, with n replaced by the number of independent samples that give the share of values below the
+    quantile as accurately: p(1 − p) over the variance of this share by the replicates, times (1.96/t)², since the
+    scatter of R replicates has R − 1 degrees of freedom (E. L. Korn, B. I. Graubard, Surv. Methodol. 24 (1998)
+    193–201). A share of n/R values has at least a rounding error of 1/√12 of R/n.
     """
     p = np.array(probabilities)
     central = np.quantile(values, p, axis=0)
@@ -438,12 +438,12 @@ def quantiles_from_replicates(
 
 
 def _between(values: FloatArray, p: FloatArray, counts: FloatArray, factor: float) -> Quantiles:
-    """Quantiles of values (n, m) whose shares below are as those of so many independent samples (k, m)."""
+    """Quantiles of values (n, m), with intervals as from these numbers of independent samples (k, m)."""
     ordered = np.sort(values, axis=0)
     central = np.quantile(values, p, axis=0)
     lower = _order_statistic(ordered, _level(p[:, None], counts))
     upper = -_order_statistic(-ordered[::-1], _level(1 - p[:, None], counts))
-    # Quantiles of few samples are interpolated otherwise, and may lie outside.
+    # Quantiles of few samples are interpolated in another way, and may lie outside.
     lower, upper = np.minimum(lower, central), np.maximum(upper, central)
     return Quantiles(central, lower, upper, np.maximum(upper - central, central - lower) / factor)
 
@@ -470,18 +470,18 @@ def _order_statistic(ordered: FloatArray, share: FloatArray) -> FloatArray:
     at = ordered[below, columns]
     inside = at + np.clip(place - below, 0, 1) * (ordered[above, columns] - at)
     few = min(max(2, n // 4), n - 1)
-    # The mean of so few is known to one over their root.
+    # The relative error of the mean of so few is one over the root of their number.
     tail = (1 + few**-0.5) * (ordered[few] - ordered[:few].mean(axis=0))
     return np.asarray(np.where(place < 0, ordered[0] + tail * np.log(np.maximum(place + 1, 1e-12)), inside))
 
 
 def half_width(dataset: xr.Dataset) -> float:
-    """Standard errors on either side of a 95 % interval of results: more where they come from a few scrambles."""
+    """Standard errors on either side of a 95 % interval of results: more if they come from a few scrambles."""
     return Z if "scramble" not in dataset else student(int(dataset["scramble"].max()))
 
 
 def student(freedom: int) -> float:
-    """Return the standard errors on either side of a 95 % interval for so many degrees of freedom."""
+    """Return the standard errors on either side of a 95 % interval with these degrees of freedom."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, ONE_SIDED))

@@ -1,14 +1,14 @@
-"""What samples do not hold of the tails that they let one guess: part of the error of a standard deviation.
+"""The contribution of tails beyond the samples to the error of a standard deviation.
 
-The largest of n samples of a log-normal quantity is about as far out as one in n of it, and of its variance a share is
-from beyond, which most sets of n samples miss: their standard deviation is too small, and so is its scatter among
-them, by which errors are claimed. Samples whose logarithms are about symmetric are log-normal as far as they say, and
-their tails are known from the spread s of all logarithms, which few samples tell much better than the tail itself.
+The largest of n samples of a log-normal quantity is near its quantile at 1 − 1/n. A share of the variance comes from
+beyond, and most sets of n samples miss it: their standard deviation is too small, and so is its estimated error, which
+comes from their scatter. Samples whose logarithms are about symmetric look log-normal, and their tails follow from the
+standard deviation s of all logarithms, which few samples determine much better than the tail itself.
 
-Half the share by which that from beyond exceeds the one of a normal quantity, which scatter knows, counts as a standard
-error of the standard deviation, relative to it. With it, 95 % intervals of plain Monte Carlo with 64 to 1 024 samples
-cover 89 to 97 % up to s = 0.65, and 87 to 96 % at 0.83 (without: 84 to 96 % and 81 to 88 %); those of 64 quasi-random
-samples 87 to 93 % instead of 76 to 92 %, and those of 1 024 up to 100 % instead of 79 to 97 %.
+Half the excess of this share over that of a normal quantity, which scatter covers, counts as a relative standard error
+of the standard deviation. With it, 95 % intervals of plain Monte Carlo with 64 to 1 024 samples cover 89 to 97 % up to
+s = 0.65, and 87 to 96 % at 0.83 (without: 84 to 96 % and 81 to 88 %); those of 64 quasi-random samples 87 to 93 %
+instead of 76 to 92 %, and those of 1 024 up to 100 % instead of 79 to 97 %.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from forward.model import FloatArray
 from uq.estimators.moments import Estimates
 from uq.inputs.random_parameters import Inputs
 
-FROM = 0.25  # standard deviation of logarithms up to which scatter knows enough
+FROM = 0.25  # standard deviation of logarithms up to which scatter suffices
 CLOSER = 0.75  # skewness of logarithms over that of the values: below, the values look log-normal
 SHORTER = -0.6  # skewness of logarithms below which the far tail is shorter than that of a log-normal
-ENDLESS = 2.1  # kurtosis of logarithms below which they seem to have ends: 1.8 for a uniform, 3 for a normal quantity
+ENDLESS = 2.1  # kurtosis of logarithms below which they seem bounded: 1.8 for a uniform, 3 for a normal quantity
 
 
 Found = TypeVar("Found", bound=Estimates)
 
 
 def counted(found: Found, inputs: Inputs, values: FloatArray) -> Found:
-    """Return estimates from samples (n, m) with the errors that come from beyond them."""
+    """Return estimates from samples (n, m) with errors that include tails beyond them."""
     return replace(found, std_error=np.hypot(found.std_error, unseen(inputs, values) * found.std))
 
 
 def unseen(inputs: Inputs, values: FloatArray) -> FloatArray:
-    """Return the relative error (m,) of standard deviations from beyond n samples (n, m) that look log-normal.
+    """Return the relative error (m,) of standard deviations due to tails beyond n samples (n, m) that look log-normal.
 
-    Zero where no parameter has a tail: samples reach up to the ends.
+    Zero if no parameter has a tail: samples then reach the ends.
     """
     n, m = values.shape
     if all(marginal.support is not None for marginal in inputs.marginals.values()):
@@ -48,9 +48,9 @@ def unseen(inputs: Inputs, values: FloatArray) -> FloatArray:
 
 
 def spread(values: FloatArray) -> float:
-    """Standard deviation of the logarithms of values (n,) that look log-normal, on the far side of the median; else 0.
+    """Standard deviation of the logarithms of values (n,) that look log-normal, beyond the median; otherwise 0.
 
-    Logarithms may have a longer tail there than normal ones, but none that is much shorter: they would end.
+    Logarithms may have a longer tail there than normal ones, but not a much shorter one: they would be bounded.
     """
     if not (values.min() > 0 or values.max() < 0):
         return 0.0
@@ -64,7 +64,7 @@ def spread(values: FloatArray) -> float:
 
 
 def _share_beyond(s: float, n: int) -> float:
-    """Share of the variance of exp(s z), z normal, from beyond the z that one of n passes, less that of z itself.
+    """Share of the variance of exp(s z), z normal, beyond the quantile of z at 1 − 1/n, minus that of z itself.
 
     With w = exp(s²): E[(x − μ)²; z > a] = w²Φ(2s − a) − 2wΦ(s − a) + wΦ(−a), and Var x = w² − w.
     """

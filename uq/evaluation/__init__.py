@@ -1,1 +1,1 @@
-"""Where models are evaluated and what is kept of it: blocks, groups of ranks, files."""
+"""Evaluation of models, and storage of the results: blocks, rank groups, files."""

@@ -1,9 +1,8 @@
-"""Finished blocks on disk: one file each while a study runs, one file of all at its end.
+"""Finished blocks on disk: one file each while a study runs, one file for all at its end.
 
-A file is written under another name and renamed into place, so that whatever carries its final name is whole. A block
-is found by what was asked, not by who asked: its name is a hash of the points and of everything else that decides the
-answer. It carries a checksum of its content together with its name, so that neither damage nor an exchange of files
-passes for an answer.
+A file is written under a temporary name and renamed into place, so that whatever has its final name is complete. A
+block is found by its request, whoever made it: its name is a hash of the points and of everything else that determines
+the answer. It has a checksum of its content and its name, so that neither damage nor swapped files pass for an answer.
 """
 
 from __future__ import annotations
@@ -26,31 +25,31 @@ from forward.model import WORK, ModelError, Stability
 from uq.evaluation.evaluate import Evaluations, Failure
 from uq.evaluation.hdf5 import creation, image, in_memory
 
-HEAD = 512  # bytes before those of HDF5, which begin with the checksum of these
+HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
 
 
 class DamagedError(OSError):
-    """A file of evaluations is not as it was written."""
+    """A file of evaluations that is not as it was written."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path}: damaged, or not what it is named after")
 
 
 class Code(Protocol):
-    """What of the user's code was loaded in the course of a run, beyond what the identity of the study covers."""
+    """The user's code that was loaded during a run, beyond that covered by the identity of the study."""
 
     def note(self) -> str:
-        """Say what it is, to be kept with a block."""
+        """Describe it, for storage with a block."""
 
     def objection(self, note: str) -> str | None:
-        """Say why a block with a note is no longer valid, if it is not."""
+        """Say why a block with a note is no longer valid; None if it is."""
 
 
 class Block(Protocol):
-    """A finished piece of work that is not evaluations."""
+    """Finished work other than evaluations."""
 
     def image(self, note: str) -> bytes:
-        """Return the bytes of an HDF5 file, `HEAD` of which are left free, with an attribute `note`."""
+        """Return the bytes of an HDF5 file with an attribute `note`; the first `HEAD` are left free."""
 
 
 class Checkpoint:
@@ -61,9 +60,9 @@ class Checkpoint:
     directory
         The results directory; blocks are kept in its folder `evaluations`.
     identity
-        Text that decides the answers besides the request (the study, the version of the program).
+        Text that, with the request, determines the answers (the study, the version of the program).
     code
-        Knows what of the user's code was loaded in the course of the run.
+        Knows which of the user's code was loaded during the run.
     """
 
     def __init__(self, directory: Path, identity: str, code: Code | None = None) -> None:
@@ -73,16 +72,16 @@ class Checkpoint:
         self._code = code
 
     def key(self, block: object) -> str:
-        """Return the name of a block: of a request, or of whatever else says what was asked."""
+        """Return the name of a block, from a request or another value that specifies it."""
         return digest(block, self._identity).hex()[:24]
 
     def has(self, key: str) -> bool:
-        """Whether a block is finished; one that is damaged, or that answers another request, is removed.
+        """Whether a block is finished; one that is damaged or answers another request is removed.
 
         Raises
         ------
         ModelError
-            If a file of the user's from which it follows has changed.
+            If a file of the user on which it depends has changed.
         """
         path = self.path(key)
         if not path.exists():
@@ -107,7 +106,7 @@ class Checkpoint:
             self._folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
             message = (
-                f"{self._folder}: cannot be made: {error.strerror}; the same command continues once that is mended"
+                f"{self._folder}: cannot be created: {error.strerror}; the same command continues once that is fixed"
             )
             raise StopError(message) from None
         note = "" if self._code is None else self._code.note()
@@ -115,21 +114,21 @@ class Checkpoint:
         _write(self.path(key), body, key)
 
     def load(self, key: str) -> Evaluations:
-        """Read evaluations, as `has` has found them."""
+        """Read evaluations that `has` has found."""
         return read(self.path(key))
 
     @property
     def answers(self) -> bool:
-        """Whether a block that is kept has more in it than failed solves."""
+        """Whether any stored block holds more than failed solves."""
         return any(_has_answers(path) for path in self._folder.glob("*.h5"))
 
     def drop(self, keys: Iterable[str]) -> None:
-        """Remove blocks that are no longer needed, since what follows from them is kept."""
+        """Remove blocks that are no longer needed because their results are stored."""
         for key in keys:
             self.path(key).unlink(missing_ok=True)
 
     def path(self, key: str) -> Path:
-        """Return the file of a block."""
+        """Return the path of a block."""
         return self._folder / f"{key}.h5"
 
     def consolidate(self, evaluations: Mapping[str, Evaluations]) -> None:
@@ -142,7 +141,7 @@ class Checkpoint:
 
 
 def digest(value: object, before: bytes = b"") -> bytes:
-    """Return a hash of a value, after some text: of arrays by their numbers, of dataclasses by their fields."""
+    """Return a hash of a value, after some text; arrays count by their numbers, dataclasses by their fields."""
     hashed = hashlib.sha256(before)
     _feed(hashed, value)
     return hashed.digest()
@@ -162,7 +161,7 @@ def _feed(digest: Any, value: object) -> None:
 
 
 def _image(blocks: Mapping[str, Evaluations], note: str = "") -> bytes:
-    """Return the bytes of a file of evaluations, each in a group of this name, without the head."""
+    """Return the bytes of a file of evaluations, each in the group of its name, without the head."""
     with in_memory(creation(HEAD)) as file:
         for name, block in blocks.items():
             group = file.require_group(name)
@@ -192,7 +191,7 @@ def write(group: h5py.Group, block: Evaluations) -> None:
 
 
 def _has_answers(path: Path) -> bool:
-    """Whether a block has more in it than failed solves; what cannot be read counts as more."""
+    """Whether a block holds more than failed solves; a block that cannot be read counts as such."""
     try:
         with h5py.File(path, "r") as file:
             return len(json.loads(file["failures"][()])) < len(file["points"])
@@ -206,18 +205,18 @@ def _write(path: Path, body: bytes, key: str = "") -> None:
 
 
 def _checksum(file: BinaryIO, key: str) -> str:
-    """Return a hash of the rest of a file, and of what the file was asked for."""
+    """Return a hash of the rest of a file and of its key."""
     return hashlib.file_digest(file, lambda: hashlib.sha256(key.encode())).hexdigest()  # type: ignore[arg-type]
 
 
 def _check(path: Path, key: str) -> None:
-    """Raise `DamagedError` unless all is as it was written, before HDF5, which a bit can crash, sees it."""
+    """Raise `DamagedError` unless a file is as it was written; HDF5 may crash on one wrong bit."""
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
             if _checksum(file, key).encode() == head[:64]:
                 return
-            if not key and head.startswith(b"\x89HDF"):  # of a version that wrote none
+            if not key and head.startswith(b"\x89HDF"):  # from a version that wrote no checksum
                 return
     except FileNotFoundError:
         raise
@@ -227,7 +226,7 @@ def _check(path: Path, key: str) -> None:
 
 
 def load(path: Path, name: str = "/") -> Evaluations:
-    """Read evaluations, such as those of an `evaluations.h5`, which has several under their names if there were.
+    """Read evaluations, such as those in an `evaluations.h5`, which holds several by name if there were.
 
     Parameters
     ----------
@@ -239,14 +238,14 @@ def load(path: Path, name: str = "/") -> Evaluations:
     DamagedError
         If the file cannot be read, or its content is not what was written.
     FileNotFoundError
-        If there is none.
+        If there is no file.
     """
     _check(path, "")
     return read(path, name)
 
 
 def read(path: Path, name: str = "/") -> Evaluations:
-    """Read evaluations from a file whose checksum is known to be right."""
+    """Read evaluations from a file whose checksum was verified."""
     try:
         with h5py.File(path, "r") as whole:
             file = whole[name]

@@ -1,8 +1,8 @@
-"""Groups of ranks that evaluate blocks of points side by side.
+"""Rank groups that evaluate blocks of points in parallel.
 
 Rank 0 runs the method; the other ranks serve its requests. A group (the ranks that share one model) takes the next
-block when it is free (`uq.evaluation.turns`). Which group computes a block decides nothing: blocks are added in their
-order.
+block when it is free (`uq.evaluation.turns`). Results do not depend on which group computes a block: blocks are added
+in order.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger
 from uq.evaluation.turns import Progress, Turns, abort_all, end_job
 
 T = TypeVar("T")
-CHEAP = 1e-3  # seconds below which a block is found sooner than its file is written and read again,
-SELDOM = 0.1  # so that a file of such blocks is written only so often (s)
-SECONDS_FOR_OTHERS = 5.0  # in which ranks that fail alike come together
+CHEAP = 1e-3  # seconds below which computing a block is faster than writing and reading its file;
+SELDOM = 0.1  # files of such blocks are written at intervals of this length (s)
+SECONDS_FOR_OTHERS = 5.0  # for ranks that fail in the same way to meet
 
 
 class Ensemble:
@@ -48,13 +48,13 @@ class Ensemble:
         self._turns: Turns | None = None
 
     def count(self, done: int, failed: int) -> None:
-        """Count solves of this group that are no points of a request: rank 0 hears of them, while something runs."""
+        """Count solves of this group that are not points of a request; rank 0 is told while something runs."""
         if self._turns is not None:
             self._turns.count(done, failed)
 
     @contextmanager
     def turns(self, progress: Progress) -> Iterator[Turns]:
-        """Let groups take turns, and count: `progress` of rank 0 is told of what all count; collective."""
+        """Let groups take turns, and count: `progress` on rank 0 is told the counts of all; collective."""
         with Turns.of(self.world, self.group, self.index, progress) as found:
             self._turns = found
             try:
@@ -64,7 +64,7 @@ class Ensemble:
 
     @classmethod
     def split(cls, world: Any, ranks_per_model: int = 1) -> Ensemble:
-        """Split `world` into groups of neighbouring ranks; collective.
+        """Split `world` into groups of consecutive ranks; collective.
 
         Raises
         ------
@@ -78,9 +78,9 @@ class Ensemble:
         return cls(world.Dup(), world.Split(index, world.rank), world.size // ranks_per_model, index)
 
     def together(self, make: Callable[[], T]) -> T:
-        """Return what all ranks make; what is raised on one of them is raised on all; collective.
+        """Return what `make` returns; what it raises on one rank is raised on all; collective.
 
-        A rank that fails alone, while the others wait for it inside what they make, ends the job.
+        A rank that fails alone, while the others wait for it inside `make`, ends the job.
         """
         found, error = None, None
         try:
@@ -123,13 +123,13 @@ class Ensemble:
         task
             Called on rank 0 only, with the evaluation.
         others
-            Make this group's other models by their names (`Evaluate.on`), each when it is first asked for.
+            Make this group's other models by name (`Evaluate.on`), each when first needed.
         checkpoint
             Where finished blocks are kept and found.
         progress
-            On rank 0: told the numbers of points that were done and that failed since it was last told.
+            On rank 0: told the numbers of points that finished and that failed since the last call.
         blocks
-            Most blocks that an evaluation is cut into.
+            Largest number of blocks into which an evaluation is cut.
         node_volumes
             On rank 0: those of the first model, see `Evaluate`.
 
@@ -153,7 +153,7 @@ class Ensemble:
 
 @dataclass(frozen=True)
 class _Order:
-    """A request on its way to all ranks: most blocks, those that are still to be computed, and where each is kept."""
+    """A request sent to all ranks: largest number of blocks, those still to be computed, and their keys."""
 
     request: Request
     blocks: int
@@ -162,7 +162,7 @@ class _Order:
 
 
 class _Models:
-    """The models of this group, each made when it is first asked for; making one is collective over the group."""
+    """The models of this group, each made when first needed; making one is collective over the group."""
 
     def __init__(self, first: ForwardModel, others: Mapping[str, Callable[[], ForwardModel]]) -> None:
         self._makers = others
@@ -191,16 +191,16 @@ class EnsembleEvaluate(OfModel):
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Share (n_nodes,) of the body that each node of the first model stands for, see `Evaluate`."""
+        """Share (n_nodes,) of the body that each node of the first model represents, see `Evaluate`."""
         return self.volumes() if self.name == OWN else None
 
     def on(self, model: str) -> EnsembleEvaluate:
-        """Return the evaluation of another of the models; all groups make it now."""
+        """Return the evaluation of another model; all groups make it now."""
         self.worker.prepare(model)
         return replace(self, name=model)
 
     def __call__(self, request: Request) -> Evaluations:
-        """Evaluate all points of a request on all groups; blocks that are on disk are read."""
+        """Evaluate all points of a request on all groups; blocks on disk are read."""
         request = replace(request, model=self.name)
         blocks = request.blocks(self.blocks)
         checkpoint = self.worker.checkpoint
@@ -230,7 +230,7 @@ class EnsembleEvaluate(OfModel):
 
 
 class _Worker:
-    """What every rank does with an order."""
+    """The part of every rank in an order."""
 
     def __init__(self, ensemble: Ensemble, models: _Models, checkpoint: Checkpoint | None, turns: Turns) -> None:
         self._ensemble = ensemble
@@ -263,7 +263,7 @@ class _Worker:
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 
     def work(self, order: _Order | str) -> None:
-        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by its name."""
+        """Compute blocks of an order until none is left, and send them to rank 0; or make a model, by name."""
         if isinstance(order, str):
             self.models[order]
             return

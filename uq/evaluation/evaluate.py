@@ -1,9 +1,9 @@
-"""Evaluation of a model at many points: what a sampling method calls, and what it gets back.
+"""Evaluation of a model at many points: the requests of sampling methods, and the answers.
 
 Work is cut into blocks of fixed size; sums of fields are formed in index order inside a block and the blocks are added
-in order. So the result does not depend on who computed which block.
+in order. So the result does not depend on which rank computed which block.
 
-Requests, evaluations and the serial way between them are one contract, hence one file.
+Requests, evaluations and their serial implementation are one contract, hence one file.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from forward.model import (
 )
 from uq.inputs.coordinates import Coordinates
 
-OWN = ""  # name of the model that an evaluation has first
-LARGEST = 1e60  # size of outputs, and one over it the smallest: fourth powers of them are numbers
-MANY = 8  # points of which one is expected to have an output that is not small by chance
-TOGETHER = 16  # realisations whose part of a compact sum is formed at once
+OWN = ""  # name of the first model of an evaluation
+LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers must not overflow or underflow
+MANY = 8  # points among which at least one should have an output that is not small by chance
+TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A point without an answer, and why; whether there is no model there at all, or only no solution was found."""
+    """A point without an answer, and why: the model is not defined there, or no solution was found."""
 
     index: int
     parameters: tuple[float, ...]
@@ -61,26 +61,26 @@ class Evaluations:
     outputs
         Outputs (n, m); NaN in the rows that failed.
     tangents
-        dψ/dω (n, m, d) where they were asked for, NaN where a solve failed.
+        dψ/dω (n, m, d) if requested, NaN where a solve failed.
     failures
         The points that failed, by index.
     seconds
-        Processor time (n,) that each point took on one group of ranks, times the ranks of the group.
+        Processor time (n,) of each point on one rank group, times the ranks of the group.
     work
-        Counts (n, k) of the operations `forward.model.WORK`.
+        Numbers (n, k) of the operations in `forward.model.WORK`.
     residuals
         Relative residuals (n,) of the states, in the solver's measure; NaN where a solve failed.
     converged
-        Which states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
+        Whether the states (n,) meet the solver's tolerance: all that did not fail, unless its iterations were limited.
     stability
-        Whether each state (n,) was counted or only screened, or refused as unstable: `forward.model.Stability`.
+        Whether the stability of each state (n,) was counted or screened, or refused: `forward.model.Stability`.
     fields
-        Sum over the points that did not fail of the rows (k, U) of the field sum that was asked for; in a block of a
+        Sum over the points that did not fail of the rows (k, U) of the requested field sum; in a block of a
         `CompactSum`, the rows of these points themselves, one point after the other.
     sketches
-        What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are put together.
+        What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are merged.
     mesh_errors
-        Estimated errors of the mesh (n, m) where they were asked for, NaN where a solve failed or nothing is estimated.
+        Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
     """
 
     points: FloatArray
@@ -105,7 +105,7 @@ class Evaluations:
 
 
 class FieldSum(Protocol):
-    """A quantity of each realisation's state that is summed as the realisations stream by."""
+    """A quantity of each realisation's state that is summed while realisations are computed."""
 
     def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → rows (k, U_local) to be summed, for one group's model."""
@@ -113,22 +113,22 @@ class FieldSum(Protocol):
 
 @runtime_checkable
 class CompactSum(FieldSum, Protocol):
-    """A sum whose terms have many rows that follow from few of each realisation: blocks carry those few.
+    """A sum whose terms have many rows that follow from a few rows of each realisation: blocks hold those few.
 
-    `on` returns the few; the sum is formed where blocks are added, so that files and messages stay small.
+    `on` returns these few; the sum is formed when blocks are added, so that files and messages stay small.
     """
 
     def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the sum (K, U) over some realisations, from their parameters (n, d) and their rows (n, r, U)."""
 
     def sketch(self, rows: FloatArray) -> FloatArray | None:
-        """Return a few numbers (n, r, k) of the rows (n, r, U) of some realisations, to be kept; None for none."""
+        """Return a few numbers (n, r, k) to be kept of the rows (n, r, U) of some realisations; or None."""
 
 
 class JointSum(Protocol):
-    """A quantity of the states of several points that follow each other, summed as these rows of points stream by.
+    """A quantity of the states of several consecutive points, summed while these rows of points are computed.
 
-    A row is never cut by blocks; one in which a solve failed adds nothing.
+    Blocks hold whole rows; a row with a failed solve adds nothing.
     """
 
     @property
@@ -140,9 +140,9 @@ class JointSum(Protocol):
 
 
 class Start(Protocol):
-    """A prediction of the state: start of the solver at every point, with the reference whose factor corrects it.
+    """A prediction of the state: initial guess of the solver at every point, with the reference that corrects it.
 
-    A dataclass, by whose fields the blocks that were started from it are found again.
+    A dataclass; its fields are part of the keys of the blocks that were started from it.
     """
 
     def on(self, model: ForwardModel) -> Callable[[FloatArray], Guess]:
@@ -160,7 +160,7 @@ class Prediction:
     state
         State (U,) there, in canonical order.
     slopes
-        Derivatives (d, U) of the state along the coordinates, or none (0, U): then the solver starts from the state at
+        Derivatives (d, U) of the state along the coordinates; empty (0, U) if the solver starts from the state at
         `point`.
     coordinates
         The coordinates.
@@ -186,26 +186,26 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of an evaluation.
+    """What an evaluation is asked for.
 
     Attributes
     ----------
     points
         Parameters (n, d).
     tangents
-        Whether the derivatives of the outputs are wanted.
+        Whether the derivatives of the outputs are computed.
     fields
-        What is summed of the states.
+        Sum over the states.
     start
-        Where the solver starts.
+        Initial guesses of the solver.
     iterations
-        Iterations of the solver after which its state is taken as it is, see `ForwardModel.solve`.
+        Iterations of the solver after which its state is accepted as it is, see `ForwardModel.solve`.
     model
-        Name of the model among those that the evaluation has; `Evaluate.on` sets it.
+        Name of one of the models of the evaluation; `Evaluate.on` sets it.
     joint
-        What is summed, in place of `fields`, of the states of points that follow each other.
+        Sum over the states of consecutive points, instead of `fields`.
     mesh_errors
-        Whether the errors that the mesh makes of the outputs are estimated (`Solution.mesh_error`).
+        Whether the errors of the mesh in the outputs are estimated (`Solution.mesh_error`).
     """
 
     points: FloatArray
@@ -218,14 +218,14 @@ class Request:
     mesh_errors: bool = False
 
     def blocks(self, most: int | None = None) -> list[Request]:
-        """Cut into blocks that depend on the number of points, of those that belong together, and `most` only."""
+        """Cut into blocks that depend only on the number of points, the size of rows, and `most`."""
         together = 1 if self.joint is None else self.joint.size
         size = together * max(1, -(-len(self.points) // (together * (most or BLOCKS))))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 
 
 class Evaluate(Protocol):
-    """A model seen by a sampling method: points in, evaluations out."""
+    """A model as seen by a sampling method: points in, evaluations out."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -241,17 +241,17 @@ class Evaluate(Protocol):
 
     @property
     def displacements(self) -> int:
-        """Number of displacements at the head of a state, see `NodalSpace.displacements`."""
+        """Number of displacements at the start of a state, see `NodalSpace.displacements`."""
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Share (n_nodes,) of the body that each node stands for in integrals; None: all nodes count alike."""
+        """Share (n_nodes,) of the body that each node represents in integrals; None if all nodes count equally."""
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request."""
 
     def on(self, model: str) -> Evaluate:
-        """Return the evaluation of another of the models (meshes, solvers), by its name; the first is called `OWN`."""
+        """Return the evaluation of another model (mesh, solver), by name; the first one is `OWN`."""
 
 
 class OfModel:
@@ -317,16 +317,16 @@ class OfEvaluate:
 
 @dataclass(frozen=True)
 class SerialEvaluate(OfModel):
-    """Evaluation of a model in this process, point after point.
+    """Evaluation of a model in this process, point by point.
 
     Parameters
     ----------
     model
         The model.
     progress
-        Told the numbers of points that were done and that failed since it was last told.
+        Told the numbers of points that finished and that failed since the last call.
     others
-        Models that a method may ask for, by their names.
+        Other models that a method may ask for, by name.
     node_volumes
         See `Evaluate`.
     """
@@ -347,16 +347,16 @@ class SerialEvaluate(OfModel):
 
 
 class Recorder(OfEvaluate):
-    """An evaluation that keeps what it returned, and says what that has cost.
+    """An evaluation that keeps what it returned, with the cost.
 
     Attributes
     ----------
     log
         Every evaluation, in order, of all models; shared by the evaluations of the other models.
     models
-        The name of the model of each.
+        The name of the model of each evaluation.
     first
-        The first evaluation of this model whole, with derivatives and fields: methods begin at the mean parameters.
+        The complete first evaluation of this model, with derivatives and fields: methods begin at the mean parameters.
     """
 
     def __init__(self, evaluate: Evaluate, whole: Recorder | None = None, model: str = OWN) -> None:
@@ -372,12 +372,12 @@ class Recorder(OfEvaluate):
         Raises
         ------
         ModelError
-            If outputs are so large or small that the fourth powers of them are no numbers any more.
+            If outputs are so large or small that their fourth powers overflow or underflow.
         """
         evaluations = self._evaluate(request)
         _check_magnitude(evaluations, self.outputs)
         self.first = self.first or evaluations
-        # Derivatives and fields are the method's own business.
+        # Derivatives and fields are not kept: only methods need them.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0], sketches=None))
         self.models.append(self._model)
         return evaluations
@@ -398,13 +398,13 @@ class Recorder(OfEvaluate):
 
 
 def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:
-    """Raise a ModelError where fourth powers of outputs, of which errors are made, overflow or vanish."""
+    """Raise a ModelError if fourth powers of outputs, from which errors are computed, overflow or vanish."""
     sizes = np.abs(evaluations.outputs[evaluations.ok]).max(axis=0, initial=0.0)
     for name, size in zip(names, sizes.tolist(), strict=True):
         if size > LARGEST or (0 < size < 1 / LARGEST and len(evaluations.points) >= MANY):
             message = (
-                f"output {name} is of the size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}: moments of "
-                "what is beyond are no numbers; take another unit, or its logarithm"
+                f"output {name} is of size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}, beyond which "
+                "moments overflow or vanish; use another unit, or its logarithm"
             )
             raise ModelError(message)
 
@@ -423,7 +423,7 @@ class BlockSolver:
         self._plain = Guess(iterations=request.iterations)
 
     def _guessed(self, point: FloatArray) -> Guess:
-        """What is known of the solution at a point (d,)."""
+        """What is known about the solution at a point (d,)."""
         if self._guess is None:
             return self._plain
         return replace(self._guess(point), iterations=self._plain.iterations)
@@ -440,8 +440,8 @@ class BlockSolver:
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         stability = np.zeros(n, dtype=np.int8)
         failures: list[Failure] = []
-        rows: list[FloatArray] = []  # of each point where they are compact, or else their sum
-        states: list[FloatArray] = []  # of a row that is not complete
+        rows: list[FloatArray] = []  # of each point for compact sums, otherwise their sum
+        states: list[FloatArray] = []  # of an incomplete row
         solutions = model.solve_many(points, map(self._guessed, points))
         for i, point in enumerate(points):
             begin = time.process_time()
@@ -455,7 +455,7 @@ class BlockSolver:
                 if self._row is not None:
                     row = self._row(solution, point)
                 if tangents is not None:
-                    # One derivative for each parameter or for each output, whichever are fewer.
+                    # One derivative for each parameter or for each output, whichever is fewer.
                     tangents[i] = solution.adjoint(np.eye(m)) if m < d else solution.tangent(np.eye(d)).T
             except SolveError as error:
                 row = None
@@ -474,7 +474,7 @@ class BlockSolver:
             if row is not None and (self._compact or not rows):
                 rows.append(row.copy())
             elif row is not None:
-                # In place: these are the largest arrays there are, and a new one for each sample takes longer.
+                # In place: these are the largest arrays, and a new one for each sample takes longer.
                 rows[0] += row
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
@@ -497,7 +497,7 @@ class BlockSolver:
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
-    """Put the blocks of a request for these fields together, or several evaluations, in their order."""
+    """Merge the blocks of a request for these fields, or several evaluations, in order."""
     merger = Merger(fields)
     for block in blocks:
         merger.add(block)
@@ -505,12 +505,12 @@ def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Eval
 
 
 class Merger:
-    """Adds blocks in their order, keeping one sum of fields.
+    """Adds blocks in order, with one sum of fields.
 
     Parameters
     ----------
     fields
-        The sum that the blocks are parts of; none where each of them is complete.
+        The sum of which the blocks are parts; None if each of them is complete.
 
     Attributes
     ----------
@@ -544,7 +544,7 @@ class Merger:
         self._blocks.append(replace(block, fields=np.zeros((0, 0)), sketches=None))
 
     def _form(self) -> None:
-        """Add what waits, in one product: the sum is read and written once for all of it."""
+        """Add the pending rows in one product: the sum is read and written only once."""
         if self._compact is not None and self._waiting:
             points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
             self._add(self._compact.total(points, rows))

@@ -1,4 +1,4 @@
-"""HDF5 and netCDF-4 files made in memory: one on disk that cannot be written to the end kills its process."""
+"""HDF5 and netCDF-4 files made in memory: a file on disk that cannot be completed kills its process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ File = h5py.File
 
 
 def in_memory(creation: Any = None) -> h5py.File:
-    """Return a new HDF5 file in memory; `creation` is the list of properties that it is created with."""
+    """Return a new HDF5 file in memory; `creation` is its property list."""
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_EARLIEST, h5py.h5f.LIBVER_LATEST)
     access.set_fapl_core(2**20, backing_store=False)
@@ -23,15 +23,15 @@ def in_memory(creation: Any = None) -> h5py.File:
 
 
 def image(file: h5py.File) -> bytes:
-    """Return the bytes of a file in memory, without those that `head` leaves free."""
+    """Return the bytes of a file in memory, without those left free by `head`."""
     file.flush()
     return bytes(file.id.get_file_image())
 
 
 def creation(head: int = 0, *, ordered: bool = False) -> Any:
-    """Return the properties of a file with so many bytes before those of HDF5, and without times.
+    """Return the property list of a file with `head` bytes before those of HDF5, and without time stamps.
 
-    `ordered` ones keep the order in which things were created, which netCDF-4 needs.
+    `ordered` files keep the order of creation, which netCDF-4 needs.
     """
     properties = h5py.h5p.create(h5py.h5p.FILE_CREATE)
     if head:
@@ -50,11 +50,11 @@ def netcdf(
     Parameters
     ----------
     dataset, groups
-        Its variables, and those of its groups by their names.
+        The variables of the file, and those of its groups by name.
     head
         Bytes before those of HDF5.
     more
-        Writes what is not netCDF into groups of the file.
+        Writes data that are not netCDF into groups of the file.
     """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
@@ -71,7 +71,7 @@ def netcdf(
 
 
 def _ordered(properties: Any) -> Any:
-    """Properties of a file or group that keeps the order of its parts, and no time, with which HDF5 stamps groups."""
+    """Properties of a file or group that keeps the order of its parts, without the time stamps of HDF5."""
     order = h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED
     properties.set_obj_track_times(False)
     properties.set_link_creation_order(order)

@@ -1,4 +1,4 @@
-"""Evaluations and solves of a model by one group of ranks, which keeps what it has solved."""
+"""Evaluations and solves of a model by one rank group, which stores what it has solved."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, R
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
 
-BLOCKS = 16  # that a request is cut into: an interruption costs at most one of them
-LEAST = 4  # points of a block, unless a request has fewer
+BLOCKS = 16  # into which a request is cut: an interruption costs at most one of them
+LEAST = 4  # points in a block, unless a request has fewer
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """What decides on a block: of a start, its point, since its state is rounded where ranks share a model."""
+    """What determines a block: of a start only its point, as its state has rounding errors if ranks share a model."""
 
     label: str
     points: FloatArray
@@ -43,7 +43,7 @@ class _Asked:
 
 @dataclass(frozen=True)
 class KeptEvaluate(OfModel):
-    """Evaluation of a model in one group of ranks; blocks that are on disk are read. Collective over the group.
+    """Evaluation of a model in one rank group; blocks on disk are read. Collective over the group.
 
     Parameters
     ----------
@@ -54,9 +54,9 @@ class KeptEvaluate(OfModel):
     checkpoint
         Where finished blocks are kept and found.
     label
-        What the model is of beside the study.
+        What determines the model besides the study.
     progress
-        Told the numbers of points that were done and that failed since it was last told.
+        Told the numbers of points that finished and that failed since the last call.
     log
         Every evaluation is added to it, without derivatives and fields.
 
@@ -75,7 +75,7 @@ class KeptEvaluate(OfModel):
     keys: list[str] = field(default_factory=list)
 
     def on(self, model: str) -> KeptEvaluate:
-        """Return itself: it has one model."""
+        """Return itself: there is one model."""
         return self
 
     @property
@@ -111,7 +111,7 @@ class KeptEvaluate(OfModel):
         return self.checkpoint.load(key) if self.checkpoint.has(key) else None
 
     def forget(self) -> None:
-        """Remove the blocks: what follows from them is kept."""
+        """Remove the blocks, once their results are stored."""
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()
@@ -119,7 +119,7 @@ class KeptEvaluate(OfModel):
 
 @dataclass(frozen=True)
 class _Solved:
-    """What decides on a solve."""
+    """What determines a solve."""
 
     label: str
     parameters: FloatArray
@@ -127,16 +127,16 @@ class _Solved:
 
 @dataclass(frozen=True)
 class KeptModel(OneByOne):
-    """A model in one group of ranks whose states are kept: one that is on disk is where the solver starts, and ends.
+    """A model in one rank group whose states are stored: the solver starts from a state on disk, and ends there.
 
-    The state meets the tolerance as it is, so that a solution found again is the same. Collective over the group.
+    A stored state meets the tolerance already, so that the solution is the same. Collective over the group.
 
     Parameters
     ----------
     model, group, checkpoint, label
-        As of `KeptEvaluate`.
+        As in `KeptEvaluate`.
     log
-        Every solve is added to it, without its point: that may be of as many numbers as the mesh has nodes.
+        Every solve is added to it, without its point, which may have as many numbers as the mesh has nodes.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class KeptModel(OneByOne):
 
     @property
     def space(self) -> NodalSpace | None:
-        """As of the model."""
+        """As for the model."""
         return self.model.space
 
     @property
@@ -172,7 +172,7 @@ class KeptModel(OneByOne):
         return self.model.differentiable
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
-        """Return the solution at parameters (d,), from its state if that is kept; errors as of the model."""
+        """Return the solution at parameters (d,), from its state if that is stored; errors as for the model."""
         key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
         self.keys.append(key)
         kept = None
@@ -207,7 +207,7 @@ class KeptModel(OneByOne):
         self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
 
     def forget(self) -> None:
-        """Remove the states: what follows from them is kept."""
+        """Remove the states, once their results are stored."""
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()

@@ -1,8 +1,8 @@
-"""A map over tasks of which each gives a dataset, shared by groups of ranks and kept like blocks of evaluations.
+"""A map over tasks that each return a dataset, shared by rank groups and stored like blocks of evaluations.
 
-Each group takes the next task when it is free; all of its ranks work on it together. What came of a task, a dataset or
-the reason why there is none, is a file of its own as soon as it is there (`uq.evaluation.checkpoint`): an interrupted
-map goes on with the others. The outcome of a task does not depend on who made it, nor on the others.
+Each group takes the next task when it is free; all of its ranks work on it together. The outcome of a task, a dataset
+or the reason for its failure, is written to its own file as soon as it is known (`uq.evaluation.checkpoint`): an
+interrupted map continues with the other tasks. An outcome does not depend on the group, nor on other tasks.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _SOLVED = "evaluations"  # group of a file
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a task.
+    """The outcome of a task.
 
     Attributes
     ----------
     dataset
-        What it gave; None where it failed.
+        Its result; None if it failed.
     reason
-        Why it failed; empty where it did not.
+        Why it failed; empty if it did not.
     evaluations
-        What was solved for it; None where nothing was.
+        The solves made for it; None if there were none.
     seconds
         Processor time of its group's first rank.
     """
@@ -54,7 +54,7 @@ class Outcome:
         return 0 if self.evaluations is None else len(self.evaluations.points)
 
     def image(self, note: str) -> bytes:
-        """Return the bytes of a netCDF-4 file, with what was solved as a group of HDF5."""
+        """Return the bytes of a netCDF-4 file, with the solves in an HDF5 group."""
         import xarray as xr
 
         dataset = xr.Dataset() if self.dataset is None else self.dataset
@@ -68,12 +68,12 @@ class Outcome:
 
     @classmethod
     def read(cls, path: Path) -> Outcome:
-        """Read an outcome from a file whose checksum is known to be right.
+        """Read an outcome from a file whose checksum was verified.
 
         Raises
         ------
         DamagedError
-            If that holds something else.
+            If the file holds something else.
         """
         import xarray as xr
 
@@ -89,7 +89,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Task:
-    """What decides on an outcome, beside the study."""
+    """What determines an outcome besides the study."""
 
     number: int
     name: str
@@ -105,30 +105,30 @@ def run_tasks(
     arrived: Callable[[int, Outcome], None] = lambda number, outcome: None,
     kept: Callable[[], None] = lambda: None,
 ) -> list[Outcome] | None:
-    """Do tasks, each on one group of ranks; collective over all ranks.
+    """Run tasks, each on one rank group; collective over all ranks.
 
     Parameters
     ----------
     ensemble
         The groups.
     names
-        Of the tasks, by which finished ones are found again.
+        Names of the tasks, by which finished ones are found again.
     work
-        Does a task, by its number, and appends what it has solved to a list; collective over a group. A task that
-        raises `SolveError` has failed, and the others go on.
+        Runs a task, by number, and appends its solves to a list; collective over a group. A task that raises
+        `SolveError` has failed, and the others continue.
     checkpoint
         Where finished tasks are kept and found.
     progress
         On rank 0: told the numbers of solves that tasks have counted (`Ensemble.count`), and of those that failed.
     arrived
-        On rank 0: told of each finished task as soon as it is there, in any order.
+        On rank 0: called for each finished task as soon as its outcome is known, in any order.
     kept
-        In the group that has done a task: called when its file is there.
+        On the group that has run a task: called when its file is written.
 
     Returns
     -------
     list
-        The outcomes in the order of the names, on rank 0; None on the other ranks.
+        The outcomes in the order of the names on rank 0; None on the other ranks.
     """
     from uq.evaluation.turns import abort_all
 

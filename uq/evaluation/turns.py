@@ -1,7 +1,7 @@
-"""Numbered pieces of work that groups of ranks take as they become free; rank 0 receives what comes of each.
+"""Numbered pieces of work that rank groups take as they become free; rank 0 receives the results.
 
-A group takes the next piece from a counter in rank 0's memory (an MPI window), so that no one waits for a slow
-neighbour. Rank 0 works too, and receives the results of others while it does.
+A group takes the next piece from a counter in rank 0's memory (an MPI window), so that none waits for a slow one.
+Rank 0 works too, and receives the results of others meanwhile.
 """
 
 from __future__ import annotations
@@ -20,60 +20,60 @@ from forward.machine import reason_to_stop
 from forward.model import ModelError, SolveError
 
 T = TypeVar("T")
-Progress = Callable[[int, int], None]  # told how many solves were done, and failed, since it was last told
+Progress = Callable[[int, int], None]  # told how many solves finished, and failed, since the last call
 _RESULT = 1
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results
 
 
 class Turns:
-    """The turns of the groups of one world; made and used by all of its ranks together.
+    """The turns of the rank groups of one world; making and using it is collective.
 
     Parameters
     ----------
     world, group, index
         All ranks, those of this rank's group, and the number of that group.
     progress
-        On rank 0, told of what `count` counts in any group.
+        On rank 0: told the counts of all groups.
     """
 
     def __init__(self, world: Any, group: Any, index: int, progress: Progress, counters: Sequence[Counter]) -> None:
         self._world, self._group, self._index = world, group, index
         self._turn, *tallied = counters
         self._tally = _Tally(tallied, progress if world.rank == 0 else None)
-        self._drain: Callable[[], None] = lambda: None  # on rank 0: receive what is there
+        self._drain: Callable[[], None] = lambda: None  # on rank 0: receive what has arrived
 
     @classmethod
     @contextmanager
     def of(cls, world: Any, group: Any, index: int, progress: Progress) -> Iterator[Turns]:
-        """Make the counters, and give them back; collective."""
+        """Make the counters, and free them at the end; collective."""
         with counter(world) as turn, counter(world) as solves, counter(world) as failures:
             yield cls(world, group, index, progress, (turn, solves, failures))
 
     def count(self, done: int, failed: int) -> None:
-        """Count solves on the first rank of a group; rank 0 hears of them at its own next count."""
+        """Count solves on the first rank of a group; rank 0 is told at its own next count."""
         if self._group.rank == 0:
             self._tally(done, failed)
             self._drain()
 
     def drain(self) -> None:
-        """Rank 0: receive the results that have come."""
+        """Rank 0: receive the results that have arrived."""
         self._drain()
 
     def restart(self) -> None:
-        """Rank 0: begin with the first piece again, before the others are told of new pieces."""
+        """Rank 0: start again with the first piece, before the others are told of new pieces."""
         self._turn.reset()
 
     def lead(self, pending: Sequence[int], work: Callable[[int], T], receive: Callable[[int, T, bool], None]) -> None:
-        """Rank 0: work on pieces until all are done, here or elsewhere.
+        """Rank 0: work on pieces until all are finished, here or elsewhere.
 
         Parameters
         ----------
         pending
             Numbers of the pieces.
         work
-            Makes what comes of a piece; collective over the group.
+            Computes the result of a piece; collective over the group.
         receive
-            Takes a number, what came of it, and whether another group made it; in any order.
+            Takes a number, its result, and whether another group computed it; in any order.
         """
         world, missing = self._world, set(pending)
 
@@ -90,19 +90,19 @@ class Turns:
             accept(i, found, theirs=False)
         heard = time.monotonic()
         while missing:
-            # Waiting as `recv` does, but other groups' solves go on being counted.
+            # Waits as `recv` does, but keeps counting other groups' solves.
             while not world.iprobe(tag=_RESULT):
                 time.sleep(0)
                 if time.monotonic() > heard + SECONDS_BETWEEN_COUNTS:
                     self.count(0, 0)
                     heard = time.monotonic()
             accept(*world.recv(tag=_RESULT), theirs=True)
-        # Only when everyone has seen that no turn is left may the counter start again for the next pieces.
+        # The counter may restart for the next pieces only once every rank has seen that no turn is left.
         world.barrier()
         self.count(0, 0)
 
     def follow(self, pending: Sequence[int], work: Callable[[int], T]) -> None:
-        """Other ranks: work on pieces until none is left, and send to rank 0 what comes of them."""
+        """Other ranks: work on pieces until none is left, and send the results to rank 0."""
         sent: list[Any] = []
         for result in self._taken(pending, work):
             if self._group.rank == 0 and self._index > 0:
@@ -125,29 +125,29 @@ class Turns:
 
 
 class Counter:
-    """A number in rank 0's memory that any rank can read and raise in one step."""
+    """A number in rank 0's memory that any rank can read and increase atomically."""
 
     def __init__(self, world: Any) -> None:
         self._world = world
         size = MPI.INT64_T.Get_size()
         self._window = MPI.Win.Allocate(size if world.rank == 0 else 0, size, comm=world)
         if world.rank == 0:
-            self.reset()  # what the memory held before is anything
+            self.reset()  # the memory is not initialised
         world.barrier()
 
     def reset(self) -> None:
-        """Start from zero again (rank 0, while no one takes)."""
+        """Start from zero again (on rank 0, while no rank takes a number)."""
         zero = np.zeros(1, dtype=np.int64)
         self._window.Lock(0, MPI.LOCK_EXCLUSIVE)
         self._window.Put(zero, 0)
         self._window.Unlock(0)
 
     def take(self) -> int:
-        """Return the number and raise it by one."""
+        """Return the number and increase it by one."""
         return self.add(1)
 
     def add(self, count: int) -> int:
-        """Raise the number by a count, and return what it was before."""
+        """Increase the number by a count, and return the previous one."""
         value = np.empty(1, dtype=np.int64)
         self._window.Lock(0, MPI.LOCK_SHARED)
         self._window.Fetch_and_op(np.array([count], dtype=np.int64), value, 0, op=MPI.SUM)
@@ -155,7 +155,7 @@ class Counter:
         return int(value[0])
 
     def free(self) -> None:
-        """Give the window back; collective."""
+        """Free the window; collective."""
         self._window.Free()
 
 
@@ -187,7 +187,7 @@ def counter(world: Any) -> Iterator[Counter]:
 
 @contextmanager
 def abort_all(world: Any) -> Iterator[None]:
-    """An exception that only one rank knows of would leave the others waiting for ever: print it and stop them all."""
+    """Print an exception that only one rank knows of, and stop all ranks: the others would wait forever."""
     try:
         yield
     except BaseException as error:
@@ -198,9 +198,9 @@ def abort_all(world: Any) -> Iterator[None]:
 
 
 def end_job(world: Any, error: BaseException) -> None:
-    """End the job of all ranks with exit code 1 for an exception of this rank, in one line where it has a reason."""
+    """End the job of all ranks with exit code 1 for an exception of this rank, in one line if it has a reason."""
     reason = str(error) if isinstance(error, ModelError | SolveError) else reason_to_stop(error)
-    # Where all ranks fail alike, the first one to speak ends the others.
+    # If all ranks fail in the same way, the first one to report ends the others.
     time.sleep(min(0.1 * world.rank, 1.0))
     if reason is None:
         traceback.print_exception(error)

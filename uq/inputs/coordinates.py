@@ -1,9 +1,9 @@
-"""The coordinates in which outputs are taken for polynomials: the parameters, or logarithms of some, standardised.
+"""The coordinates in which outputs are approximated by polynomials: parameters, or logarithms of some, standardised.
 
-Polynomials of a log-normal ω are not even dense in the functions of ω with a variance (O. G. Ernst, A. Mugler, H.-J.
-Starkloff, E. Ullmann, ESAIM: M2AN 46 (2012) 317–339), and moments of those that are fitted are made where no sample is.
-In ln ω they are Hermite's, and converge. Which distributions have polynomials of the logarithm their blocks say
-(`uq.inputs.distributions`).
+Polynomials of a log-normal ω are not even dense in the functions of ω with finite variance (O. G. Ernst, A. Mugler,
+H.-J. Starkloff, E. Ullmann, ESAIM: M2AN 46 (2012) 317–339), and the moments of fitted ones depend on their values where
+no sample is. In ln ω they are Hermite's, and converge. Each distribution says whether its polynomials are of the
+logarithm (`uq.inputs.distributions`).
 
 With x_i = ω_i or ln ω_i, t = (x − E x)/std x has mean 0 and variance 1, and derivatives along t follow by the chain
 rule: ∂ψ/∂t_i = (∂ω_i/∂t_i) ∂ψ/∂ω_i, with the `steps` ∂ω_i/∂t_i = std x_i, times ω_i where x_i is its logarithm.

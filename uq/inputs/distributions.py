@@ -1,13 +1,13 @@
 """Distributions of one parameter, as blocks of a study.
 
-Quantiles are sought from the nearer end, p = F(ω) or 1 − p, so that neither tail is lost to rounding; moments are
+Quantiles are computed from the nearer end, p = F(ω) or 1 − p, so that neither tail is lost to rounding; moments are
 closed forms, or Gauss rules around a point of the distribution, so that none is a difference of large numbers.
-Chaospy's own hold to six digits where there is no closed form, and not at all for beta(a, b) with a + b = 2, a ≠ b,
-and for normals that are cut beyond eight standard deviations.
+Chaospy's own are accurate to six digits if there is no closed form, and wrong for beta(a, b) with a + b = 2, a ≠ b,
+and for normals that are truncated beyond eight standard deviations.
 
 Polynomials are of the coordinate in which they converge (`logarithmic`), see docs/decisions/0009-coordinates.md.
 
-It is long because there are many distributions, each a small class.
+The file is long because there are many distributions, each a small class.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from forward.settings import Settings
 from uq.inputs.quadrature import Cut, panels
 
 PositiveFloat = Annotated[float, Gt(0)]
-RARE = 1e-4  # probability of what is beyond the range of a distribution with a tail
-TAIL = 1e-16  # nearest to 0 and 1 that a probability is taken to a quantile
-EXTREME = 1e60  # fourth powers of numbers beyond it, or below its inverse, leave the range of doubles
-NARROW = 1e-10  # standard deviation over the mean below which rounding of the parameter shows in results
+RARE = 1e-4  # probability beyond the range, for a distribution with a tail
+TAIL = 1e-16  # smallest distance to 0 and 1 of a probability for which a quantile is computed
+EXTREME = 1e60  # fourth powers of numbers above it, or below its inverse, leave the range of doubles
+NARROW = 1e-10  # standard deviation over the mean below which rounding of the parameter affects results
 WIDE = 10.0  # ratio of the quantiles at 10⁻⁴ and 1 − 10⁻⁴ from which polynomials are of the logarithm
 
 
@@ -45,7 +45,7 @@ class _Distribution(Settings):
     @property
     @abstractmethod
     def _frame(self) -> tuple[float, float]:
-        """Origin and unit of the variable u = (ω − origin)/unit of the next three."""
+        """Origin and unit of the variable u = (ω − origin)/unit of the next three methods."""
 
     @abstractmethod
     def _log_density(self, u: FloatArray) -> FloatArray:
@@ -86,7 +86,7 @@ class _Distribution(Settings):
         return float(weights @ deviations**3), float(weights @ deviations**4)
 
     def recurrence(self, degree: int) -> FloatArray:
-        """Return α and β (2, degree + 1) of the orthogonal polynomials of (ω − mean)/std, where `closed`; β_0 = 1.
+        """Return α and β (2, degree + 1) of the orthogonal polynomials of (ω − mean)/std, if `closed`; β_0 = 1.
 
         π_k+1 = (t − α_k) π_k − β_k π_k−1 (W. Gautschi, Orthogonal Polynomials (2004), theorem 1.27).
         """
@@ -108,7 +108,7 @@ class _Distribution(Settings):
 
     @property
     def range(self) -> tuple[float, float]:
-        """Ends of the support or, of tails, the quantiles that one of ten thousand samples is beyond."""
+        """Ends of the support or, for a tail, the quantile that one of ten thousand samples exceeds."""
         return self.support or (self.at(RARE), self.at(1 - RARE))
 
     @cached_property
@@ -118,7 +118,7 @@ class _Distribution(Settings):
 
     @cached_property
     def of_coordinate(self) -> tuple[float, float]:
-        """Expected value and standard deviation of what polynomials are of: ω, or ln ω where `logarithmic`."""
+        """Expected value and standard deviation of the argument of polynomials: ω, or ln ω if `logarithmic`."""
         if not self.logarithmic:
             return self.moments
         origin, offsets, weights = self.rule
@@ -169,13 +169,13 @@ class _Distribution(Settings):
         ):
             message = (
                 f"mean {mean:.6g} and standard deviation {std:.3g}: too large, small or wide for double precision, "
-                f"expected numbers between {1 / EXTREME:g} and {EXTREME:g} in units of their own"
+                f"expected numbers between {1 / EXTREME:g} and {EXTREME:g} in their own units"
             )
             raise ValueError(message)
         if not (np.isfinite(mean) and np.isfinite(std) and std > NARROW * abs(mean)):
             message = (
                 f"mean {mean:.6g} and standard deviation {std:.3g}: too narrow for double precision, expected "
-                f"a standard deviation above {NARROW:g} of the mean, or the value itself in the model"
+                f"a standard deviation above {NARROW:g} of the mean, or a fixed value in the model"
             )
             raise ValueError(message)
         return self
@@ -199,7 +199,7 @@ class _Bounded(_Distribution):
         return np.clip(super().quantile(probability), self.lower, self.upper)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As of every distribution, within the range in spite of rounding."""
+        """As for every distribution, within the range in spite of rounding."""
         values, slopes = super().from_normal(z)
         return np.clip(values, self.lower, self.upper), slopes
 
@@ -232,7 +232,7 @@ class Uniform(_Bounded):
         return self.lower + (self.upper - self.lower) / 2, float((self.upper - self.lower) / np.sqrt(12))
 
     def recurrence(self, degree: int) -> FloatArray:
-        """As of every closed distribution: Legendre's polynomials."""
+        """As for every closed distribution: Legendre's polynomials."""
         k = np.arange(1, degree + 1)
         return np.array([np.zeros(degree + 1), np.append(1.0, 3 * k**2 / (4.0 * k**2 - 1))])
 
@@ -257,12 +257,12 @@ class LogUniform(_Bounded):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As of every distribution."""
+        """As for every distribution."""
         return True
 
     @cached_property
     def of_coordinate(self) -> tuple[float, float]:
-        """As of every distribution."""
+        """As for every distribution."""
         return float(np.log(self.lower) + self._length / 2), float(self._length / np.sqrt(12))
 
     @property
@@ -272,7 +272,7 @@ class LogUniform(_Bounded):
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As of every distribution."""
+        """As for every distribution."""
         logs, weights = panels([0.0, self._length])
         return self.lower, self.lower * np.expm1(logs), weights / weights.sum()
 
@@ -301,7 +301,7 @@ class Triangular(_Bounded):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As of every distribution: where it is positive and spans more than a decade."""
+        """As for every distribution: if it is positive and spans more than a decade."""
         return self._over_decades()
 
     @property
@@ -310,7 +310,7 @@ class Triangular(_Bounded):
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As of every distribution."""
+        """As for every distribution."""
         unit, c = self.upper - self.lower, self._peak
         u, weights = panels([0.0, c, 1.0])
         weights = weights * np.where(u < c, u / c if c else 1.0, (1 - u) / (1 - c) if c < 1 else 1.0)
@@ -349,7 +349,7 @@ class Beta(_Bounded):
 
     closed: ClassVar[bool] = True
     kind: Literal["beta"] = "beta"
-    a: Annotated[PositiveFloat, Field(le=1e9)]  # beyond, quantiles take minutes, of what is hardly random
+    a: Annotated[PositiveFloat, Field(le=1e9)]  # above, quantiles take minutes, and the parameter is hardly random
     b: Annotated[PositiveFloat, Field(le=1e9)]
 
     def _chaospy(self, cp: Any) -> Any:
@@ -363,13 +363,13 @@ class Beta(_Bounded):
         return self.lower + unit * share, float(unit * np.sqrt(share * (b / (a + b)) / (a + b + 1)))
 
     def recurrence(self, degree: int) -> FloatArray:
-        """As of every closed distribution: Jacobi's polynomials (Gautschi, table 1.1)."""
+        """As for every closed distribution: Jacobi's polynomials (Gautschi, table 1.1)."""
         a, b, both = self.a, self.b, self.a + self.b
-        # Of x = 2u − 1: mean and standard deviation.
+        # Mean and standard deviation of x = 2u − 1.
         mean, std = (a - b) / both, 2 * np.sqrt(a / both * (b / both) / (both + 1))
         k = np.arange(1.0, degree + 1)
         s = 2 * k + both
-        alpha = -mean * 4 * k * (k + both - 1) / (s * (s - 2)) / std  # less the mean, without the difference
+        alpha = -mean * 4 * k * (k + both - 1) / (s * (s - 2)) / std  # minus the mean, without cancellation
         k, s = k[1:], s[1:]
         beta = 4 * k * (k + a - 1) * (k + b - 1) * (k + both - 2) / ((s - 2) ** 2 * (s - 1) * (s - 3)) / std**2
         return np.array([np.append(0.0, alpha), np.append(np.ones(min(degree, 1) + 1), beta)])
@@ -397,7 +397,7 @@ class Beta(_Bounded):
 
 
 class TruncatedNormal(_Bounded):
-    """Normal with `mean` and `std` (of the normal before the cut), cut to [lower, upper]."""
+    """Normal with `mean` and `std` (both before truncation), truncated to [lower, upper]."""
 
     kind: Literal["truncated-normal"] = "truncated-normal"
     mean: float
@@ -408,12 +408,12 @@ class TruncatedNormal(_Bounded):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As of every distribution: where it is positive and spans more than a decade."""
+        """As for every distribution: if it is positive and spans more than a decade."""
         return self._over_decades()
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As of every distribution."""
+        """As for every distribution."""
         cut = self._cut
         return cut.origin, cut.unit * cut.nodes, cut.weights
 
@@ -459,7 +459,7 @@ class Normal(_Distribution):
         return self.mean, self.std
 
     def recurrence(self, degree: int) -> FloatArray:
-        """As of every closed distribution: Hermite's polynomials."""
+        """As for every closed distribution: Hermite's polynomials."""
         return np.array([np.zeros(degree + 1), np.append(1.0, np.arange(1.0, degree + 1))])
 
     @property
@@ -481,7 +481,7 @@ class Normal(_Distribution):
         return u, self._log_density(u)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As of every distribution, in closed form."""
+        """As for every distribution, in closed form."""
         z = np.asarray(z, dtype=float)
         return self.mean + self.std * z, np.full(z.shape, self.std)
 
@@ -495,7 +495,7 @@ class LogNormal(_Distribution):
 
     @cached_property
     def of_coordinate(self) -> tuple[float, float]:
-        """As of every distribution."""
+        """As for every distribution."""
         variance = np.log1p((self.std / self.mean) ** 2)
         return float(np.log(self.mean) - variance / 2), float(np.sqrt(variance))
 
@@ -518,7 +518,7 @@ class LogNormal(_Distribution):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As of every distribution."""
+        """As for every distribution."""
         return True
 
     @property
@@ -546,7 +546,7 @@ class LogNormal(_Distribution):
         return u, self._log_density(u)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As of every distribution, in closed form."""
+        """As for every distribution, in closed form."""
         mean, std = self.of_coordinate
         value = np.exp(mean + std * np.asarray(z, dtype=float))
         return value, std * value
@@ -570,7 +570,7 @@ class Gamma(_Distribution):
         return self.shift + self.shape * self.scale, float(np.sqrt(self.shape) * self.scale)
 
     def recurrence(self, degree: int) -> FloatArray:
-        """As of every closed distribution: Laguerre's polynomials."""
+        """As for every closed distribution: Laguerre's polynomials."""
         k = np.arange(1.0, degree + 1)
         return np.array(
             [np.append(0.0, 2 * k / np.sqrt(self.shape)), np.append(1.0, k * (k - 1 + self.shape) / self.shape)]
@@ -578,15 +578,15 @@ class Gamma(_Distribution):
 
     @cached_property
     def logarithmic(self) -> bool:
-        """As of every distribution: where 1/ω has a variance."""
+        """As for every distribution: if 1/ω has a finite variance."""
         return self.shift == 0 and self.shape > 2
 
     @property
     def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """As of every distribution; it integrates polynomials of the logarithm too, which Laguerre's rule does not."""
+        """As for every distribution; it integrates polynomials of the logarithm too, unlike Laguerre's rule."""
         from scipy.special import gammaincinv
 
-        # ln u has the density exp(k ln u − u)/Γ(k): nothing below the quantile at 10⁻⁴⁰, and above k + 40 √k + 100.
+        # ln u has the density exp(k ln u − u)/Γ(k), negligible below the quantile at 10⁻⁴⁰ and above k + 40 √k + 100.
         lower = float(np.log(gammaincinv(self.shape, 1e-40)))
         upper = float(np.log(self.shape + 40 * np.sqrt(self.shape) + 100))
         logs, weights = panels(np.linspace(lower, upper, 9).tolist())

@@ -1,4 +1,4 @@
-"""Integrals against densities that have no closed form: composite Gauss rules, and a normal density that is cut."""
+"""Integrals against densities without closed forms: composite Gauss rules, and a truncated normal density."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from forward.model import FloatArray
 
 Function = Callable[[FloatArray], FloatArray]
 PANEL = 200  # Gauss points of a panel on which a density is smooth
-NOTHING = 100.0  # exponent below which exp(−x) is nothing beside 1
-FLAT = 4.0  # exponent that a density falls by at most where it is integrated by one rule of few points
+NOTHING = 100.0  # exponent x from which exp(−x) is negligible beside 1
+FLAT = 4.0  # largest exponent by which a density falls where one rule of few points integrates it
 STEPS = 60  # of Newton's method, at most
 
 
@@ -29,15 +29,15 @@ def panels(breaks: list[float]) -> tuple[FloatArray, FloatArray]:
 class Cut:
     """The density ∝ exp(−u (t + u/2)) on [lower, upper]: a standard normal one around its largest value inside.
 
-    With t ≥ 0, lower = 0 the normal is cut t standard deviations from its mean; with t = 0 the mean is inside. Nothing
-    here is a difference of two probabilities that are both nearly 0 or nearly 1.
+    With t ≥ 0, lower = 0 the normal is truncated t standard deviations from its mean; with t = 0 the mean is inside.
+    Nothing here is a difference of two probabilities that are both nearly 0 or nearly 1.
 
     Attributes
     ----------
     origin, unit
         Of the parameter: ω = origin + unit u. A negative unit mirrors it.
     t, lower, upper
-        Numbers of the density.
+        Numbers in the density.
     """
 
     origin: float
@@ -89,7 +89,7 @@ class Cut:
             whole = self._integral(np.array(self.upper))
             return self._newton(start, lambda u: self._integral(u) - p * whole, lambda u: np.exp(-u * (self.t + u / 2)))
         if self.t > 0 or self.lower == 0:
-            # The tail beyond u is q of the whole, and that beyond the upper end.
+            # The tail beyond u is q of the whole, plus that beyond the upper end.
             last = np.exp(self._log_tail(np.array(self.upper)))
             near = p < 0.5
             beyond = np.log(np.clip(last + q * (1 - last), np.finfo(float).tiny, 1.0))
@@ -106,14 +106,14 @@ class Cut:
         return bool(np.abs(ends * (self.t + ends / 2)).max() < FLAT)
 
     def _integral(self, u: FloatArray) -> FloatArray:
-        """∫ exp(−v (t + v/2)) dv from the lower end to u, where the density is flat."""
+        """∫ exp(−v (t + v/2)) dv from the lower end to u, for a flat density."""
         x, w = np.polynomial.legendre.leggauss(24)  # type: ignore[no-untyped-call]
         half = (np.asarray(u)[..., None] - self.lower) / 2
         v = self.lower + half * (x + 1)
         return np.asarray((np.exp(-v * (self.t + v / 2)) * half) @ w)
 
     def _log_tail(self, u: FloatArray) -> FloatArray:
-        """Ln of the share that the uncut normal has beyond t + u of what it has beyond t."""
+        """Ln of the probability beyond t + u given that beyond t, for the normal before truncation."""
         from scipy.special import erfcx
 
         return np.asarray(-u * (self.t + u / 2) + np.log(erfcx((self.t + u) / np.sqrt(2)) / erfcx(self.t / np.sqrt(2))))
@@ -132,7 +132,7 @@ class Cut:
 
     @staticmethod
     def _of_normal(lower: float, upper: float, p: FloatArray, q: FloatArray) -> FloatArray:
-        """Quantile of a normal cut to [lower, upper], exact in its lower half."""
+        """Quantile of a normal truncated to [lower, upper], exact in its lower half."""
         from scipy.special import log_ndtr, ndtri_exp
 
         with np.errstate(divide="ignore"):

@@ -15,8 +15,8 @@ from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution
 from uq.inputs.sampling import sobol_points
 
-CORNERS = 12  # parameters up to which all corners of a box are looked at
-FARTHEST = 6.0  # standard deviations: beyond are 2e-9
+CORNERS = 12  # number of parameters up to which all corners of a box are checked
+FARTHEST = 6.0  # standard deviations: the probability beyond is 2e-9
 POINTS = 2**16
 
 
@@ -38,19 +38,18 @@ class Inputs:
     Parameters
     ----------
     marginals
-        Distribution of each parameter by its name; the order is that of the parameter vectors.
+        Distribution of each parameter by name; the order is that of the parameter vectors.
     correlations
         Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
-        mapped through the marginals. Pairs that are left out are uncorrelated.
+        mapped through the marginals. Other pairs are uncorrelated.
 
     admissible
-        Where there is a model: the distribution is restricted to it where that is asked for (`admitted`), points are
-        not.
+        Where the model is defined. Densities are restricted to it by dividing by `admitted`; points are not restricted.
 
     Raises
     ------
     ValueError
-        If the correlations are of unknown names or do not form a positive definite matrix.
+        If the correlations have unknown names or do not form a positive definite matrix.
     """
 
     marginals: dict[str, Distribution]
@@ -113,7 +112,7 @@ class Inputs:
 
     @cached_property
     def coordinates(self) -> Coordinates:
-        """What outputs are taken for polynomials of."""
+        """The arguments of polynomials that approximate outputs."""
         centre, scale = np.array([m.of_coordinate for m in self.marginals.values()]).reshape(-1, 2).T
         return Coordinates(np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale)
 
@@ -166,21 +165,21 @@ class Inputs:
         return replace(self, admissible=admissible)
 
     def allowed(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Return at which points (n, d) there is a model, (n,)."""
+        """Return at which points (n, d) the model is defined, (n,)."""
         if self.admissible is None:
             return np.ones(len(points), dtype=bool)
         return np.broadcast_to(self.admissible.admissible(dict(zip(self.names, points.T, strict=True))), len(points))
 
     @cached_property
     def admitted(self) -> float:
-        """Probability of parameters for which there is a model."""
+        """Probability of parameters for which the model is defined."""
         return self.admitted_at(1.0)
 
     def admitted_at(self, width: float) -> float:
-        """Return that probability where the standard normal coordinates are wider by a factor.
+        """Return that probability if the standard normal coordinates are wider by a factor.
 
-        It is 1 where no corner of the box of these coordinates is beyond what is admissible: the moduli of materials
-        are linear in each constant, and least at a corner. Else it is the share of scrambled Sobol' points.
+        It is 1 if all corners of the box of these coordinates are admissible: the moduli of materials are linear in
+        each constant, hence smallest at a corner. Otherwise it is the share of admissible scrambled Sobol' points.
         """
         if self.admissible is None or not self.admissible.names:
             return 1.0
@@ -190,7 +189,7 @@ class Inputs:
         if len(names) <= CORNERS:
             z = width * np.array([-FARTHEST, FARTHEST])
             supports = [marginal.support for marginal in few.marginals.values()]
-            if None not in supports and self._admits_corners(names, supports):  # a larger box, which takes no quantiles
+            if None not in supports and self._admits_corners(names, supports):  # a larger box, which needs no quantiles
                 return 1.0
             if self._admits_corners(names, [marginal.from_normal(z)[0] for marginal in few.marginals.values()]):
                 return 1.0
@@ -200,7 +199,7 @@ class Inputs:
         return float(self.admissible.admissible(dict(zip(names, points.T, strict=True))).mean())
 
     def _admits_corners(self, names: Sequence[str], ends: Sequence[Any]) -> bool:
-        """Whether there is a model at every corner of a box with these two ends along each of the named parameters."""
+        """Whether the model is defined at all corners of a box with these two ends along each named parameter."""
         assert self.admissible is not None
         corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
         return bool(self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all())

@@ -1,4 +1,4 @@
-"""Designs: points of the unit cube that depend on the seed and the index of the sample only."""
+"""Designs: points of the unit cube that depend only on the seed and the index of the sample."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ BITS = 52  # of each coordinate of a Sobol' point
 def random_points(seed: int | tuple[int, ...], start: int, stop: int, dimension: int) -> FloatArray:
     """Return the pseudo-random points number `start` to `stop` (stop − start, dimension) of the stream `seed`.
 
-    A point is the same whichever range it is drawn in, and lies strictly inside the unit cube. Several numbers make one
-    seed: (s, 1), (s, 2), … are independent streams.
+    A point does not depend on the range in which it is drawn, and lies strictly inside the unit cube. Several numbers
+    make one seed: (s, 1), (s, 2), … are independent streams.
     """
     bits = np.random.PCG64(seed)
     bits.advance(start * dimension)
@@ -25,13 +25,13 @@ def random_points(seed: int | tuple[int, ...], start: int, stop: int, dimension:
 def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int) -> FloatArray:
     """Return the Sobol' points number `start` to `stop` (stop − start, dimension) of one of the scrambles of `seed`.
 
-    A point is the same whichever range it is drawn in and however many scrambles there are. Each is uniform in the
-    cube by itself (a random linear scramble and a digital shift); different scrambles are independent.
+    A point depends neither on the range in which it is drawn nor on the number of scrambles. Each is uniform in the
+    cube (a random linear scramble and a digital shift); different scrambles are independent.
     """
     from scipy.stats import qmc
 
     count = 1 << (stop - 1).bit_length()
-    # Balance, which scipy warns of, is a matter of whole powers of two. Newer versions of scipy scramble in other ways.
+    # Balance, about which scipy warns, needs whole powers of two. Newer versions of scipy scramble in other ways.
     plain = qmc.Sobol(dimension, scramble=False, bits=BITS).random(count)
     numbers = (plain * 2.0**BITS).astype(np.uint64)
     powers = 1 << np.arange(count.bit_length() - 1)
@@ -66,7 +66,7 @@ def power_of_two(limit: int) -> int:
 
 
 def check_scrambles(samples: int | None, scrambles: int) -> None:
-    """Raise ValueError if so many samples, where a number is given, are not scrambles of a power of two each."""
+    """Raise ValueError if the number of samples, if given, is not the number of scrambles times a power of two."""
     if samples is not None and samples != scrambles * power_of_two(samples // scrambles):
         below = scrambles * power_of_two(samples // scrambles)
         nearest = f"{below} or {2 * below}" if samples > scrambles else str(scrambles)

@@ -1,1 +1,1 @@
-"""Functions that stand for a model: expansions in polynomials, regressions, Taylor's."""
+"""Surrogates of a model: polynomial expansions, regressions, Taylor polynomials."""

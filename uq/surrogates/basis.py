@@ -1,9 +1,9 @@
 """Orthonormal polynomials of independent random parameters, and their derivatives.
 
-They are polynomials of standardised coordinates t, of the parameters or of logarithms (`uq.inputs.coordinates`), so
-that a derivative along t is one "per standard deviation". The orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} =
+They are polynomials of standardised coordinates t, of parameters or their logarithms (`uq.inputs.coordinates`), so that
+derivatives along t are "per standard deviation". The orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} =
 (t − α_k) p_k − √β_k p_{k−1} (W. Gautschi, Orthogonal Polynomials (2004), section 1.3); p_0 = 1 and p_1 = t. Basis
-functions are products ψ_a(t) = Π_i p_{a_i}(t_i) over a set of multi-indices a.
+functions are products ψ_a(t) = Π_i p_{a_i}(t_i) for a set of multi-indices a.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Basis:
     Attributes
     ----------
     coordinates
-        What they are polynomials of.
+        Their arguments.
     alpha, beta
         Recurrence coefficients (d, N + 1) of the standardised coordinates, for degrees up to N.
     indices
@@ -65,7 +65,7 @@ class Basis:
         return self.rows(points, gradients=True)[:, 1:]
 
     def rows(self, points: FloatArray, *, gradients: bool) -> FloatArray:
-        """Return what a sample gives a regression (n, 1 + d, P): values and derivatives, or values (n, 1, P) alone."""
+        """Return the rows of a regression (n, 1 + d, P): values and derivatives, or values (n, 1, P) only."""
         tables, slopes = self._tables(points, derivatives=gradients)
         result = np.zeros((len(points), 1 + len(slopes), len(self.indices)))
         result[:, 0] = _products(tables, self.indices)
@@ -75,13 +75,13 @@ class Basis:
         return result
 
     def of_one(self, i: int, t: FloatArray) -> FloatArray:
-        """Return the factor p_{a_i}(t) (n, P) that each function has of coordinate i, at values (n,) of it."""
+        """Return the factor p_{a_i}(t) (n, P) of each function in coordinate i, at values (n,) of it."""
         degree = int(self.indices[:, i].max(initial=0))
         table, _ = _recur(t, self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=False)
         return np.column_stack(table)[:, self.indices[:, i]]
 
     def subset(self, which: IntArray) -> Basis:
-        """Return the basis of some of the functions, by their numbers."""
+        """Return the basis of some of the functions, by index."""
         return replace(self, indices=self.indices[which])
 
     def _tables(self, points: FloatArray, *, derivatives: bool) -> tuple[list[FloatArray], list[FloatArray]]:
@@ -97,7 +97,7 @@ class Basis:
 
 
 def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
-    """Return the products (n, P) of the columns of d tables (n, N + 1) that multi-indices (P, d) name.
+    """Return the products (n, P) of the columns of d tables (n, N + 1) given by multi-indices (P, d).
 
     Columns 0 are one, and most indices of many parameters are zero.
     """
@@ -133,9 +133,9 @@ def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
 
 @cache
 def recurrence(marginal: Distribution, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return α and β (degree + 1,) of the standardised coordinate, with β_0 = 1; not to be written to.
+    """Return α and β (degree + 1,) of the standardised coordinate, with β_0 = 1; read-only.
 
-    Where they have no closed form they come from the Stieltjes procedure with the rule of the distribution.
+    Without a closed form they come from the Stieltjes procedure with the rule of the distribution.
     """
     match marginal:
         case LogNormal():
@@ -166,7 +166,7 @@ def gauss_rule(marginal: Distribution, count: int) -> tuple[FloatArray, FloatArr
     """Return points (count,) of the standardised coordinate and weights of the Gauss rule of a distribution.
 
     The points are eigenvalues of the Jacobi matrix (G. H. Golub, J. H. Welsch, Math. Comp. 23 (1969) 221–230), the
-    weights 1/Σ p_k², which has small ones to all digits, other than the components of its eigenvectors.
+    weights 1/Σ p_k², which keeps small ones accurate, unlike the components of its eigenvectors.
     """
     from scipy.linalg import eigvalsh_tridiagonal
 
@@ -204,7 +204,7 @@ def hyperbolic(dimension: int, order: int, q: float) -> IntArray:
 
 
 def hyperbolic_count(dimension: int, order: int, q: float) -> int:
-    """Return the number of rows of `hyperbolic`, without making them."""
+    """Return the number of rows of `hyperbolic`, without computing them."""
     return 1 + sum(
         math.comb(dimension, len(pattern))
         * math.factorial(len(pattern))
@@ -214,7 +214,7 @@ def hyperbolic_count(dimension: int, order: int, q: float) -> int:
 
 
 def _patterns(dimension: int, order: int, q: float) -> Iterator[tuple[int, ...]]:
-    """Yield the degrees other than zero that the indices of `hyperbolic` have, in falling order."""
+    """Yield the nonzero degrees of each kind of index of `hyperbolic`, in descending order."""
     budget = order**q * (1 + 1e-12)
     longer: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
     while longer:
@@ -227,5 +227,5 @@ def _patterns(dimension: int, order: int, q: float) -> Iterator[tuple[int, ...]]
 
 
 def by_degree(indices: IntArray) -> IntArray:
-    """Sort multi-indices (P, d) by total degree, and those of one degree by the first parameters."""
+    """Sort multi-indices (P, d) by total degree, and within a degree by the first parameters."""
     return np.asarray(indices[np.lexsort((*(-indices.T[::-1]), indices.sum(axis=1)))])

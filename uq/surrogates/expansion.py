@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class OutsideRangeWarning(UserWarning):
-    """Points where an expansion was not fitted."""
+    """Points outside the range where an expansion was fitted."""
 
 
 @dataclass(frozen=True)
 class Expansion:
-    """A polynomial that stands for a model, for any number of points at once.
+    """A polynomial surrogate of a model, for any number of points at once.
 
     Attributes
     ----------
@@ -33,9 +33,9 @@ class Expansion:
     coefficients
         (P, m).
     lower, upper
-        Range (d,) of the parameters: their support, or that of the samples where a distribution has tails.
+        Range (d,) of the parameters: their support, or that of the samples if a distribution has tails.
     fields
-        Coefficients (P, nodes, 3) of the displacement field, in m, where it was expanded.
+        Coefficients (P, nodes, 3) of the displacement field, in m, if it was expanded.
     """
 
     parameters: tuple[str, ...]
@@ -57,7 +57,7 @@ class Expansion:
             If these are not results of `method.kind = "chaos"` or `"multilevel-chaos"`.
         """
         if "multi_index" not in results:
-            message = "these results hold no expansion, expected those of method.kind = 'chaos'"
+            message = "these results hold no expansion, expected results of method.kind = 'chaos'"
             raise ValueError(message)
         arrays = {str(name): variable.to_numpy() for name, variable in results.data_vars.items()}
         basis = Basis(

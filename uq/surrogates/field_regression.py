@@ -1,13 +1,13 @@
-"""Regression of whole states: the coefficients of a field from sums over the samples, and states predicted by them.
+"""Regression of whole states: the coefficients of a field from sums over the samples, and predictions of states.
 
-The regression is linear in the data, so the coefficients of a field need Σ_z A_zᵀ y_z only, one row for each function
-of the largest basis that may be chosen. These rows are summed where blocks are added, from the d + 1 fields of a sample
-that the blocks carry.
+The regression is linear in the data, so the coefficients of a field need only Σ_z A_zᵀ y_z, one row for each function
+of the largest basis that may be chosen. These rows are summed when blocks are added, from the d + 1 fields of each
+sample in the blocks.
 
-Which functions the field has is decided by what the field does, and no output need do the same: one on a plane of
-symmetry does not depend on what moves the body across it. Errors at samples that are left out need each sample, of
-which fields keep too much. So a few sketches of each are kept, integrals of its displacements with random weights: to
-these, functions are fitted as to outputs, and what they leave of the sketches is what they leave of the field.
+The functions for the field are chosen from the field, since no output need depend on the same parameters: one on a
+plane of symmetry does not depend on what moves the body across it. Leave-one-out errors need every sample, and whole
+fields are too large to keep. So a few sketches of each are kept, integrals of its displacements with random weights:
+functions are fitted to these as to outputs, and the errors of the sketches estimate those of the field.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from uq.surrogates.regression import (
     rows_of,
 )
 
-FIELD_DICTIONARY = 500  # functions to select from, at most: a field in memory for each
-SKETCHES = 8  # of a sample's field
-AS_GOOD = 1.5  # times the least leave-one-out error: up to it, the field has the functions that the outputs have
+FIELD_DICTIONARY = 500  # functions to select from, at most; each needs a field in memory
+SKETCHES = 8  # of each sample's field
+AS_GOOD = 1.5  # times the smallest leave-one-out error, up to which the field uses the functions of the outputs
 
 
 @dataclass(frozen=True)
 class Projections:
     """Sum over the samples of A_zᵀ y_z for the state's deviation y from the one at the mean, and of |y_z|².
 
-    A compact sum: blocks carry y_z, the deviation and its slopes.
+    A compact sum: blocks hold y_z, the deviation and its slopes.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Projections:
     state
         State (U,) at the mean parameters.
     gradients
-        Whether derivatives give rows too.
+        Whether derivatives are rows too.
     points, weights
         Points (n, d) whose weights (n,) are not one.
     displacements
-        Number of displacements at the head of the state, of which sketches are kept; 0: none are.
+        Number of displacements at the start of the state, of which sketches are kept; 0 for no sketches.
     volumes
-        Share (nodes,) of the body that each node stands for; by default all count alike.
+        Share (nodes,) of the body that each node represents; by default all count equally.
     """
 
     basis: Basis
@@ -119,13 +119,13 @@ class Deviations:
     basis
         The P functions.
     outputs, state
-        Coefficients (P, m) and (P, U); (P, 0) where the state was not wanted.
+        Coefficients (P, m) and (P, U); (P, 0) if the state was not requested.
     relative
         Leave-one-out errors (m,) of the outputs over their standard deviation.
     ok
         Which samples (n,) had an answer and were fitted.
     prediction
-        Of the state, from which the solver may start; None where the state was not wanted.
+        Of the state, from which the solver may start; None if the state was not requested.
     reach
         Lowest and highest coordinates (2, d) of the samples that were fitted.
     """
@@ -142,7 +142,7 @@ class Deviations:
 def fit_deviations(
     inputs: Inputs, evaluate: Evaluate, centre: Linearisation, points: FloatArray, max_order: int, *, fields: bool
 ) -> Deviations:
-    """Fit an expansion to values and gradients at points (n, d), outputs and whole state alike.
+    """Fit an expansion to values and gradients at points (n, d), for the outputs and the whole state.
 
     Raises
     ------
@@ -203,17 +203,17 @@ class StateExpansion:
 
 
 def solved(fit: Fit, projections: FloatArray) -> FloatArray:
-    """Coefficients (P, U) of the regression on what has these projections (P, U)."""
+    """Coefficients (P, U) of the regression from projections (P, U)."""
     from scipy.linalg import cho_solve
 
     return np.asarray(cho_solve((fit.triangle, False), projections))
 
 
-# --- what the sketches of a field say ------------------------------------------------------------------------------
+# --- regression of the sketches of a field --------------------------------------------------------------------------
 
 
 def regression_of_field(outputs: Regression, sketches: FloatArray) -> Regression:
-    """Fit to the sketches (n, r, k) of the samples of a regression of outputs: by its functions, or by better ones."""
+    """Fit the sketches (n, r, k) of the samples of a regression of outputs, with its functions or better ones."""
     slopes = sketches[:, 1:] if sketches.shape[1] > 1 else None
     data = Data(outputs.data.points, sketches[:, 0], slopes, outputs.data.weights)
     fits: list[Regression] = []
@@ -222,16 +222,16 @@ def regression_of_field(outputs: Regression, sketches: FloatArray) -> Regression
         try:
             fit = fit_best(replace(outputs.candidates, sets=sets), outputs.largest, data)
         except SolveError:
-            continue  # they are not determined without some of the samples
+            continue  # not determined without some of the samples
         fits.append(replace(outputs, data=data, fit=fit))
     errors = [relative_of_field(fit) for fit in fits]
     return next(fit for fit, error in zip(fits, errors, strict=True) if error <= AS_GOOD * min(errors) + ROUNDING)
 
 
 def errors_of_indices(regression: Regression) -> dict[str, FloatArray]:
-    """Return standard errors (d,) of the generalised indices, by the jackknife and by what the fit leaves.
+    """Return standard errors (d,) of the generalised indices, from the jackknife and the residual variance.
 
-    NaN where it explains nothing.
+    NaN if the fit explains nothing.
     """
     fit, largest = regression.fit, regression.largest.indices
     alone = np.eye(largest.shape[1], dtype=bool)

@@ -16,7 +16,7 @@ from uq.inputs.random_parameters import Inputs
 if TYPE_CHECKING:
     import xarray as xr
 
-MANY = 256  # parameters above which the state has no slopes: each would be a field to keep and to send
+MANY = 256  # parameters above which the state has no slopes: each would be a field to store and send
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Linearisation:
     slopes
         dū/dω (d, U); empty (0, U) for a model without derivatives or of more than `MANY` parameters.
     coordinates
-        What predictions are linear in.
+        In which predictions are linear.
     spread
         Standard deviations (d,) of the parameters.
     """
@@ -51,7 +51,7 @@ class Linearisation:
 
     @property
     def prediction(self) -> Prediction | None:
-        """The prediction of the state, linear where there are slopes; None for a model without derivatives."""
+        """The prediction of the state, linear if there are slopes; None for a model without derivatives."""
         if self.state.size == 0 or np.isnan(self.tangents).all():
             return None
         return Prediction(self.point, self.state, self.state_slopes, self.coordinates, self.spread)
@@ -63,16 +63,16 @@ class Linearisation:
 
     @property
     def state_slopes(self) -> FloatArray:
-        """Derivatives dū/dt (d, U) of the state along the coordinates, or none (0, U)."""
+        """Derivatives dū/dt (d, U) of the state along the coordinates; empty (0, U) if there are none."""
         if len(self.slopes) == 0:
             return self.slopes
         return self.slopes * self.coordinates.steps(self.point)[:, None]
 
     @property
     def middle(self) -> FloatArray:
-        """What the tangents predict for the outputs (m,) at the mean coordinates: the mean of their prediction.
+        """The outputs (m,) predicted by tangents at the mean coordinates: the mean of their prediction.
 
-        The mean parameters are there, but where coordinates are logarithms. Without derivatives it is the outputs.
+        These are the mean parameters, unless coordinates are logarithms. Without derivatives, the outputs themselves.
         """
         if np.isnan(self.tangents).all():
             return self.outputs
@@ -80,7 +80,7 @@ class Linearisation:
 
     @property
     def state_middle(self) -> FloatArray:
-        """The same for the state (U,); the state itself where it has no slopes."""
+        """The same for the state (U,); the state itself if it has no slopes."""
         if len(self.slopes) == 0:
             return self.state
         return np.asarray(self.state - self.coordinates.of(self.point) @ self.state_slopes)
@@ -103,7 +103,7 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
     Raises
     ------
     SolveError
-        If the model has no answer there.
+        If the model has no answer at the point.
     """
     derivatives = evaluate.differentiable
     slopes = derivatives and len(evaluate.parameters) <= MANY
@@ -115,7 +115,7 @@ def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = Non
 def linearised(
     inputs: Inputs, evaluate: Evaluate, found: Evaluations, point: FloatArray | None = None
 ) -> Linearisation:
-    """Return what `linearise` does from what it has solved."""
+    """Return the result of `linearise` from its evaluations."""
     centre = inputs.mean if point is None else point
     for failure in found.failures:
         message = (

@@ -2,15 +2,15 @@
 
 The expansion Σ_a c_a ψ_a(ω) is fitted to the samples by least squares. A sample gives one row for its value, ψ(ω_z)·c =
 f(ω_z), and with derivatives one row more for each parameter, ∂ψ/∂t_i(ω_z)·c = ∂f/∂t_i(ω_z) along the coordinates t of
-the polynomials (`uq.inputs.coordinates`): d + 1 rows for little more than the price of one solve. All rows count the
-same: on five test functions of two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within the
-scatter of the designs.
+the polynomials (`uq.inputs.coordinates`): d + 1 rows for little more than the cost of one solve. All rows have the same
+weight: for five test functions of two to four parameters, weights of 1/4 to 3/2 for the gradients gave errors within
+the scatter of the designs.
 
-What a fit is worth is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
-residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without it errs there by (I − H_z)⁻¹ r_z, and its coefficients differ
-by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
+The error of a fit is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
+residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without sample z has the error (I − H_z)⁻¹ r_z there, and its
+coefficients differ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
 
-Choice of functions, fit and leave-one-out errors update the same factorisation, hence one file.
+The choice of functions, the fit and the leave-one-out errors use the same factorisation, hence one file.
 """
 
 from __future__ import annotations
@@ -34,31 +34,31 @@ from uq.surrogates.basis import Basis, IntArray, by_degree, hyperbolic, hyperbol
 BoolArray = NDArray[np.bool_]
 TRUNCATIONS = (0.5, 0.75, 1.0)
 ROWS_PER_TERM = 2  # rows of the regression for each unknown, at least
-FULL = 8  # parameters up to which whole bases are tried; above, functions are selected one by one
+FULL = 8  # number of parameters up to which whole bases are tried; above, functions are selected one by one
 DICTIONARY = 2000  # functions to select from, at most
-FOLDS = 10  # parts of the samples that are left out in turn, to choose the functions
-ROUNDING = 1e-13  # relative error below which there is nothing left to select for
-LIKELY = 24  # functions whose inner products are found together
-ROUGH = 0.1  # relative leave-one-out error above which the mean is no better known than the samples say
+FOLDS = 10  # parts of the samples that are left out in turn to choose the functions
+ROUNDING = 1e-13  # relative error below which no function is added
+LIKELY = 24  # functions whose inner products are computed together
+ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
-NOTHING = 0.8  # the same, above which a fit says nothing of what the output depends on
-POINTS = 4096  # at which an expansion says where its variance comes from
-PATIENCE = 30  # functions that may be selected without a gain before the selection ends
+NOTHING = 0.8  # the same, above which a fit tells nothing about which parameters matter
+POINTS = 4096  # at which the origin of the variance of an expansion is computed
+PATIENCE = 30  # functions selected without a gain before the selection ends
 
 
 # --- candidates ------------------------------------------------------------------------------------------------------
 
 
 def rows_of(inputs: Inputs, *, gradients: bool) -> int:
-    """Number of rows that a sample gives."""
+    """Number of rows of one sample."""
     return 1 + len(inputs.names) if gradients else 1
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Some functions of the largest basis, by their numbers; order and q of the set that they are from.
+    """Some functions of the largest basis, by index, with the order and q of their set.
 
-    Where `sparse` is set they are a dictionary, to select functions from.
+    If `sparse`, they are a dictionary from which functions are selected.
     """
 
     order: int
@@ -69,7 +69,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Sets to choose from; `all` (P, d) is their union."""
+    """Sets of functions to choose from; `all` (P, d) is their union."""
 
     all: IntArray
     sets: tuple[Candidate, ...]
@@ -99,9 +99,9 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
         while not determined and order > 0:
             indices = hyperbolic(d, order, q)
             found.setdefault((True, indices.tobytes()), (indices, order, q))
-            # Where there are fewer rows than functions, it helps to have less to choose from.
+            # With fewer rows than functions, smaller dictionaries help.
             order = order - 1 if rows < counts[order] and order > 2 else 0
-        # Nothing is lost by selecting from all of them where there are as many rows.
+        # With as many rows as functions, nothing is lost by selecting from all.
         determined = determined or (widest == max_order and counts[widest] <= rows)
     union = by_degree(np.unique(np.concatenate([indices for indices, *_ in found.values()]), axis=0))
     number = {index.tobytes(): i for i, index in enumerate(union)}
@@ -119,7 +119,7 @@ def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) ->
 class Data:
     """Samples that have an answer: points (n, d), values (n, m), slopes (n, d, m) along the coordinates or None.
 
-    `weights` (n,) count the samples in sums of squares.
+    `weights` (n,) are those of the samples in sums of squares.
     """
 
     points: FloatArray
@@ -129,7 +129,7 @@ class Data:
 
     @classmethod
     def of(cls, evaluations: Evaluations, inputs: Inputs, weights: FloatArray | None) -> Data:
-        """Take those of the evaluations that have an answer; `weights` are one where none are given."""
+        """Take the evaluations that have an answer; `weights` default to one."""
         ok = evaluations.ok
         tangents = None if evaluations.tangents is None else evaluations.tangents[ok]
         counted = None if weights is None else weights[ok]
@@ -144,14 +144,14 @@ class Data:
         inputs: Inputs,
         weights: FloatArray | None = None,
     ) -> Data:
-        """Take values (n, m) and, where they are given, tangents (n, m, d) at points; `weights` as of `of`."""
+        """Take values (n, m) and, if given, tangents (n, m, d) at points; `weights` as in `of`."""
         slopes = None
         if tangents is not None:
             slopes = np.swapaxes(tangents * inputs.coordinates.steps(points)[:, None, :], 1, 2)
         return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
 
     def some(self, which: slice | IntArray) -> Data:
-        """Return some of the samples, in the order asked for."""
+        """Return some of the samples, in the given order."""
         slopes = None if self.slopes is None else self.slopes[which]
         return Data(self.points[which], self.values[which], slopes, self.weights[which])
 
@@ -176,7 +176,7 @@ class Data:
         return np.asarray(np.sqrt((errors[:, 0] ** 2).sum(axis=0) / self.weights.sum()))
 
     def relative(self, errors: FloatArray) -> FloatArray:
-        """The same over the standard deviation of the values; zero where that is rounding."""
+        """The same over the standard deviation of the values; zero if that is rounding error."""
         share = self.weights / self.weights.sum()
         mean = share @ self.values
         std = np.sqrt(share @ (self.values - mean) ** 2)
@@ -186,7 +186,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Fit:
-    """A regression and what it is worth.
+    """A regression and its errors.
 
     Attributes
     ----------
@@ -195,19 +195,19 @@ class Fit:
     coefficients
         (P, m).
     without
-        Coefficients (g, P', m), of all functions of the largest basis, of fits that leave a gth of the samples out.
+        Coefficients (g, P', m), for all functions of the largest basis, of g fits that each leave out 1/g of samples.
     sampled
-        Standard errors (P, m) of the coefficients as of a regression with independent errors of any sizes.
+        Standard errors (P, m) of the coefficients, as for a regression with independent errors of any size.
     triangle
-        R (P, P) of the matrix of the regression, of which the Gram matrix is RᵀR.
+        R (P, P) of the matrix of the regression, whose Gram matrix is RᵀR.
     loo, relative
-        Root mean square (m,) of the leave-one-out errors of the values, and that over their standard deviation.
+        Root mean square (m,) of the leave-one-out errors of the values, and its ratio to their standard deviation.
     squares
         Sum of squares (m,) of the residuals of all rows.
     held
-        Number (n,) of the fit of `without` that has not seen the sample.
+        Index (n,) of the fit in `without` that leaves the sample out.
     unseen
-        Errors (n, m) of the values at each sample by that fit.
+        Errors (n, m) of that fit in the values at each sample.
     """
 
     chosen: Candidate
@@ -224,16 +224,16 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Folds:
-    """What was selected without some of the samples.
+    """Selections without some of the samples.
 
     Attributes
     ----------
     held
-        Number (n,) of the selection that went without the sample.
+        Index (n,) of the selection that leaves the sample out.
     which
         Functions (K, P) of each selection.
     errors
-        Errors (n, rows, m) at each sample of the fit without it.
+        Errors (n, rows, m) at each sample, by the fit without it.
     """
 
     held: IntArray
@@ -249,7 +249,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     SolveError
         If there are not enough samples.
     """
-    # Samples that are left out together stand together.
+    # Samples that are left out together are next to each other.
     n = len(data.points)
     held = np.arange(n) % min(n, FOLDS)
     order = np.argsort(held, kind="stable")
@@ -278,7 +278,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
         message = f"{n} samples have an answer, too few for an expansion of order 1"
         raise SolveError(message)
     best = min(score for score, *_ in scores)
-    # Of those that are as good, the smallest.
+    # The smallest of those that are equally good.
     good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
     fit = _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
     given = np.argsort(order)
@@ -286,7 +286,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
 
 
 def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
-    """Errors (n, rows, m) at each sample of the fit without those that share its number in `held` (n,).
+    """Errors (n, rows, m) at each sample, by the fit without those that share its number in `held` (n,).
 
     They follow from the orthonormal columns (n, rows, P) and the residuals.
     """
@@ -323,20 +323,20 @@ class _Products:
 
     @classmethod
     def of(cls, left: FloatArray, held: IntArray) -> _Products:
-        """Take the matrix (n, rows, P) of samples with rising numbers `held` (n,)."""
+        """Take the matrix (n, rows, P) of samples with ascending numbers `held` (n,)."""
         ends = left.shape[1] * np.searchsorted(held, np.arange(held.max() + 2))
         columns = left.reshape(-1, left.shape[2])
         return cls(columns, tuple(slice(*pair) for pair in pairwise(ends.tolist())), columns.T @ columns)
 
     def lengths(self) -> FloatArray:
-        """Squared lengths (F + 1, P) of the columns without the rows of each number; the last without none."""
+        """Squared lengths (F + 1, P) of the columns without the rows of each number; the last with all rows."""
         total = np.diag(self.gram)
         return np.array([*(total - (self.columns[part] ** 2).sum(axis=0) for part in self.parts), total])
 
     def rows(self, pick: IntArray, likely: IntArray) -> FloatArray:
-        """Products (F + 1, P) with all columns of the one that `pick` (F + 1,) names for each number.
+        """Products (F + 1, P) of all columns with column `pick` (F + 1,) for each number.
 
-        Products within the parts are found for many columns at once: for those that are `likely` to be asked for next.
+        Products within the parts are computed for many columns at once: for those `likely` to be needed next.
         """
         missing = [j for j in dict.fromkeys(pick[:-1].tolist()) if j not in self._known]
         if missing:
@@ -352,21 +352,21 @@ class _Products:
 def _select(
     products: _Products, right: FloatArray, data: Data, dictionary: Candidate, held: IntArray, most: int
 ) -> tuple[float, Candidate, _Folds]:
-    """Take functions one by one, each time the one that explains most of what all outputs have left.
+    """Select functions one by one, each time the one that explains most of the residuals of all outputs.
 
-    Orthogonal least squares, from all samples and, to learn when to stop, without those of each number in `held` (n,):
-    what is selected by samples cannot be judged by them. All of it is done with inner products (the Cholesky factor of
-    the Gram matrix grows by a row for each function), so that a step does not go through all rows of all functions.
+    Orthogonal least squares, from all samples and, to find when to stop, without those of each number in `held` (n,):
+    a selection cannot be judged by the samples that it used. It needs only inner products (the Cholesky factor of the
+    Gram matrix grows by a row for each function), so that a step does not go through all rows of all functions.
 
     Returns
     -------
     float, Candidate, _Folds
-        The relative error at the samples left out, the functions selected from all, and those selected without some.
+        The relative error at the samples left out, the functions selected from all samples, and those without some.
     """
     n, rows, m = right.shape
     columns, parts, folds = products.columns, products.parts, len(products.parts)
     size, scale = (np.linalg.norm(one, axis=(0, 1)) for one in (right, right - right.mean(axis=0)))
-    scale = np.where(scale > ROUNDING * size, scale, np.maximum(size, 1e-300))  # a constant asks for no function
+    scale = np.where(scale > ROUNDING * size, scale, np.maximum(size, 1e-300))  # a constant needs no function
     rest = (right / scale).reshape(n * rows, m)
     explained = np.tile(columns.T @ rest, (folds + 1, 1, 1))
     for k, part in enumerate(parts):
@@ -442,10 +442,10 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
 
 
 def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> FloatArray:
-    """Standard errors (P, m) of coefficients from the residuals of samples that are independent of each other.
+    """Standard errors (P, m) of coefficients from the residuals of independent samples.
 
     With (I − H_z)^(−1/2) r_z for the errors of sample z (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002)
-    169–181), which has the right variance where all rows err alike.
+    169–181), whose variance is right if the errors of all rows are alike.
     """
     from scipy.linalg import solve_triangular
 
@@ -457,12 +457,12 @@ def _sampled(blocks: FloatArray, residual: FloatArray, triangle: FloatArray) -> 
 
 
 def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Samples (n, m) of the first two moments of deviations, with fits that have not seen them as controls.
+    """Samples (n, m) of the first two moments of deviations, each with the fit without it as control.
 
     Returns
     -------
     tuple of numpy.ndarray
-        The samples, and what the deviations are from (m,).
+        The samples, and the values (m,) from which they deviate.
     """
     offset = data.values.mean(axis=0)
     constant = (largest == 0).all(axis=1)
@@ -475,7 +475,7 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
 def beyond(
     inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
 ) -> FloatArray:
-    """Share (m,) of the variance of functions times coefficients (P, m) from where tails pass all points (n, d)."""
+    """Share (m,) of the variance of an expansion (P, m) that comes from tails beyond all points (n, d)."""
     tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
     if not tails.any():
         return np.zeros(coefficients.shape[1])
@@ -488,7 +488,7 @@ def beyond(
 
 @dataclass(frozen=True)
 class Regression:
-    """A fit to samples and what it was chosen from.
+    """A fit to samples and the sets from which it was chosen.
 
     Attributes
     ----------
@@ -512,7 +512,7 @@ class Regression:
     def of(
         cls, inputs: Inputs, points: FloatArray, values: FloatArray, tangents: FloatArray | None, max_order: int
     ) -> Regression:
-        """Fit to values (n, m) and, where they are given, tangents (n, m, d) at points (n, d).
+        """Fit values (n, m) and, if given, tangents (n, m, d) at points (n, d).
 
         Raises
         ------
@@ -526,7 +526,7 @@ class Regression:
         return cls(inputs, candidates, largest, data, fit_best(candidates, largest, data))
 
     def first(self, count: int) -> Regression:
-        """Return the fit to the first `count` samples that have an answer; errors as of `of`."""
+        """Return the fit to the first `count` samples that have an answer; errors as in `of`."""
         data = self.data.some(slice(count))
         return replace(self, data=data, fit=fit_best(self.candidates, self.largest, data))
 
@@ -536,16 +536,16 @@ class Regression:
         return self.largest.subset(self.fit.chosen.which)
 
     def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
-        """Return what follows from the coefficients, by output, with standard errors."""
+        """Return estimates from the coefficients, by output, with standard errors."""
         return _estimates(self.fit, self.largest.indices, self.data, self._rest(), of)
 
     def _rest(self) -> FloatArray | None:
-        """Return the norms (m,) of what is missing in outputs, or None where no parameter has a tail.
+        """Return the norms (m,) of what the basis misses in outputs; None if no parameter has a tail.
 
-        Samples reach up to the ends of a range, and know it as the leave-one-out error. Where distributions have tails
-        they do not: what is missing is, before all else, the next power of a parameter with a tail, and beyond the
-        samples it grows. Of such a function ψ, of norm 1, the fit to these samples leaves residuals of a sum of squares
-        r²; a sum of squares s² of the outputs' own is that of a function of norm s/r.
+        On a bounded range samples reach the ends, and the leave-one-out error shows what is missing. In tails they do
+        not: above all, the next power of a parameter with a tail is missing, and it grows beyond the samples. If the
+        residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r², then outputs
+        whose residuals have the sum of squares s² miss a function of norm s/r.
         """
         tails = np.flatnonzero([marginal.support is None for marginal in self.inputs.marginals.values()])
         if not tails.size:
@@ -562,16 +562,16 @@ class Regression:
 
     @property
     def beyond(self) -> FloatArray:
-        """Share (m,) of the variance of the fit from where there are no samples."""
+        """Share (m,) of the variance of the fit that comes from where there are no samples."""
         return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)
 
     @property
     def controlled(self) -> BoolArray:
-        """Of which outputs (m,) the moments are those of the samples, with the fit as control."""
+        """Whether the moments of outputs (m,) are those of the samples, with the fit as control."""
         return self.fit.relative > TRUSTED
 
     def doubts(self, names: Sequence[str]) -> Iterator[Finding]:
-        """Find what speaks against the estimates of these outputs."""
+        """Find reasons to doubt the estimates of these outputs."""
         n = len(self.data.points)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
         yield from of_reach(names, self.beyond, self.fit.relative, n)
@@ -587,26 +587,25 @@ class Regression:
 
 
 def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis) -> dict[str, FloatArray]:
-    """Moments and indices by output with their standard errors, by the jackknife over samples and by what it leaves.
+    """Moments and indices by output, with standard errors from the jackknife over samples and the residual variance.
 
-    The jackknife is taken around the estimate itself, so that a bias counts too. Where functions were selected, its
-    parts select anew: what the samples chose is uncertain as they are.
+    The jackknife is taken around the estimate itself, so that a bias counts too. If functions were selected, each of
+    its fits selects again, since the selection is as uncertain as the samples.
 
-    The jackknife asks what a fit does in the hole that a sample left, and claims too much; a regression with
-    independent errors takes the smooth rest for random errors, and claims too little. For the mean, the geometric
-    mean of the two is claimed: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
+    The jackknife tests a fit in the gap that a sample leaves, and its error is too large; a regression with independent
+    errors takes the smooth remainder for random errors, and its error is too small. The error of the mean is the
+    geometric mean of the two: in 30 settings of five functions its 95 % intervals covered 92 to 100 %, those of the
     jackknife 97 to 100 % at up to four times the length, the others 55 to 100 %. Up to two samples for each parameter
-    it is the jackknife.
+    it is the jackknife's.
 
-    None of this looks at what no function of the basis takes. So there are other estimates beside, of the samples
-    with fits that have not seen them as controls (`_unseen`): half the distance to them counts as an error, and for the
-    standard deviation the variance λ² that is left, λ the leave-one-out error. Above `ROUGH` their error counts for the
-    mean, and above `TRUSTED` they take the place of
-    those of the fit (docs/decisions/0011-claims-of-expansions.md).
+    None of this sees what lies outside the basis. So there are other estimates too, from the samples, each with the fit
+    without it as control (`_unseen`): half the distance to them counts as an error, and for the standard deviation the
+    residual variance λ², λ the leave-one-out error. Above `ROUGH` their error counts for the mean, and above `TRUSTED`
+    they replace those of the fit (docs/decisions/0011-claims-of-expansions.md).
 
-    Where distributions have tails, the part of the function outside the basis is large there and no sample says so:
-    there its norm, the `rest`, is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the
-    mean, which keeps the jackknife.
+    In tails, the part of the function outside the basis is large, and no sample shows it. If distributions have tails,
+    its norm, the `rest`, is added: for the standard deviation, as |σ_f − σ_g| ≤ ‖f − g‖, and over √n for the mean,
+    whose error is the jackknife's.
 
     Indices have the share of λ² in the variance as a further error; above `NOTHING` there are none (NaN).
     """
@@ -648,13 +647,13 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
 
 
 def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:
-    """Moments by output from the samples, each with a fit that has not seen it as control, and their standard errors.
+    """Moments by output from the samples, each with the fit without it as control, and their standard errors.
 
-    With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and so for the square: unbiased for
-    independent samples, however bad the fits are; where they are constants it is plain Monte Carlo.
+    With g_z for the fit without sample z, E[f] = ⟨E g_z + f(ω_z) − g_z(ω_z)⟩, and likewise for the square: unbiased for
+    independent samples, however bad the fits are; with constants as fits it is plain Monte Carlo.
     """
     weights = (data.weights / data.weights.sum())[:, None]
-    independent = 1 / (weights**2).sum()  # as many samples of equal weight know as much
+    independent = 1 / (weights**2).sum()  # samples of equal weight that are as informative
     first, second, offset = _unseen_samples(fit, largest, data)
     mean = (weights * first).sum(axis=0)
     second = second - 2 * mean * first + mean**2

@@ -1,8 +1,8 @@
-"""Polynomials that stand for a model and whose moments are known exactly: control variates.
+"""Control variates: polynomial surrogates of a model whose moments are known exactly.
 
-A control is C(ω) = Σ_k φ_k(ω) c_k, of features φ whose moments are known. E[C] = Σ E[φ_k] c_k is exact whatever the
-coefficients are, as long as they do not depend on the samples that are controlled: an error of theirs costs efficiency
-and never bias. So is E[C²] = Σ c_k E[φ_kφ_l] c_l. For the Taylor polynomials around the mean parameters, with the
+A control is C(ω) = Σ_k φ_k(ω) c_k, with features φ whose moments are known. E[C] = Σ E[φ_k] c_k is exact whatever the
+coefficients, as long as they do not depend on the samples that are controlled: errors in them cost efficiency but never
+cause bias. So is E[C²] = Σ c_k E[φ_kφ_l] c_l. For the Taylor polynomials around the mean parameters, with the
 deviation δ = t − t̄ of the coordinates (`uq.inputs.coordinates`), φ = (δ_i; ½δ_i², δ_iδ_j for i < j) and c = (∂ψ/∂t_i;
 ∂²ψ/∂t_i∂t_j).
 """
@@ -25,10 +25,10 @@ from uq.surrogates.basis import Basis, gauss_rule
 from uq.surrogates.field_regression import Deviations
 from uq.surrogates.linearisation import Linearisation
 
-STEP = 0.5  # of the difference quotients, in standard deviations: wide, to see the curvature where the samples lie
-MARGIN = 0.25  # of the reach of its samples, by which an expansion is followed beyond them on either side
-FAR = 9.0  # standard deviations beyond which a normal density is nothing
-EDGE = 1e-9  # probability of the quantile that takes the place of the end of an unbounded range
+STEP = 0.5  # of the difference quotients, in standard deviations: wide, to capture the curvature where the samples lie
+MARGIN = 0.25  # of the range of its samples, by which an expansion is used beyond them on either side
+FAR = 9.0  # standard deviations beyond which a normal density is negligible
+EDGE = 1e-9  # probability of the quantile that replaces the end of an unbounded range
 
 
 class Features(Protocol):
@@ -55,19 +55,19 @@ class Monomials:
 
 @dataclass(frozen=True)
 class Control:
-    """A polynomial that stands for the deviations of the outputs and of the state from those at the mean parameters.
+    """A polynomial surrogate of the deviations of the outputs and the state from those at the mean parameters.
 
     Attributes
     ----------
     polynomials
         The k features.
     outputs, state
-        Coefficients (k, m) and (k, U); no state (0, U) where the slopes of the state are not known.
+        Coefficients (k, m) and (k, U); empty (0, U) if the slopes of the state are unknown.
     features_mean
         E[φ] (k,).
     features_second
-        E[φφᵀ] (s, s) of the first s features, s = k, or d where the fourth moments of the inputs are not known: the
-        square of what these predict is the control of the second moment.
+        E[φφᵀ] (s, s) of the first s features, s = k, or d if the fourth moments of the inputs are unknown: the square
+        of the prediction by these is the control of the second moment.
     """
 
     polynomials: Features
@@ -94,16 +94,16 @@ class Control:
 
 
 def expansion(fitted: Deviations) -> Control:
-    """Return the control that an expansion in orthonormal polynomials is: E[φφᵀ] = 1, E[φ] is 1 for the constant."""
+    """Return an expansion in orthonormal polynomials as a control: E[φφᵀ] = 1, E[φ] is 1 for the constant, else 0."""
     constant = (fitted.basis.indices == 0).all(axis=1)
     return Control(fitted.basis, fitted.outputs, fitted.state, constant.astype(float), np.eye(constant.size))
 
 
 def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
-    """Return the outputs' control that the expansion is within the reach of its samples and `MARGIN`, held beyond.
+    """Return the expansion as a control of outputs within the range of its samples and `MARGIN`, constant beyond.
 
-    There the expansion itself is a guess that no sample supports, while E[φφᵀ] counts it in full. None where all
-    parameters have ends, up to which samples reach.
+    Beyond, the expansion is a guess that no sample supports, while E[φφᵀ] counts it in full. None if all parameters
+    are bounded: samples then reach the ends.
     """
     tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
     if not tails.any():
@@ -126,7 +126,7 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
 
 @dataclass(frozen=True)
 class Held:
-    """Functions of the parameters that beyond a range (d,) of the coordinates keep the values at its edge."""
+    """Functions of the parameters that keep, beyond a range (d,) of the coordinates, their values at its edge."""
 
     basis: Basis
     lower: FloatArray
@@ -139,7 +139,7 @@ class Held:
 
 
 def _normal_rule(marginal: Distribution, lower: float, upper: float) -> tuple[FloatArray, FloatArray]:
-    """Coordinates t and weights of a rule for what has kinks at the coordinates lower and upper."""
+    """Coordinates t and weights of a rule for functions with kinks at the coordinates lower and upper."""
     from scipy.special import ndtri
 
     alone = Inputs({"": marginal}).coordinates
@@ -162,16 +162,16 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     """Return the Taylor polynomial of second degree, by central differences of tangents: two solves for each parameter.
 
     E[φ] follows from the correlation of the coordinates. E[φφᵀ] needs their moments up to the fourth, which are known
-    where the inputs are independent; with a copula the second moment is controlled by the square of the tangent alone.
+    if the inputs are independent; with a copula only the square of the tangent controls the second moment.
 
     Parameters
     ----------
     inputs, evaluate
-        Where, and of what.
+        The parameters and the model.
     centre
         The linearisation at the mean parameters.
     fields
-        Whether the coefficients of the state are wanted: d(d + 1)/2 fields.
+        Whether the coefficients of the state are computed: d(d + 1)/2 fields.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
 
 
 def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, factors: FloatArray) -> FloatArray:
-    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by Gauss rules that are exact for it."""
+    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by exact Gauss rules."""
     moments = []
     for marginal, at in zip(inputs.marginals.values(), middle, strict=True):
         t, weights = gauss_rule(marginal, 3)
@@ -217,7 +217,7 @@ def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, f
 
 
 def _steps(inputs: Inputs) -> FloatArray:
-    """Steps (d,) of the differences along the coordinates: no further than half the way to an end of the range."""
+    """Steps (d,) of the differences along the coordinates: at most half the distance to an end of the range."""
     marginals = inputs.marginals.values()
     supports = [marginal.support or (marginal.at(EDGE), marginal.at(1 - EDGE)) for marginal in marginals]
     lower, upper = inputs.coordinates.of(np.array(supports).T)

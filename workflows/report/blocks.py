@@ -50,7 +50,7 @@ class Pairs(Block):
 
 @dataclass(frozen=True)
 class Table(Block):
-    """A table; the columns `text` are flushed left, and those of them in `long` are wrapped."""
+    """A table; the columns `text` are flush left, and those of them in `long` are wrapped."""
 
     macro = "table"
     head: Sequence[str]
@@ -61,7 +61,7 @@ class Table(Block):
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in base64 with what it shows; `wide` is one of many panels, which needs all of the page."""
+    """A PNG in base64 with a caption; a `wide` one has many panels and needs the whole width of the page."""
 
     data: str
     caption: str
@@ -81,7 +81,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures(Block):
-    """Pictures side by side; `small` ones stand three in a row."""
+    """Pictures side by side; `small` ones are three in a row."""
 
     macro = "pictures"
     items: Sequence[Picture]

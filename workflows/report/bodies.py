@@ -1,4 +1,4 @@
-"""Pictures of the deformed body with pyvista, on screen or in a process of its own."""
+"""Pictures of the deformed body with pyvista, on screen or in a separate process."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from workflows.results.directory import body_grid, mesh_grid
 if TYPE_CHECKING:
     import xarray as xr
 
-SUBDIVISION = 3  # times that a face of high order is halved
-DRAWING_SECONDS = 600  # what the drawing of all bodies may take
+SUBDIVISION = 3  # number of times that a face of high order is halved
+DRAWING_SECONDS = 600  # time limit for drawing all bodies
 FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
 COLUMNS, ROWS = 3, 3  # of names of colours
 STILL = "#c9ced4"  # of nodes that do not move
@@ -28,7 +28,7 @@ BY_NUMBER = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "
 
 
 def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
-    """Draw the body, deformed by its mean displacement (the nominal one where there is no mean) and coloured.
+    """Draw the body, deformed by its mean displacement (the nominal one if there is no mean) and coloured.
 
     Parameters
     ----------
@@ -108,19 +108,19 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
 
 
 def mesh(dataset: xr.Dataset, shown: str = "mesh") -> Any:
-    """Draw a mesh that was refined, coloured by what its cells add to errors.
+    """Draw a mesh that was refined, coloured by the contributions of its cells to errors.
 
     Parameters
     ----------
     dataset
         Results with such a mesh.
     shown
-        "mesh": its surface; "mesh cut": what is behind the cell that adds most.
+        "mesh": its surface; "mesh cut": what is behind the cell that contributes most.
 
     Returns
     -------
     pyvista.Plotter
-        As of `body`.
+        As in `body`.
     """
     import pyvista
 
@@ -145,15 +145,15 @@ def mesh(dataset: xr.Dataset, shown: str = "mesh") -> Any:
     _show_lengths(plotter, grid.points, up)
     _look(plotter, up)
     plotter.subplot(1, 0)
-    _show_colours(plotter, coloured.mapper, "log10 of what cells add to the error by their volume, 0 on average")
+    _show_colours(plotter, coloured.mapper, "log10 of contributions of cells to the error by volume, 0 on average")
     plotter.subplot(0, 0)
     return plotter
 
 
 def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | None:
-    """Draw bodies as PNG, each as `body` or `mesh` does, in a process of its own; None where they cannot be drawn.
+    """Draw bodies as PNG, each as `body` or `mesh` does, in a separate process; None if they cannot be drawn.
 
-    A graphics library that is missing or broken ends a process at once: it must not take a study with it.
+    A graphics library that is missing or broken kills its process: it must not kill the study.
     """
     needed = dataset[[name for name in dataset.data_vars if "sample" not in dataset[name].dims]]
     try:
@@ -194,7 +194,7 @@ def _edges(grid: Any, displacement: FloatArray | None = None) -> Any:
 
 
 def _up(dataset: xr.Dataset) -> FloatArray:
-    """Return the axis (3,) that is nearest to up: against gravity, or else z (y where the body is a sheet across z)."""
+    """Return the axis (3,) that points up: against gravity, otherwise z (y if the body is a sheet across z)."""
     points = dataset["node_position" if "node_position" in dataset else "mesh_vertex_position"].to_numpy()
     extents = np.ptp(points, axis=0)
     up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
@@ -221,7 +221,7 @@ def _look(plotter: Any, up: FloatArray) -> None:
     plotter.reset_camera()
     extents = np.ptp(np.reshape(plotter.bounds, (3, 2)), axis=1)
     tall = extents @ np.abs(up) > 0.8 * (extents * (1 - np.abs(up))).max()
-    plotter.camera.zoom(0.86 if tall else 1.02)  # the numbers below and above a tall body need room
+    plotter.camera.zoom(0.86 if tall else 1.02)  # room for the numbers below and above a tall body
     plotter.camera.SetWindowCenter(0, -0.06)  # the numbers of the axes are below the body
 
 
@@ -231,7 +231,7 @@ def _colour_of(parameter: int) -> str:
 
 def _name_colours(plotter: Any, present: list[tuple[int, str]]) -> None:
     """Write the parameters that dominate somewhere, each in its colour, in three columns."""
-    plotter.add_text("the parameter that dominates:", position=(0.1, 0.75), viewport=True, font_size=14, color="black")
+    plotter.add_text("dominating parameter:", position=(0.1, 0.75), viewport=True, font_size=14, color="black")
     for k, (i, name) in enumerate(present[: COLUMNS * ROWS]):
         place = (0.1 + 0.28 * (k % COLUMNS), 0.48 - 0.22 * (k // COLUMNS))
         text = name.replace("$", "")
@@ -256,9 +256,9 @@ def _show_colours(plotter: Any, mapper: Any, title: str) -> None:
 
 
 def _show_lengths(plotter: Any, points: FloatArray, up: FloatArray) -> None:
-    """Draw axes around the points (n, 3) that begin, end and have their numbers at multiples of a round length.
+    """Draw axes around the points (n, 3) that begin, end and are numbered at multiples of a round length.
 
-    Two axes meet in the corners at the lower left and at the lower right: one of them leaves its number out.
+    Two axes meet in the corners at the lower left and lower right: one of them omits its number.
     """
     extent = float(np.ptp(points, axis=0).max())
     power = 10 ** np.floor(np.log10(extent / 4))
@@ -286,7 +286,7 @@ def _show_lengths(plotter: Any, points: FloatArray, up: FloatArray) -> None:
 
 
 def _colour_title(shown: str, parameter: str | None) -> str:
-    # A dollar would begin a formula of VTK.
+    # A dollar sign would start a formula in VTK.
     if parameter is not None:
         return f"displacement by one standard deviation of {parameter} (m)".replace("$", "")
     if shown.startswith("sobol_"):

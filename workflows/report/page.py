@@ -29,7 +29,7 @@ def write_report(directory: Path) -> Path:
     FileNotFoundError
         If the directory holds no results.
     StudyError
-        If a section that the study asks for is not there.
+        If a section that the study asks for does not exist.
     """
     path = directory / "report.html"
     results = _read(directory)
@@ -54,7 +54,7 @@ def compare(directories: Sequence[Path], out: Path) -> Path:
     for name, directory in zip(_names(directories), directories, strict=True):
         studies[name] = _read(directory)
         if not comparison.applies(studies[name]):
-            message = f"{directory}: holds no estimates of outputs, expected studies that do, to lay side by side"
+            message = f"{directory}: holds no estimates of outputs, expected studies that do, for a comparison"
             raise StudyError(message)
     title = f"Comparison of {len(studies)} studies"
     write_text(out, render(title, [("comparison", [Heading(title, 1), *comparison.content(studies)])]))
@@ -77,7 +77,7 @@ def _asked(directory: Path) -> Report | None:
 
 
 def _made(name: str, section: Section, results: Results) -> list[Block] | None:
-    """Return what a section shows, if it applies; of one from outside that fails, the rest of the report is kept."""
+    """Return the blocks of a section, if it applies; the rest of the report survives a failing one from outside."""
     try:
         return list(section.content(results)) if section.applies(results) else None
     except Exception as error:
@@ -98,7 +98,7 @@ def _read(directory: Path) -> Results:
         return Results(dataset, summary, parse(tomllib.loads(dataset.attrs["config"])))
     except StudyError as error:
         made = dataset.attrs.get("tissuq", "unknown")
-        message = f"{directory}: is no study of this version of tissuq, it was made by version {made} ({error.args[0]})"
+        message = f"{directory}: not a study of this version of tissuq, it was made by version {made} ({error.args[0]})"
         raise StudyError(message) from None
 
 
@@ -131,7 +131,7 @@ def _inside(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def _names(directories: Sequence[Path]) -> list[str]:
-    """Name directories by their last part, or in full where that is not unique."""
+    """Name directories by their last part, or in full if that is not unique."""
     times = Counter(directory.resolve().name for directory in directories)
     names = [d.resolve().name if times[d.resolve().name] == 1 else str(d) for d in directories]
     return names if len(set(names)) == len(names) else [f"{i}: {name}" for i, name in enumerate(names, start=1)]

@@ -31,7 +31,7 @@ ROWS = 40  # parameters that a table lists
 
 @dataclass(frozen=True)
 class Results:
-    """What a results directory holds.
+    """The contents of a results directory.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Results:
     summary
         summary.json.
     study
-        The study, of whichever kind: a section that applies to the results knows which one.
+        The study, of any kind: a section that applies to the results knows which.
     """
 
     dataset: xr.Dataset
@@ -58,7 +58,7 @@ class Results:
         return [str(name) for name in self.dataset["parameter"].values]
 
     def leading(self, effects: xr.DataArray) -> list[str]:
-        """Names of the parameters, or of those with the largest effects (parameter,) where there are many."""
+        """Names of the parameters, or of those with the largest effects (parameter,) if there are many."""
         if len(self.parameters) <= ROWS:
             return self.parameters
         largest = (-abs(effects)).argsort().to_numpy()[:ROWS]
@@ -75,7 +75,7 @@ class Results:
         return str(self.dataset["unit"].sel(output=output).item())
 
     def parameter_unit(self, path: str, label: str = "/") -> str:
-        """SI unit of a number of the model of some evaluations, by its path; "1" of what is no number of the model."""
+        """SI unit of a number of the model of some evaluations, by its path; "1" for other names."""
         return str(self.study.units_of(label).get(path, "1"))
 
     @property
@@ -157,7 +157,7 @@ def of_study(report: Report | None) -> dict[str, Section]:
     Raises
     ------
     StudyError
-        If one of them is not there, or is to stand before one that is not; the message says where it was looked for.
+        If one of them does not exist, or names a `before` that does not; the message says where it was searched.
     """
     if report is None:
         return {}
@@ -168,11 +168,11 @@ def of_study(report: Report | None) -> dict[str, Section]:
             found[name] = SECTIONS[name]()
         except KindError as error:
             where = f"{name.partition('.')[0]}.py in {report.folder}"
-            message = f"report.sections: {error}; expected in {where}, or in a package that is installed"
+            message = f"report.sections: {error}; expected in {where}, or in an installed package"
             raise StudyError(message) from None
         if found[name].before not in SECTIONS.own:
             known = nearest(found[name].before, tuple(SECTIONS.own))
-            message = f"report.sections: '{name}' stands before '{found[name].before}', which is no section; {known}"
+            message = f"report.sections: '{name}' has before = '{found[name].before}', which is not a section; {known}"
             raise StudyError(message)
     return found
 
@@ -183,7 +183,7 @@ def sections(report: Report | None = None) -> list[tuple[str, Section]]:
     Raises
     ------
     StudyError
-        As `of_study` does.
+        As in `of_study`.
     """
     others = {name: SECTIONS[name]() for name in SECTIONS.names if name not in SECTIONS.own} | of_study(report)
     placed: list[tuple[str, Section]] = []

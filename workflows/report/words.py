@@ -16,7 +16,7 @@ def stability(counts: dict[str, int]) -> str:
     refused = counts["refused"] + counts["missed"]
     parts = [
         f"{counts['counted']:,} by counting negative eigenvalues",
-        f"{counts['screened']:,} by the screen alone",
+        f"{counts['screened']:,} by the screen only",
         *([f"{counts['not_tested']:,} not at all"] if counts["not_tested"] else []),
         *([f"{refused:,} refused as unstable"] if refused else []),
     ]
@@ -24,7 +24,7 @@ def stability(counts: dict[str, int]) -> str:
 
 
 def solves(summary: Mapping[str, Any]) -> int:
-    """Return the number of solves; a data set of several that are inverted side by side is one evaluation of many."""
+    """Return the number of solves, also if several data sets were inverted in parallel."""
     return int(max(summary["evaluations"], summary.get("solves", 0)))
 
 

@@ -289,7 +289,7 @@ def test_without_refusals_nothing_is_said(inputs):
 
 
 @pytest.mark.parametrize(
-    ("continued", "words"), [(True, "The expansion goes on"), (False, "missing from the estimates")]
+    ("continued", "words"), [(True, "The expansion continues"), (False, "missing from the estimates")]
 )
 def test_where_solves_failed_is_found(inputs, continued, words):
     points = inputs.points(random_points(0, 0, 60, 2))
@@ -304,7 +304,9 @@ def test_where_solves_failed_is_found(inputs, continued, words):
 def test_failures_here_and_there_have_no_bound(inputs):
     points = inputs.points(random_points(0, 0, 60, 2))
     failed = np.sin(37 * points[:, 0]) > 0.5
-    assert branch.separated(inputs, points, failed, ~failed) == "no bound of the parameters tells them from the others"
+    assert (
+        branch.separated(inputs, points, failed, ~failed) == "no bound on the parameters separates them from the others"
+    )
 
 
 def test_what_the_screen_missed_is_an_error(inputs):

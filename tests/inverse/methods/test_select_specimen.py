@@ -206,7 +206,7 @@ def test_a_study_from_the_command_line(study):
         assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (study.parent / "one/results.nc").read_bytes() == (study.parent / "two/results.nc").read_bytes()
     page = (study.parent / "one" / "report.html").read_text()
-    for words in ("What is left of the data", "Posteriors of the constants", "neo-hookean on 1 × 1 × 1 cells"):
+    for words in ("Residuals", "Posteriors of the constants", "neo-hookean on 1 × 1 × 1 cells"):
         assert words in page
     found = xr.load_dataset(study.parent / "one" / "results.nc")
     assert found["prior_probability"].to_numpy() == pytest.approx([0.25, 0.75])

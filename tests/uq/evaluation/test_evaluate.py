@@ -171,7 +171,7 @@ def test_outputs_of_which_no_moments_are_numbers_are_refused(kind, scale):
     """Standard deviations of 0 ± 0, and tracebacks: squares and fourth powers vanish or overflow."""
     inputs = Inputs({"a": Uniform(lower=1.0, upper=2.0)})
     model = FunctionModel(lambda p: [scale * p[0], p[0]], ("a",), ("y", "z"), lambda p: [[scale], [1.0]])
-    with pytest.raises(ModelError, match="output y is of the size"):
+    with pytest.raises(ModelError, match="output y is of size"):
         kind(samples=32).run(inputs, SerialEvaluate(model))
 
 

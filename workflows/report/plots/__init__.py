@@ -1,6 +1,6 @@
 """Pictures of results: one function each, from the dataset of `read_dataset` to labelled axes.
 
-Functions that take `ax` draw there, or on a new figure that needs no display: in a notebook,
+Functions with an argument `ax` draw there, or on a new figure that needs no display: in a notebook,
 ``plots.histogram(dataset, "uy_max").figure``. Those of inversions and of comparisons of models are in `inversion` and
 `selection`; bodies are drawn by `workflows.report.bodies`.
 """

@@ -37,7 +37,7 @@ def errors(
     estimated
         The mean or the standard deviation.
     against
-        The number of solves, or the processor time, which has the plain method by the textbook too.
+        The number of solves, or the processor time, with the plain method by the textbook solver too.
     ax
         Where to draw.
     """

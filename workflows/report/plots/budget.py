@@ -1,4 +1,4 @@
-"""Where the errors of estimates come from."""
+"""The sources of the errors of estimates."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 PART_COLOURS = {"sampling": CONTROLLED, "mesh": HIGH, "solver": PLAIN, "total": DARK}
 SHOWN = 12  # outputs that have bars
-SPAN = 1e-9  # of the largest error: smaller ones have no bar, so that the others can be told apart
+SPAN = 1e-9  # of the largest error: smaller ones have no bar, so that the others can be distinguished
 
 
 def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax: Axes | None = None) -> Axes:
-    """Draw what each source of error makes of an estimate of each output, relative to the estimate.
+    """Draw the errors of an estimate of each output by source, relative to the estimate.
 
     Parameters
     ----------
     names
         Of the outputs.
     parts
-        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN where one is not known.
+        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN if unknown.
     of
         The estimate, in words.
     ax

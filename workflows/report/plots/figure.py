@@ -1,4 +1,4 @@
-"""What pictures are drawn on: figures that need no display, their axes, colours and words."""
+"""Figures that need no display, with their axes, colours and words."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def png(ax: Axes) -> bytes:
 
 
 def axes(height: float = 3.2, width: float = 5.4) -> Axes:
-    """Return axes on a new figure (inches) that needs no display and that nothing else keeps."""
+    """Return axes on a new figure (inches) that needs no display and is not kept elsewhere."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -39,7 +39,7 @@ def axes(height: float = 3.2, width: float = 5.4) -> Axes:
 
 
 def grid(count: int, columns: int, height: float = 3.0, width: float = 2.8) -> list[Axes]:
-    """Return axes side by side on a new figure as of `axes`; height and width (inches) are those of each."""
+    """Return axes side by side on a new figure as from `axes`; height and width (inches) are those of each."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -75,7 +75,7 @@ def count_axis(ax: Axes, first: int, n: int) -> None:
 def span(values: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, float]:
     """Return the ends of an axis that holds a posterior, of values (n,) with weights (n,): 99.6 % of it, and a margin.
 
-    A point far out with next to no weight, as of a wide prior, moves no end.
+    A point far out with almost no weight, as with a wide prior, does not move an end.
     """
     order = np.argsort(values)
     reached = np.cumsum(weights[order]) / weights.sum()

@@ -1,4 +1,4 @@
-"""What parameters do to outputs: derivatives, Sobol' indices, active subspaces."""
+"""Effects of parameters on outputs: derivatives, Sobol' indices, active subspaces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHARES = 8  # parameters that have a colour of their own in stacked bars
 
 
 def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw how much an output changes, to first order, with each parameter one standard deviation off its mean."""
+    """Draw how much an output changes, to first order, with each parameter one standard deviation from its mean."""
     effects = dataset["derivative_per_std"].sel(output=output).to_numpy()
     order = np.argsort(np.abs(effects))[-BARS:]
     ax = ax or axes(height=1.3 + 0.42 * len(order))
@@ -56,7 +56,7 @@ def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes
 
 
 def index_shares(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw what parameters have alone of the variance of every output, and of the field, as stacked bars."""
+    """Draw the first-order shares of parameters in the variance of outputs and of the field, as stacked bars."""
     first = dataset["sobol_first"].transpose("output", "parameter").to_numpy()
     names = [str(name) for name in dataset["output"].to_numpy()]
     if "field_sobol_first" in dataset:

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
-SEEN = 1.0  # λ above which the data say more of a direction than the prior
+SEEN = 1.0  # λ above which the data say more about a direction than the prior
 Density = tuple[FloatArray, FloatArray]
 _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "label": "posterior"}
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across the body, with what it takes to draw fields on it.
+    """A plane across the body, and the points on it at which fields are drawn.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Cut:
 
     @classmethod
     def of(cls, one: xr.Dataset) -> Cut:
-        """Cut across y where truth or recovered field stand out."""
+        """Cut across y where the truth or the recovered field varies most."""
         from scipy.spatial import Delaunay
 
         places = one["node_position"].to_numpy()
@@ -79,7 +79,7 @@ class Cut:
 
 
 def panels(one: xr.Dataset) -> dict[str, FloatArray]:
-    """Return the fields (N,) of ln stiffness that are drawn on a plane, by what they are."""
+    """Return the fields (N,) of ln stiffness that are drawn on a plane, by name."""
     found = {}
     if np.isfinite(one["stiffness_true"]).all():
         found["true"] = one["stiffness_true"].to_numpy()
@@ -165,9 +165,9 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
 
 
 def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:
-    """Draw prior and posterior densities of the parameters, of many those that the data narrow most.
+    """Draw prior and posterior densities of the parameters; if there are many, those that the data narrow most.
 
-    Units of the parameters (``study.units_of("/")``) are shown where they are given.
+    Units of the parameters (``study.units_of("/")``) are shown if given.
     """
     narrowed = (one["std"] / one["prior_std"]).to_numpy()
     chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
@@ -204,7 +204,7 @@ def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[floa
 
 
 def _cut(low: float, high: float, posterior: FloatArray, prior: FloatArray) -> tuple[float, float]:
-    """Cut the ends of an axis off where the prior (2,) ends, unless points (n,) of the posterior are beyond."""
+    """Limit an axis to the range of the prior (2,), unless points (n,) of the posterior are beyond."""
     slack = 1e-6 * (prior[1] - prior[0])
     low = max(low, float(prior[0])) if posterior.min() > prior[0] - slack else low
     return low, min(high, float(prior[1])) if posterior.max() < prior[1] + slack else high
@@ -216,7 +216,7 @@ def _worth(one: xr.Dataset) -> float:
 
 
 def _smooth(draws: FloatArray, std: float, worth: float, x: FloatArray) -> FloatArray:
-    """Density at x of draws that are worth so many independent ones, by normal kernels (Silverman's width)."""
+    """Density at x of draws with an effective sample size, by normal kernels (Silverman's width)."""
     width = max(std, 1e-300) * (4 / (3 * max(min(worth, len(draws)), 2.0))) ** 0.2
     z = (x[:, None] - draws) / width
     return np.asarray(np.exp(-(z**2) / 2).mean(axis=1) / (width * np.sqrt(2 * np.pi)))
@@ -243,7 +243,7 @@ def _legend(found: list[Axes]) -> None:
 
 
 def node_marginals(one: xr.Dataset) -> Axes:
-    """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, that which is known least."""
+    """Draw prior and posterior of ln stiffness at three nodes: the softest, the stiffest, the least certain."""
     mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
     before = one["stiffness_prior_std"].to_numpy()
     centre = float(one["prior_mean"][0])
@@ -267,7 +267,7 @@ def _bell(x: FloatArray, mean: float, std: float) -> FloatArray:
 
 
 def errors(one: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw errors of the parameters whose truth is known, over their standard deviations."""
+    """Draw errors of the parameters whose true values are known, over their standard deviations."""
     names = [str(name) for name in one.parameter.values if np.isfinite(one["true"].sel(parameter=name))]
     ax = ax or axes(height=1.2 + 0.35 * len(names))
     known = one.sel(parameter=names)

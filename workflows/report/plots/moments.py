@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Estimated = Literal["mean", "std"]
-FIRST_SHOWN = 8  # estimates from fewer samples say nothing
+FIRST_SHOWN = 8  # estimates from fewer samples are meaningless
 MOST_BINS = 200
 
 
@@ -34,8 +34,8 @@ def running_estimates(
     counts
         Numbers of samples, each at least 2.
     controlled
-        With the tangent at the mean parameters as control variate (for the mean; the standard deviation is then not
-        to be used), or plain.
+        With the tangent at the mean parameters as control variate (for the mean; do not use the standard deviation
+        then), or plain.
     """
     ok = dataset["ok"].to_numpy()
     nominal = np.asarray(dataset["nominal"].sel(output=output).to_numpy())
@@ -46,7 +46,7 @@ def running_estimates(
     steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
     sums = monomials(deviations, steps @ dataset["derivative"].sel(output=output).to_numpy()).cumsum(axis=1)
     coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
-    unused = np.zeros_like(nominal)  # the variance of the control, which the mean does not depend on
+    unused = np.zeros_like(nominal)  # the variance of the control, on which the mean does not depend
     return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
 
 
@@ -75,7 +75,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
         ax.plot(counts, error[-1] * np.sqrt(counts[-1] / counts), color=colour, linewidth=0.8, linestyle=":")
     ax.plot([], [], color=DARK, linewidth=0.8, linestyle=":", label="proportional to 1/√samples")
     count_axis(ax, *(int(series[0][2][i]) for i in (0, -1)))
-    if any((error > 0).any() for *_, error in series):  # an output that does not vary has none
+    if any((error > 0).any() for *_, error in series):  # zero for an output that does not vary
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:.4g}"))
@@ -86,7 +86,7 @@ def standard_error(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> 
 
 
 def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the density of an output, of its expansion or else of its samples, with its mean and quantiles."""
+    """Draw the density of an output, from its expansion or its samples, with its mean and quantiles."""
     ax = ax or axes()
     if "density" in dataset:
         density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
@@ -119,7 +119,7 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 
 def _bins(values: NDArray[np.float64]) -> int:
-    """Return the number of bins of NumPy's "auto", but no more than can be drawn: one value far off makes millions."""
+    """Return the number of bins of NumPy's "auto", but no more than can be drawn: one outlier makes millions."""
     quarter, three_quarters = np.percentile(values, [25, 75])
     width = 2 * (three_quarters - quarter) / len(values) ** (1 / 3)
     fewest = np.log2(len(values)) + 1
@@ -134,9 +134,9 @@ def comparison(
     Parameters
     ----------
     datasets
-        Results by the name that stands beside them.
+        Results by the name shown beside them.
     output
-        Name of the output; studies without an estimate of it are left out.
+        Name of the output; studies without an estimate of it are omitted.
     estimated
         The mean or the standard deviation.
     ax

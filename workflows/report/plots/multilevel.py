@@ -66,7 +66,7 @@ def mesh_mean(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 
 def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the samples on every mesh, and the numbers that are best for other relative errors of sampling."""
+    """Draw the samples on every mesh, and the optimal numbers for other relative errors of sampling."""
     from uq.methods.multilevel import optimal
 
     ax = _level_axis(dataset, ax)
@@ -84,7 +84,7 @@ def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Ax
 
 
 def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
-    """Draw the predicted time of sampling against the error of the mean, over meshes and on the finest mesh alone."""
+    """Draw the predicted time of sampling against the error of the mean, over all meshes and on the finest only."""
     ax = ax or axes()
     found, (variances, costs) = _levels(dataset, output), _sampling(dataset, output)
     finest = float(dataset["mesh_cost"][-1])
@@ -110,7 +110,7 @@ def mesh_cost(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 
 def _levels(dataset: xr.Dataset, output: str) -> dict[str, NDArray[np.float64]]:
-    """Return what belongs to an output on every mesh."""
+    """Return the results for an output on every mesh."""
     return {str(n): v.sel(output=output).to_numpy() for n, v in dataset.items() if v.dims == ("level", "output")}
 
 
@@ -140,7 +140,7 @@ def _log2(
 
 
 def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax: Axes | None = None) -> Axes:
-    """Draw the estimated relative errors of outputs against the unknowns of the meshes, and what is asked for."""
+    """Draw the estimated relative errors of outputs against the unknowns of the meshes, and the tolerance."""
     ax = ax or axes()
     unknowns = dataset["cycle_unknowns"].to_numpy()
     for output, colour in zip(outputs, cycle(COLOURS), strict=False):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw ln Z of each model less the largest, with three standard errors."""
+    """Draw ln Z of each model minus the largest, with three standard errors."""
     order = ranking(dataset["log_evidence"])[::-1]
     ax = ax or axes(height=1.2 + 0.5 * len(order))
     values = dataset["log_evidence"].sel(model=order).values
@@ -25,7 +25,7 @@ def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     places = np.arange(len(order))
     below = values - values.max()
     ax.barh(places, below, xerr=3 * errors, color=CONTROLLED, ecolor=DARK, capsize=4, height=0.6)
-    # Beside models that are hopeless, what the others differ in cannot be seen: the numbers stand with the names.
+    # Next to hopeless models the differences of the others are invisible: the numbers are written with the names.
     labels = [f"{model}\n{with_error(float(z), float(e))}" for model, z, e in zip(order, below, errors, strict=True)]
     ax.set_yticks(places, labels, fontsize="small")
     ax.set_xlim(1.15 * min(below.min(), -1.0), 0.05 * abs(below.min()) + 3 * errors.max())

@@ -24,11 +24,11 @@ class AdaptedMesh(Section):
         """A table of meshes, a picture of their errors, and the last one."""
         dataset, adapt = results.dataset, results.study.model.adapt
         yield Heading("The mesh")
-        by = "what they add to these errors" if adapt.indicator == "dual-weighted" else "how far stresses jump"
+        by = "their contributions to these errors" if adapt.indicator == "dual-weighted" else "the jumps of stresses"
         yield Text(
             "Solved at the mean of the parameters, and refined where cells have most of the estimated error, by "
-            f"{by}. An error is the exact minus the discrete value, as elements of one degree more tell it: an "
-            "estimate, and no bound. That a coarse mesh cuts off a part of a curved body is not seen."
+            f"{by}. An error is the exact minus the discrete value, estimated with elements of one degree higher; it "
+            "is not a bound. It does not include the part of a curved body that a coarse mesh cuts off."
         )
         yield cycles(results)
         named = [results.study.model.outputs[i].name for i in adapt.named(results.study.model)]
@@ -36,8 +36,8 @@ class AdaptedMesh(Section):
             [Picture.drawn(plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh.")]
         )
         captions = {
-            "mesh": "The mesh; cells in bright colours add most to the error, for their volume.",
-            "mesh cut": "What is behind the cell that adds most.",
+            "mesh": "The mesh; cells in bright colours contribute most to the error, for their volume.",
+            "mesh cut": "What is behind the cell that contributes most.",
         }
         drawn = bodies.pictures(dataset, list(captions))
         if drawn is None:

@@ -14,7 +14,7 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     import xarray as xr
 
-UNITS = {"stress": "Pa", "displacement": "m", "output": "1"}  # outputs have units of their own
+UNITS = {"stress": "Pa", "displacement": "m", "output": "1"}  # outputs have their own units
 
 
 class Averages(Section):
@@ -28,7 +28,7 @@ class Averages(Section):
         """One table."""
         yield Heading("Averaged predictions")
         yield Text(
-            "At the far end of each test, or where most was measured to move, without the errors of measurement."
+            "At the end of each test, or where the largest displacement was measured, without measurement errors."
         )
         yield averages(results.dataset)
 
@@ -41,7 +41,7 @@ def averages(dataset: xr.Dataset) -> Table:
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
         at = dataset["output_at"].values[members]
-        # Data of displacements have numbers only: there, what moved most.
+        # Displacement data have only numbers: take the largest displacement.
         far = np.abs(at - at[0]) if quantity == "stress" else np.abs(dataset["measured"].values[members])
         one = dataset.isel(output=members[int(np.argmax(far))])
         stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))

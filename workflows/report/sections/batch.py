@@ -1,4 +1,4 @@
-"""All data sets that were inverted, a row each."""
+"""All data sets that were inverted, one row each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TRUSTED = ("Laplace's", "corrected", "not to be trusted", "doubtful")
 
 
 class Batch(Section):
-    """All data sets that were inverted, a row each."""
+    """All data sets that were inverted, one row each."""
 
     def applies(self, results: Results) -> bool:
         """Whether several data sets were inverted."""
@@ -24,8 +24,8 @@ class Batch(Section):
         """One table."""
         yield Heading("All data sets")
         yield Text(
-            "± is one posterior standard deviation; the same, with more digits, is in batch.csv. The first that could "
-            "be inverted follow one by one."
+            "± is one posterior standard deviation; batch.csv has more digits. The first data sets that could be "
+            "inverted follow one by one."
         )
         yield batch(results)
 

@@ -21,10 +21,10 @@ NO_BODY = "The body could not be drawn on this machine: drawing needs OpenGL wit
 
 
 class Body(Section):
-    """The deformed body, coloured by what is known of its displacement."""
+    """The deformed body, coloured by its displacement."""
 
     def applies(self, results: Results) -> bool:
-        """Whether one body was deformed, whether or not its displacement was kept."""
+        """Whether one body was deformed, with or without a stored displacement."""
         return "nominal" in results.dataset and bool(results.study.spec.meshed)
 
     def content(self, results: Results) -> Iterator[Block]:
@@ -32,7 +32,7 @@ class Body(Section):
         dataset = results.dataset
         yield Heading("The deformed body")
         if "cell_nodes" not in dataset:
-            yield Text("This study keeps no displacement field.")
+            yield Text("This study stores no displacement field.")
             return
         captions = captions_of(dataset)
         drawn = bodies.pictures(dataset, list(captions))
@@ -40,12 +40,12 @@ class Body(Section):
             yield Text(NO_BODY)
             return
         where = "its mean displacement" if "field_mean" in dataset else "the displacement at the mean parameters"
-        yield Text(f"Deformed by {where}, in true scale; the grey lines are the undeformed body.")
+        yield Text(f"Deformed by {where}, to scale; the grey lines are the undeformed body.")
         yield Pictures([Picture.of(drawn[name], caption) for name, caption in captions.items()])
 
 
 def captions_of(dataset: xr.Dataset) -> dict[str, str]:
-    """Return what of the body is drawn, and what the picture shows."""
+    """Return the pictures of the body by name, with their captions."""
 
     def largest(field: str) -> str:
         return f"at most {number(float(np.linalg.norm(dataset[field].to_numpy(), axis=1).max()))} m"
@@ -62,7 +62,7 @@ def captions_of(dataset: xr.Dataset) -> dict[str, str]:
         effects = dataset["field_derivative_rms"] * dataset["parameter_std"]
         strongest = dataset["parameter"].to_numpy()[np.argsort(-effects.to_numpy())][:DERIVATIVES_DRAWN]
         for name in strongest:
-            captions[f"derivative {name}"] = f"What one standard deviation of {name} moves, to first order."
+            captions[f"derivative {name}"] = f"Displacement by one standard deviation of {name}, to first order."
     if "dominating" in dataset:
         strongest = dataset["parameter"].to_numpy()[np.argsort(-dataset["field_sobol_total"].to_numpy())]
         for name in strongest[:MAPS_DRAWN]:

@@ -1,4 +1,4 @@
-"""What a control variate, or quasi-random points, are worth."""
+"""The gain of a control variate, or of quasi-random points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ControlVariate(Section):
-    """What a control variate, or quasi-random points, are worth."""
+    """The gain of a control variate, or of quasi-random points."""
 
     def applies(self, results: Results) -> bool:
         """Whether there is something better than plain samples."""
@@ -37,21 +37,21 @@ class Gain:
 
 
 def gains(dataset: xr.Dataset) -> Iterator[Gain]:
-    """Say what the control variate, or quasi-random points, are worth, output by output."""
+    """Say what the control variate, or quasi-random points, gain, output by output."""
     means = "the control variate"
     if "scramble" in dataset:
         means = "Sobol' points and the control variate" if "coefficient" in dataset else "Sobol' points"
         R = int(dataset["scramble"].max()) + 1
         spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
         yield Gain(
-            f"Errors are from the scatter of {R} independent scrambles, and so known to {spread} % or so when squared; "
-            f"a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
+            f"Errors come from the scatter of {R} independent scrambles, so that their squares are known to about "
+            f"{spread} %; a 95 % interval is ± {number(half_width(dataset), 3)} of them.",
             hurts=False,
         )
     if "control_samples" in dataset:
         error, fitted = number(float(dataset["loo_error"].max()), 2), int(dataset["control_samples"])
         yield Gain(
-            f"The control variate is an expansion fitted to {fitted} samples of its own, with a leave-one-out "
+            f"The control variate is an expansion fitted to {fitted} separate samples, with a leave-one-out "
             f"error of at most {error} standard deviations.",
             hurts=False,
         )
@@ -63,5 +63,5 @@ def gains(dataset: xr.Dataset) -> Iterator[Gain]:
         )
         worse = [word for word, ratio in (("mean", mean), ("standard deviation", std)) if ratio < 1]
         if worse:
-            text += f" It hurts the {' and the '.join(worse)}: there, plain Monte Carlo is better."
+            text += f" For the {' and the '.join(worse)}, plain Monte Carlo is better."
         yield Gain(text, bool(worse))

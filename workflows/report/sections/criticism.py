@@ -25,8 +25,8 @@ class Criticism(Section):
         """Tables of scores."""
         yield Heading("Is the best one good?")
         yield Text(
-            "Data left out one at a time are predicted from the others, by weights that are judged in the same way; "
-            "residuals are compared with those that a true model would leave."
+            "Each datum is left out and predicted from the others, by weights that are judged in the same way; "
+            "residuals are compared with those of a true model."
         )
         yield criticism(results.dataset)
 

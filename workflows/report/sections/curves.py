@@ -1,4 +1,4 @@
-"""What the models say beside the data."""
+"""Predictions of the models and the data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workflows.report.section import Results, Section
 
 
 class Curves(Section):
-    """Curves over the data, or what is left of the data."""
+    """Curves over the data, or residuals."""
 
     def applies(self, results: Results) -> bool:
         """Whether models were compared."""
@@ -21,11 +21,11 @@ class Curves(Section):
         dataset, study = results.dataset, results.study
         tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
         if dataset.attrs["quantity"] != "stress":
-            yield Heading("What is left of the data")
+            yield Heading("Residuals")
             drawn = [
                 Picture.drawn(
                     plots.residuals(dataset, str(test), of=study.measured_in(str(test))),
-                    f"{test}: measured less predicted, over the errors.",
+                    f"{test}: measured minus predicted, over the errors.",
                 )
                 for _, test in tests
             ]

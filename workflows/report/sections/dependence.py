@@ -1,4 +1,4 @@
-"""What evidences depend on."""
+"""The dependence of evidences on errors, data and priors."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Dependence(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
-        yield Heading("What it depends on")
+        yield Heading("What the evidences depend on")
         yield Text(
             "ln Z and probability of each model with other errors, other data, and priors of half and twice the width "
-            "in standard normal coordinates."
+            "(in standard normal coordinates)."
         )
         yield variants(results.dataset)
 

@@ -23,14 +23,14 @@ class DerivativeBased(Section):
         yield Heading("Sensitivity from derivatives")
         yield Text(
             "The total index of a parameter is at most its mean squared derivative times the Poincaré constant of its "
-            "distribution over the variance of the output. The active subspace is made of the directions along which "
-            "the output changes most, in parameters over their standard deviations."
+            "distribution over the variance of the output. The active subspace is spanned by the directions along "
+            "which the output changes most, in parameters over their standard deviations."
         )
         for output in results.outputs:
             yield Heading(output, level=3)
             yield bounds(results, output)
             yield active_subspace(results, output)
-            summary = f"{output} against its leading direction: a curve, if that direction is all that matters."
+            summary = f"{output} against its leading direction: a curve if only that direction matters."
             spectrum = f"Eigenvalues of the active subspace of {output} with 95 % ranges."
             yield Pictures(
                 [

@@ -13,7 +13,7 @@ class Distribution(Section):
     """Samples of the outputs, and how their estimates converge."""
 
     def applies(self, results: Results) -> bool:
-        """Whether there are samples, and nothing smoother."""
+        """Whether there are samples, and no expansion."""
         return {"values", "nominal"} <= set(results.dataset) and "density" not in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:

@@ -1,4 +1,4 @@
-"""What methods err, and what they cost."""
+"""Errors of methods against their costs."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class ErrorAgainstCost(Section):
         """The reference, and pictures and a table for each estimate of each output."""
         yield Heading("Error against cost")
         yield Text(
-            "The reference, with its own standard errors; what the tolerance of the solver leaves of an output "
-            "(against the textbook, on some draws); what the mesh errs, by estimate or (`mesh_error` of the "
-            "method) by a mesh of twice the cells in each direction at the mean parameters."
+            "The reference, with its own standard errors; the error due to the tolerance of the solver (against the "
+            "textbook solver, on some draws); the error of the mesh, by estimate or (`mesh_error` of the method) by a "
+            "mesh of twice the cells in each direction at the mean parameters."
         )
         yield references(results)
         yield Text(
-            "RMSE is the root mean square error of the repeats against the reference, claimed the standard error that "
-            "the method itself gives, coverage the share of its 95\u00a0% intervals that hold the reference. Errors "
-            "below twice that of the reference are not resolved. A gain is what plain Monte Carlo costs at equal error "
-            "(by its exact rate) over what the method costs, with its set-up: in solves, in processor time, and in "
-            "processor time where plain Monte Carlo solves by the textbook. The rate is the slope of ln RMSE over ln "
-            "solves. Rows by the textbook solver are derived from the solves of plain Monte Carlo."
+            "RMSE is the root mean square error of the repeats against the reference, “claimed” the standard error "
+            "that the method itself gives, coverage the share of its 95\u00a0% intervals that contain the reference. "
+            "Errors below twice that of the reference are not resolved. A gain is the cost of plain Monte Carlo at "
+            "equal error (by its exact rate) over the cost of the method, with its set-up: in solves, in processor "
+            "time, and in processor time if plain Monte Carlo uses the textbook solver. The rate is the slope of "
+            "ln RMSE over ln solves. Rows with the textbook solver are derived from the solves of plain Monte Carlo."
         )
         costs: dict[str, plots.Cost] = {"the number of solves": "solves", "processor time": "cpu_seconds"}
         words: dict[str, plots.Estimated] = {"mean": "mean", "standard deviation": "std"}
@@ -54,7 +54,7 @@ class ErrorAgainstCost(Section):
 
 
 def references(results: Results) -> Table:
-    """What methods are compared with, and what the solver and the mesh leave of it."""
+    """The references, and the errors of the solver and the mesh."""
     rows = []
     for output in results.outputs:
         of_output, unit = results.dataset.sel(output=output), results.unit(output)
@@ -64,7 +64,7 @@ def references(results: Results) -> Table:
 
 
 def errors(results: Results, output: str, estimated: str) -> Table:
-    """What each method errs and costs at each budget, for one estimate of an output."""
+    """Error and cost of each method at each budget, for one estimate of an output."""
     dataset = results.dataset.sel(output=output)
     scale = abs(float(dataset[estimated]))
     plain, gained = plain_samples(dataset, estimated).to_numpy(), gains(dataset, estimated)

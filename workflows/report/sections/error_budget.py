@@ -1,4 +1,4 @@
-"""Where the errors of all that follows come from."""
+"""The sources of the errors of all results that follow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at t
 
 
 class ErrorBudget(Section):
-    """What sampling, the mesh and the solver leave of each estimate."""
+    """The errors of sampling, the mesh and the solver in each estimate."""
 
     def applies(self, results: Results) -> bool:
         """Whether outputs of one body were estimated."""
@@ -34,22 +34,22 @@ class ErrorBudget(Section):
                 [
                     Picture.drawn(
                         plots.error_budget(results.outputs, found, ESTIMATES[name]),
-                        f"What each source leaves of the {ESTIMATES[name]}.",
+                        f"Errors of the {ESTIMATES[name]} by source.",
                     )
                     for name, found in budgets.items()
                 ]
             )
         if any(f"{name}_corrected" in results.dataset for name in shown):
             yield Text(
-                "The error of the mesh is the exact minus the computed value, by estimate, with what is not known of "
-                "it. The total error is √(sampling² + (mesh + its doubt)²), and what the corrected value, with the "
-                "error of the mesh added, has left is √(sampling² + doubt²). All are as large as standard errors."
+                "The error of the mesh is the estimated exact minus the computed value, ± its uncertainty. The total "
+                "error is √(sampling² + (mesh + uncertainty)²); that of the corrected value, to which the error of the "
+                "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
             )
             yield table(results, shown)
 
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
-    """Return the errors of an estimate by their source, by output (m,); NaN where one is not known."""
+    """Return the errors of an estimate by source, for each output (m,); NaN if unknown."""
     dataset, first = results.dataset, {"std": "std_", "nominal": "nominal_"}.get(name, "")
     found = {}
     if f"{name}_error" in dataset:
@@ -65,7 +65,7 @@ def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
 
 
 def relative(results: Results, name: str) -> dict[str, FloatArray]:
-    """Return the errors relative to the estimate, or to the standard deviation where that is larger than a mean."""
+    """Return the errors relative to the estimate, or to the standard deviation if that is larger than a mean."""
     size = np.abs(results.dataset[name].to_numpy())
     if name == "mean":
         size = np.maximum(size, results.dataset["std"].to_numpy())
@@ -74,14 +74,14 @@ def relative(results: Results, name: str) -> dict[str, FloatArray]:
 
 
 def sentence(results: Results, name: str) -> str:
-    """Say which source is the largest of each output."""
+    """Say which source is the largest for each output."""
     found = relative(results, name)
     total = found.pop("total", None)
     if "mesh" not in found:
         why = "is not known here"
         if not getattr(results.study, "accuracy", None) or not results.study.accuracy.mesh_error:
             why = "was not estimated, as asked (accuracy.mesh_error = false)"
-        return f"The error of the mesh {why}: what is printed after ± leaves it out."
+        return f"The error of the mesh {why}: the numbers after ± do not include it."
     words = []
     for i, output in enumerate(results.outputs):
         known = {source: float(errors[i]) for source, errors in found.items() if np.isfinite(errors[i])}

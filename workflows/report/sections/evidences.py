@@ -31,12 +31,12 @@ class Evidences(Section):
         dataset = results.dataset
         yield Heading("Evidences and probabilities")
         yield Text(
-            "± is one standard error. Laplace's formula stands beside the corrected evidence; words are those of Kass "
-            "and Raftery."
+            "± is one standard error. Laplace's formula is shown beside the corrected evidence; the words for Bayes "
+            "factors are those of Kass and Raftery."
         )
         yield evidences(dataset)
         captions = (
-            "ln Z less that of the most probable model, with three standard errors.",
+            "ln Z minus that of the most probable model, with three standard errors.",
             "Probability of each model, and with other errors, data and priors.",
         )
         drawn = plots.evidence_bars(dataset), plots.probability_bars(dataset)
@@ -80,7 +80,7 @@ def evidences(dataset: xr.Dataset) -> Table:
 
 
 def routes(dataset: xr.Dataset) -> Table:
-    """How each evidence was found, and what its weights are worth."""
+    """How each evidence was found, and the quality of its weights."""
     rows = []
     for model in dataset.model.values:
         for group in dataset.group.values:

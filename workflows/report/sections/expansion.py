@@ -10,7 +10,7 @@ from workflows.report.section import Results, Section
 
 
 class Expansion(Section):
-    """The polynomials of an expansion, and what they are worth."""
+    """The polynomials of an expansion, and their errors."""
 
     def applies(self, results: Results) -> bool:
         """Whether there is one."""
@@ -19,12 +19,12 @@ class Expansion(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
         yield Heading("Polynomial chaos")
-        yield Text("The leave-one-out error is that of the expansion at samples that it was not fitted to.")
+        yield Text("The leave-one-out error is that at each sample of the expansion fitted to the others.")
         yield expansion(results)
 
 
 def expansion(results: Results) -> Table:
-    """The polynomials of an expansion and what they are worth, output by output."""
+    """The polynomials of an expansion and their errors, output by output."""
     dataset = results.dataset
     used, order = int(dataset["ok"].sum()), int(dataset["order"])
     rows = [

@@ -23,7 +23,7 @@ class Failures(Section):
         failed, listed = results.summary["failed"], len(results.summary["failures"])
         yield Heading("Failed solves")
         if not listed:
-            yield Text("none failed")
+            yield Text("None failed.")
             return
         line = f"{failed:,} of {counted(results.solves)} failed."
         yield Text(line if listed == failed else f"{line} These are the first {listed}; evaluations.h5 holds all.")
@@ -31,9 +31,9 @@ class Failures(Section):
 
 
 def failures(results: Results) -> Table:
-    """The solves that failed: the model where there are several, parameters and reason.
+    """The solves that failed: the model if there are several, parameters and reason.
 
-    The coefficients of random fields are left out.
+    The coefficients of random fields are omitted.
     """
     found = results.summary["failures"]
     every = dict.fromkeys(name for failure in found for name in failure["parameters"])

@@ -1,4 +1,4 @@
-"""What is to be known before any number is read."""
+"""Findings, which should be read before any number."""
 
 from __future__ import annotations
 

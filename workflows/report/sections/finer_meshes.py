@@ -1,4 +1,4 @@
-"""What a finer mesh of each candidate moves."""
+"""The effect of a finer mesh on each candidate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class FinerMeshes(Section):
-    """What a finer mesh of each candidate moves."""
+    """The effect of a finer mesh on each candidate."""
 
     def applies(self, results: Results) -> bool:
         """Whether meshes were checked."""
@@ -24,16 +24,16 @@ class FinerMeshes(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
-        yield Heading("What a finer mesh moves", level=3)
+        yield Heading("Effect of a finer mesh", level=3)
         yield Text(
-            "One solve of each candidate, at its mode on a finer mesh with thinner cells at the faces that are held, "
-            "and what follows from it to first order, by the model that is linear there."
+            "One solve of each candidate, at its mode on a finer mesh with thinner cells at the fixed faces, and its "
+            "consequences to first order, by the model linearised there."
         )
         yield meshes(results.dataset)
 
 
 def meshes(dataset: xr.Dataset) -> Table:
-    """What a finer mesh does to data, evidence and unknowns of each candidate."""
+    """The effect of a finer mesh on data, evidence and unknowns of each candidate."""
     from inverse.criticism.doubts import change_in_words
 
     rows = []

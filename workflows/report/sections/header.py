@@ -17,7 +17,7 @@ class Header(Section):
         return True
 
     def content(self, results: Results) -> Iterator[Block]:
-        """Title, method, number of solves, and how stability was looked at."""
+        """Title, method, number of solves, and how stability was tested."""
         summary = results.summary
         yield Heading(f"Study {summary['study']}", level=1)
         yield Text(str(type(results.study.method).__doc__).partition("\n")[0], "lead")

@@ -25,7 +25,7 @@ class HeldOut(Section):
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
-        yield Text("Whole tests, predicted from the others: ln of the density of all data of the test.")
+        yield Text("Whole tests, predicted from the others: ln of the density of all data in the test.")
         yield held_out(results.dataset)
 
 

@@ -11,7 +11,7 @@ from workflows.report.section import Results, Section
 
 
 class Levels(Section):
-    """What the levels of multilevel chaos cost and reached."""
+    """Costs and accuracy of the levels of multilevel chaos."""
 
     def applies(self, results: Results) -> bool:
         """Whether there are some."""
@@ -21,21 +21,22 @@ class Levels(Section):
         """A table, a picture, and the moments by control variates."""
         yield Heading("Levels")
         yield Text(
-            "Every level starts its samples from the expansion of the level before. Residuals are relative to the "
+            "Every level starts its samples from the expansion of the previous level. Residuals are relative to the "
             "loads."
         )
         yield levels(results)
         caption = "Residuals at the samples, relative to the loads, and relative change of the moments, level by level."
         yield Pictures([Picture.drawn(plots.levels(results.dataset), caption)])
         yield Text(
-            "Moments from the samples of the last level, with the expansion of the level before, which does not depend "
-            "on them, as control variate; how far the moments of the expansion are from these is part of their errors."
+            "Moments from the samples of the last level, with the expansion of the previous level, which does not "
+            "depend on them, as control variate; the distance between these and the moments of the expansion is part "
+            "of the errors of the latter."
         )
         yield controlled(results)
 
 
 def levels(results: Results) -> Table:
-    """What the levels of multilevel chaos have cost and reached."""
+    """Costs and accuracy of the levels of multilevel chaos."""
     rows = []
     for k in results.dataset["level"].to_numpy():
         level = results.dataset.sel(level=k)
@@ -61,7 +62,7 @@ def levels(results: Results) -> Table:
 
 
 def controlled(results: Results) -> Table:
-    """Moments from the samples of the last level, with the expansion of the level before as control variate."""
+    """Moments from the samples of the last level, with the expansion of the previous level as control variate."""
     names = ("control_mean", "control_std")
     rows = [(output, *(results.estimate(output, name) for name in names)) for output in results.outputs]
     return Table(("output", "mean", "standard deviation"), rows)

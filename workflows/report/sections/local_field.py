@@ -1,4 +1,4 @@
-"""What parameters change of the displacement field, to first order."""
+"""Effects of parameters on the displacement field, to first order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workflows.report.section import Results, Section
 
 
 class LocalField(Section):
-    """What parameters change of the displacement field, to first order."""
+    """Effects of parameters on the displacement field, to first order."""
 
     def applies(self, results: Results) -> bool:
         """Whether its derivatives are known."""

@@ -1,4 +1,4 @@
-"""What parameters change to first order."""
+"""Effects of parameters, to first order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class LocalSensitivities(Section):
-    """What parameters change to first order."""
+    """Effects of parameters, to first order."""
 
     def applies(self, results: Results) -> bool:
         """Whether there are derivatives."""
@@ -25,7 +25,7 @@ class LocalSensitivities(Section):
         """Tables of each output, and tornado charts."""
         dataset = results.dataset
         yield Heading("Local sensitivities")
-        yield Text("Derivatives at the mean parameters: what a parameter changes to first order.")
+        yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
         for output in results.outputs:
             yield Heading(output, level=3)
             yield sensitivities(results, output)
@@ -34,7 +34,7 @@ class LocalSensitivities(Section):
 
 
 def sensitivities(results: Results, output: str) -> Table:
-    """Derivatives of an output, in physical units and times the spread of the parameter."""
+    """Derivatives of an output, in physical units and times the standard deviation and the range of the parameter."""
     unit, slopes = results.unit(output), results.dataset.sel(output=output)
     rows = []
     for name in results.leading(slopes["derivative_per_std"]):
@@ -46,6 +46,6 @@ def sensitivities(results: Results, output: str) -> Table:
 
 
 def largest_of(dataset: xr.Dataset) -> str:
-    """Say that bars are not drawn of all parameters."""
+    """Say that not all parameters have bars."""
     count = dataset.sizes["parameter"]
     return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""

@@ -1,4 +1,4 @@
-"""What each mesh of a multilevel method adds."""
+"""The contribution of each mesh of a multilevel method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from workflows.report.section import Results, Section
 
 
 class Meshes(Section):
-    """The meshes of a multilevel method, and what each adds."""
+    """The meshes of a multilevel method, and the contribution of each."""
 
     def applies(self, results: Results) -> bool:
         """Whether there are several."""
@@ -37,7 +37,7 @@ class Meshes(Section):
                     ),
                     Picture.drawn(
                         plots.mesh_samples(results.dataset, output),
-                        "Samples on every mesh: taken, and best for other errors.",
+                        "Samples on every mesh: taken, and optimal for other errors.",
                     ),
                     Picture.drawn(
                         plots.mesh_cost(results.dataset, output), "Predicted time of sampling, without linearisations."
@@ -70,7 +70,7 @@ def meshes(results: Results) -> Table:
 
 
 def differences(results: Results, output: str) -> Table:
-    """What every mesh adds to the mean of an output, and whether that can be trusted."""
+    """The contribution of every mesh to the mean of an output, and whether it can be trusted."""
     rows = []
     for level in results.dataset["level"].to_numpy():
         here = results.dataset.sel(output=output, level=level)
@@ -101,6 +101,6 @@ def rates(results: Results, output: str) -> str:
     weak, strong, cost = (float(of_output[f"{name}_rate"]) for name in ("weak", "strong", "cost"))
     return (
         f"From one mesh to the next, the mean difference falls by 2^{weak:.2f}, its variance by 2^{strong:.2f}, and "
-        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 says that the sum over the meshes "
-        "telescopes."
+        f"the predicted cost of a solve grows by 2^{cost:.2f}. A consistency below 1 confirms that the sum over the "
+        "meshes telescopes."
     )

@@ -11,7 +11,7 @@ from workflows.report.section import Results, Section
 if TYPE_CHECKING:
     pass
 
-CORRECTED = ("mean_corrected", "std_corrected")  # with what the mesh is estimated to err
+CORRECTED = ("mean_corrected", "std_corrected")  # with the estimated error of the mesh
 
 
 class Moments(Section):
@@ -29,7 +29,7 @@ class Moments(Section):
 
 
 def moments(results: Results) -> Table:
-    """Mean and standard deviation of the outputs, and those of plain Monte Carlo beside controlled ones."""
+    """Mean and standard deviation of the outputs, with those of plain Monte Carlo beside controlled ones."""
     names = [n for n in ("mean", "std", *CORRECTED, "plain_mean", "plain_std") if n in results.dataset]
     words = {
         "mean": "mean",

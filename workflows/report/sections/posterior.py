@@ -1,4 +1,4 @@
-"""What was found for each data set: estimates, pictures, load cases, directions, iterations."""
+"""The posterior for each data set: estimates, pictures, load cases, directions, iterations."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
     from workflows.studies.inversion import InversionStudy
 
-DIRECTIONS = 10  # of few parameters that a table lists
-SMALL = 1e-3  # volume (m³) that is rather written in cm³
-DRAWN = 8  # data sets that have more than a row of the table
+DIRECTIONS = 10  # that a table lists
+SMALL = 1e-3  # volume (m³) below which it is written in cm³
+DRAWN = 8  # data sets that have more than a row in the table
 
 
 class Words(NamedTuple):
-    """What data are of: a part of them, several parts, and data themselves."""
+    """Words for a part of the data, several parts, and the data themselves."""
 
     part: str
     several: str
@@ -40,10 +40,10 @@ def _words(one: xr.Dataset) -> Words:
 
 
 class Posterior(Section):
-    """What was found for each data set of a few parameters."""
+    """The posterior of a few parameters for each data set."""
 
     def applies(self, results: Results) -> bool:
-        """Whether a few parameters were inverted for."""
+        """Whether a few parameters were inferred."""
         return "alone_eigenvalue" in results.dataset and "draw" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
@@ -77,14 +77,14 @@ def first(results: Results) -> Iterator[xr.Dataset]:
 
 
 def verdict(results: Results, one: xr.Dataset) -> Iterator[Block]:
-    """Name a data set, and of several say whether it is to be trusted; of one alone, findings do."""
+    """Name a data set and, if there are several, say whether it can be trusted; for a single one, findings do."""
     yield Heading(str(one.data_set.item()))
     if results.dataset.sizes["data_set"] > 1:
         yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
 
 
 def amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, list[str]]]:
-    """What was measured, and what it took; there are so many directions in all."""
+    """Amounts of data, information and work, given the total number of directions."""
     return ((word, [text]) for word, text in _amounts(one, directions))
 
 
@@ -96,7 +96,7 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
             f"{moved} points, up to {number(float(one['largest_move']), 2)} m, moved to its surface",
         )
     seen = int((one["eigenvalue"] > plots.SEEN).sum())
-    yield "directions that the data say more of than the prior", f"{seen} of {directions:,}"
+    yield "directions about which the data say more than the prior", f"{seen} of {directions:,}"
     yield "directions determined", number(float(one["determined"]), 3)
     if np.isfinite(one["log_evidence_error"]):
         yield "ln Z", f"{number(float(one['log_evidence']), 7)} ± {number(float(one['log_evidence_error']), 2)}"
@@ -120,7 +120,7 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
 
 
 def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
-    """Prior and posterior of every parameter, with the truth where it is known."""
+    """Prior and posterior of every parameter, with the truth if known."""
     known = bool(np.isfinite(one["true"]).any())
     laplace = "laplace_std" in one
     rows = [
@@ -138,7 +138,7 @@ def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
 
 
 def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[str]:
-    """Name, prior, mode, posterior, interval; width by Laplace where there is one, truth where it is known."""
+    """Name, prior, mode, posterior, interval; width by Laplace if there is one, truth if known."""
     row = [named(name, unit), with_error(float(of["prior_mean"]), float(of["prior_std"]))]
     row += [_shown(of["mode"]), _estimate(of), f"{_shown(of['lower'])} to {_shown(of['upper'])}"]
     if laplace:
@@ -150,12 +150,12 @@ def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[s
 
 
 def each_case(one: xr.Dataset) -> list[xr.Dataset]:
-    """Return what belongs to each load case."""
+    """Return the results of each load case."""
     return [one.sel(case=case) for case in one.case.values]
 
 
 def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator[Block]:
-    """Misfit of each load case, and what it alone would have said: widths with their heads, of all together at last."""
+    """Misfit of each load case, and widths from it alone, with their heads; all together in the last row."""
     rows = []
     for of, width in zip(each_case(one), widths, strict=False):
         misfit = f"{_shown(of['misfit'])} of {_shown(of['misfit_degrees'])}"
@@ -166,14 +166,14 @@ def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator
     together += [f"{_shown(one['misfit'].sum())} of {_shown(one['misfit_degrees'].sum())}"]
     together += [str(int((one["eigenvalue"] > plots.SEEN).sum())), _shown(one["determined"], 3), *widths[-1]]
     yield Heading(_words(one).several.capitalize(), level=3)
-    yield Text("What each of them alone would have said, with the model linearised at the mode.")
+    yield Text("The widths from each of them alone, with the model linearised at the mode.")
     yield Table(
         [_words(one).part, "data", "|r|², expected", "directions with λ > 1", "determined", *head], [*rows, together]
     )
 
 
 def directions(one: xr.Dataset) -> Table:
-    """The directions of the parameters, in whitened coordinates, from what the data constrain most to the least."""
+    """The directions of the parameters, in whitened coordinates, from the most to the least constrained by the data."""
     names = [str(name) for name in one.parameter.values if name != "noise"]
     rows = []
     for i, value in enumerate(one["eigenvalue"].to_numpy()[:DIRECTIONS]):
@@ -183,7 +183,7 @@ def directions(one: xr.Dataset) -> Table:
 
 
 def iterations(one: xr.Dataset) -> Block:
-    """The search for the mode, which is seen when it is asked for."""
+    """The search for the mode, folded."""
     steps = one["step"].to_numpy()
     steps = steps[np.isfinite(steps).any(axis=1)]
     names = [str(name) for name in one.column.values]
@@ -205,7 +205,7 @@ def _estimate(of: Any) -> str:
 
 
 def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
-    """Curves (values, density) of the priors by the names of the parameters."""
+    """Curves (values, density) of the priors by the name of the parameter."""
     known = dict(study.inputs.marginals)
     if study.method.noise is not None:
         known["noise"] = study.method.noise
@@ -214,13 +214,13 @@ def prior_densities(study: InversionStudy) -> dict[str, plots.Density]:
     for name, distribution in known.items():
         values, slopes = distribution.from_normal(z)
         density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / np.maximum(slopes, 1e-300)
-        seen = np.exp(-(z**2) / 2) > 1e-7  # beyond, slopes of bounded distributions are rounding
+        seen = np.exp(-(z**2) / 2) > 1e-7  # beyond, slopes of bounded distributions are rounding errors
         curves[name] = values[seen], density[seen]
     return curves
 
 
 def measurements(one: xr.Dataset) -> Table:
-    """What was measured of each output, and what the most probable parameters predict."""
+    """Measurements of each output, and predictions with the most probable parameters."""
     rows = []
     for k in np.flatnonzero(np.isfinite(one["measured"].to_numpy())):
         of = one.isel(datum=k)
@@ -251,15 +251,15 @@ def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
 
 
 def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[str, str]) -> Iterator[tuple[Axes, str]]:
-    """Draw what was found for one data set, each with what it shows."""
+    """Draw the results for one data set, each with a caption."""
     if _words(one) is OUTPUTS:
         yield of_spectrum(one)
     else:
         yield from on_a_plane(one, plots.Cut.of(one))
     yield (
         plots.marginals(one, before, units),
-        "Prior and posterior of each parameter; Laplace's Gaussian, and the truth where it is known.",
+        "Prior and posterior of each parameter; Laplace's Gaussian, and the truth if known.",
     )
     yield of_misfits(one)
     if np.isfinite(one["true"]).any():
-        yield plots.errors(one), "Mean less truth over the posterior standard deviation; 95 % lie in the grey band."
+        yield plots.errors(one), "Mean minus truth over the posterior standard deviation; 95 % lie in the grey band."

@@ -1,4 +1,4 @@
-"""What was found for each data set of a field of thousands of unknowns."""
+"""The posterior of a field of thousands of unknowns for each data set."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 class FieldPosterior(Section):
-    """What was found for each data set of a field."""
+    """The posterior of a field for each data set."""
 
     def applies(self, results: Results) -> bool:
-        """Whether a field was inverted for."""
+        """Whether a field was inferred."""
         return "alone_stiffness_std" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
@@ -49,7 +49,7 @@ class FieldPosterior(Section):
 
 
 def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
-    """What the search took, and how often the truth is within its interval, where it is known."""
+    """The cost of the search, and how often the interval contains the truth, if known."""
     yield "Hessian products", [f"{int(one['products']):,}"]
     if np.isfinite(one["stiffness_true"]).all():
         inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
@@ -57,14 +57,14 @@ def more_amounts(one: xr.Dataset) -> Iterator[tuple[str, list[str]]]:
 
 
 def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
-    """Draw what was found for one data set, each with what it shows."""
+    """Draw the results for one data set, each with a caption."""
     cut = plots.Cut.of(one)
     yield from on_a_plane(one, cut)
     words = "The directions that the data constrain most, and the last that were found"
     yield plots.direction_slices(one, cut), f"{words}, on {cut.words}."
     yield plots.alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {cut.words}."
-    words = "Prior and posterior of ln stiffness where it is found to be least and most, and where least is known"
-    yield plots.node_marginals(one), f"{words}; the truth where it is known."
+    words = "Prior and posterior of ln stiffness where it is smallest, largest, and least certain"
+    yield plots.node_marginals(one), f"{words}; the truth if known."
     yield of_misfits(one)
     if np.isfinite(one["stiffness_true"]).all():
         yield (

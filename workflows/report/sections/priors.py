@@ -1,4 +1,4 @@
-"""What was believed before the data."""
+"""The priors of the unknowns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from workflows.report.section import Results, Section
 
 
 class Priors(Section):
-    """What was believed before the data."""
+    """The priors of the unknowns."""
 
     def applies(self, results: Results) -> bool:
         """Whether data were inverted."""
@@ -24,7 +24,7 @@ class Priors(Section):
 
 
 def priors(results: Results) -> Table:
-    """What was believed before."""
+    """The priors of the unknowns."""
     config = tomllib.loads(results.dataset.attrs["config"])
     rows = [
         (path, f"{block['kind']}: {settings(block, 'kind')}", results.parameter_unit(path))

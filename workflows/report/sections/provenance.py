@@ -1,4 +1,4 @@
-"""When, from what and on what the results were made."""
+"""When, from which study and on which machine the results were made."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from workflows.report.section import Results, Section
 
 
 class Provenance(Section):
-    """When, from what and on what the results were made."""
+    """When, from which study and on which machine the results were made."""
 
     def applies(self, results: Results) -> bool:
         """Return whether it does: always."""
@@ -25,7 +25,7 @@ class Provenance(Section):
 
 
 def provenance(results: Results) -> Iterator[tuple[str, str]]:
-    """When, from what and on what the results were made."""
+    """When, from which study and on which machine the results were made."""
     found = results.summary["provenance"]
     date = datetime.fromisoformat(found["date"]).astimezone(UTC)
     yield "date", f"{date:%Y-%m-%d %H:%M:%S} UTC"

@@ -22,7 +22,7 @@ class SobolIndices(Section):
         """Tables and pictures of each output, then of all and of the field."""
         dataset = results.dataset
         yield Heading("Sobol' indices")
-        yield Text("The share of the variance that a parameter has alone, and with all its interactions.")
+        yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
         for output in results.outputs:
             yield Heading(output, level=3)
             yield sobol(results, output)
@@ -55,7 +55,7 @@ def sobol(results: Results, output: str) -> Table:
 
 
 def second_order(results: Results, output: str) -> Table:
-    """Shares of the variance of an output that two parameters have together and neither has alone."""
+    """Shares of the variance of an output due to interactions of two parameters."""
     of_output = results.dataset.sel(output=output)
     names = results.parameters
     rows = []

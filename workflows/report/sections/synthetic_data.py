@@ -1,4 +1,4 @@
-"""Which data were made."""
+"""Synthetic data that were made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of estimates by where they come from."""
+"""Errors of estimates by source."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from workflows.report.section import Results, Section
 
 
 class TotalErrors(Section):
-    """Errors of means and standard deviations by where they come from."""
+    """Errors of means and standard deviations by source."""
 
     def applies(self, results: Results) -> bool:
-        """Whether that of the mesh is known."""
+        """Whether the error of the mesh is known."""
         return "bias_error" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """One table."""
         yield Heading("Total errors", level=3)
-        yield Text("That of the mesh is estimated from the differences between meshes.")
+        yield Text("The error of the mesh is estimated from the differences between meshes.")
         yield total_errors(results)
 
 
