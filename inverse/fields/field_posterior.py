@@ -1,4 +1,4 @@
-"""The posterior density of a field of N values given many measured outputs, in the whitened coordinates of its prior.
+"""The posterior density of a field of N values given many measured outputs, in coordinates whitened by its prior.
 
 With m = m_0 + Lξ and ξ ~ N(0, I) a priori, so that Γ_pr = LLᵀ, and data y = G(m) + e with independent e_i ~ N(0, σ_i²),
 
@@ -6,8 +6,8 @@ With m = m_0 + Lξ and ξ ~ N(0, I) a priori, so that Γ_pr = LLᵀ, and data y 
 
 The gradient ξ + Aᵀr and the Gauss–Newton product (I + AᵀA)ξ, A = Γ_n^{−1/2} G'(m) L, are those of the density of m with
 the prior covariance as preconditioner: H v = λ Γ_pr⁻¹ v has the solutions v = Lu with AᵀA u = λu (T. Bui-Thanh, O.
-Ghattas, J. Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). Neither the precision nor any matrix of N
-columns and N rows is needed.
+Ghattas, J. Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). Neither the precision nor any other N × N
+matrix is needed.
 
 Vectors are rows: k of them are (k, N) in the field and (k, n) in the data.
 """
@@ -24,11 +24,11 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
 from inverse.data.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
 
-BLOCK = 32  # vectors whose products are formed together
+BLOCK = 32  # vectors whose products are computed together
 
 
 class Prior(Protocol):
-    """A normal distribution N(0, LLᵀ) of N values, known by products with a root L of its covariance."""
+    """A normal distribution N(0, LLᵀ) of N values, given by products with a root L of its covariance."""
 
     @property
     def variance(self) -> FloatArray:
@@ -43,7 +43,7 @@ class Prior(Protocol):
 
 @dataclass
 class Counts:
-    """What was asked of the model: solutions, and products with derivatives, a Hessian product being one of each."""
+    """Numbers of solutions, and of products with derivatives; a Hessian product is one tangent and one adjoint."""
 
     solves: int = 0
     tangents: int = 0
@@ -52,18 +52,18 @@ class Counts:
 
 @dataclass(frozen=True, eq=False)
 class FieldPosterior:
-    """Measured outputs of a model, and what is believed of its parameters before.
+    """Measured outputs of a model, and the prior of its parameters.
 
     Parameters
     ----------
     model
-        All of its parameters are values of the field.
+        The model; all of its parameters are values of the field.
     data
         y (n,), in the units of the outputs; NaN where nothing was measured.
     sigma
         Standard deviations σ (n,) of the errors.
     prior
-        Of the differences from `mean`.
+        Prior of the differences from `mean`.
     mean
         m_0 (N,); by default zero.
     progress
@@ -90,7 +90,7 @@ class FieldPosterior:
             message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
             raise ValueError(message)
         if not self.measured.any():
-            raise ValueError("no data that are numbers")
+            raise ValueError("all data are NaN, expected at least one number")
 
     @property
     def size(self) -> int:
@@ -99,12 +99,12 @@ class FieldPosterior:
 
     @cached_property
     def measured(self) -> FloatArray:
-        """One for what was measured, zero for what was not (n,)."""
+        """One for measured outputs (n,), zero for others."""
         return np.isfinite(self.data).astype(float)
 
     @cached_property
     def weights(self) -> FloatArray:
-        """1/σ (n,) of what was measured."""
+        """1/σ (n,) of measured outputs, zero for others."""
         return self.measured / self.sigma
 
     def values(self, whitened: FloatArray) -> FloatArray:
@@ -112,12 +112,12 @@ class FieldPosterior:
         return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)
 
     def at(self, whitened: FloatArray, guess: Guess | None = None) -> Point:
-        """Solve at ξ (N,), with the help of a guess.
+        """Solve at ξ (N,), starting from a guess.
 
         Raises
         ------
         SolveError
-            Where the model has no answer.
+            If the model has no answer.
         """
         self.counts.solves += 1
         values = self.values(whitened)
@@ -137,13 +137,13 @@ class Point:
     Attributes
     ----------
     posterior
-        Of which this is a point.
+        The posterior.
     whitened
         ξ (N,).
     values
         m (N,).
     solution
-        Of the model.
+        The solution of the model.
     """
 
     posterior: FieldPosterior
@@ -153,24 +153,24 @@ class Point:
 
     @cached_property
     def gaps(self) -> FloatArray:
-        """What is predicted less what was measured, over σ (n,); zero where nothing was measured."""
+        """Predicted minus measured outputs, over σ (n,); zero where nothing was measured."""
         posterior = self.posterior
         gap = np.where(posterior.measured > 0, self.solution.outputs - posterior.data, 0.0)
         return np.asarray(posterior.weights * gap)
 
     @cached_property
     def root(self) -> FloatArray:
-        """√ (n,) of the weights of the data in Gauss–Newton's matrix: 1 of normal errors, see `inverse.data.errors`."""
+        """√ (n,) of the weights of the data for Gauss–Newton: 1 for normal errors, see `inverse.data.errors`."""
         return np.asarray(np.sqrt(self.posterior.errors.information(self.gaps)))
 
     @cached_property
     def residual(self) -> FloatArray:
-        """R (n,); of errors that are not normal, what has their gradient with the weights of Gauss–Newton."""
+        """Residuals r (n,); for errors that are not normal, with the same gradient under Gauss–Newton weights."""
         return np.asarray(self.posterior.errors.score(self.gaps) / self.root)
 
     @cached_property
     def misfit(self) -> float:
-        """½ r·r, or what takes its place: −ln p(y | ξ) but for Σ ln σ + (n/2) ln 2π."""
+        """−ln p(y | ξ) without Σ ln σ + (n/2) ln 2π: ½ r·r for normal errors."""
         minus_log = self.posterior.errors.minus_log(self.gaps) - HALF_LOG
         return float(self.posterior.measured @ minus_log)
 
@@ -187,7 +187,7 @@ class Point:
 
     @property
     def cost(self) -> float:
-        """−ln p(ξ | y) but for a constant."""
+        """−ln p(ξ | y) up to a constant."""
         return self.misfit + self.penalty
 
     @cached_property

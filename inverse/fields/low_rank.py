@@ -1,15 +1,15 @@
 """The Gaussian at the mode of a posterior of a field, from the directions that the data constrain.
 
-With AᵀA u = λu at the mode ξ̂ (`inverse.fields.field_posterior`), and V = LU of the r pairs that are kept,
+With AᵀA u = λu at the mode ξ̂ (`inverse.fields.field_posterior`), and V = LU for the r pairs that are kept,
 
     Γ_post = Γ_pr − V diag(λ/(1+λ)) Vᵀ = L (I + UΛUᵀ)⁻¹ Lᵀ,
 
-of which the error is at most λ/(1+λ) of the first pair that is left out, in units of the prior (T. Bui-Thanh, O.
-Ghattas, J. Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). In the data, S = A(I + AᵀA)⁻¹Aᵀ says what a
-prediction of a datum owes to that datum; it is also the posterior covariance of Γ_n^{−1/2} G(m).
+with an error of at most λ/(1+λ) of the first neglected pair, in units of the prior (T. Bui-Thanh, O. Ghattas, J.
+Martin, G. Stadler, SIAM J. Sci. Comput. 35 (2013) A2494–A2523). For the data, S = A(I + AᵀA)⁻¹Aᵀ is the sensitivity of
+the prediction of a datum to that datum (its leverage); it is also the posterior covariance of Γ_n^{−1/2} G(m).
 
-The pairs come from the Krylov space of a block of random vectors (C. Musco, C. Musco, NIPS 28 (2015)): a product for
-each of its vectors, whereas passing twice over random vectors takes two, and is less accurate.
+The pairs come from the Krylov space of a block of random vectors (C. Musco, C. Musco, NIPS 28 (2015)): one product for
+each of its vectors, whereas a randomised two-pass method takes two, and is less accurate.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import numpy as np
 from forward.model import FloatArray
 from inverse.fields.field_posterior import BLOCK, Point, Prior
 
-CUTOFF = 0.1  # λ of pairs that are left out: they change a variance by at most λ/(1+λ)
-ACCURACY = 1e-2  # ‖AᵀAu − λu‖/λ of pairs that are kept: λ is known to about its square
-VANISHING = 1e-13  # of the largest λ: rounding
+CUTOFF = 0.1  # λ below which pairs are neglected: they change a variance by at most λ/(1+λ)
+ACCURACY = 1e-2  # ‖AᵀAu − λu‖/λ of pairs that are kept: the relative error of λ is about its square
+VANISHING = 1e-13  # of the largest λ: rounding errors
 
 Map = Callable[[FloatArray], FloatArray]
 
@@ -37,7 +37,7 @@ class Spectrum:
     Attributes
     ----------
     values
-        λ (r,), falling.
+        λ (r,), descending.
     vectors
         u (r, N), orthonormal rows.
     images
@@ -45,9 +45,9 @@ class Spectrum:
     residuals
         ‖AᵀAu − λu‖ (r,).
     neglected
-        Estimate of the first λ that was left out; zero where there is none.
+        Estimate of the first neglected λ; zero if there is none.
     products
-        Products with AᵀA that were formed.
+        Number of products with AᵀA.
     """
 
     values: FloatArray
@@ -86,13 +86,13 @@ def leading_pairs(
     size
         N.
     cutoff
-        λ above which pairs are kept; what is rounding never is.
+        λ above which pairs are kept, unless they are rounding errors.
     rank
         Largest number of pairs that are kept.
     accuracy
-        ‖AᵀAu − λu‖/λ that is tolerated.
+        Tolerance of ‖AᵀAu − λu‖/λ.
     block
-        Number of vectors whose products are formed together.
+        Number of vectors whose products are computed together.
     seed
         Of the first block.
     """
@@ -112,29 +112,29 @@ def leading_pairs(
         rounding = VANISHING * float(values[0])
         kept = min(int((values > max(cutoff, rounding)).sum()), wanted)
         residuals = np.linalg.norm(turn[:kept] @ HQ - values[:kept, None] * (turn[:kept] @ Q), axis=1)
-        # What is found below the cutoff shows that nothing above it was missed (but for λ that more than `block`
-        # directions share exactly).
+        # A pair found below the cutoff shows that none above it was missed (except for a λ of multiplicity larger than
+        # `block`).
         beyond = len(values) - kept
         settled = (residuals <= accuracy * values[:kept]).all() and (beyond >= min(block, size - kept))
         if settled or len(Q) == size:
             break
         room = size - len(Q)
         new = _orthonormal(products, Q, rounding)[:room]
-        if len(new) == 0:  # the space is invariant: only other vectors can show more
+        if len(new) == 0:  # the space is invariant: more pairs need other vectors
             new = _orthonormal(rng.standard_normal((min(block, room), size)), Q, 0.0)
     neglected = float(values[kept]) if kept < len(values) else 0.0
     return Spectrum(values[:kept], turn[:kept] @ Q, turn[:kept] @ AQ, residuals, neglected, len(Q))
 
 
 def _orthonormal(rows: FloatArray, basis: FloatArray, least: float) -> FloatArray:
-    """Orthonormal rows that span, with an orthonormal basis, what rows (k, N) add to it by more than `least`."""
+    """Orthonormal rows that extend an orthonormal basis to span rows (k, N), to within `least`."""
     from scipy.linalg import qr
 
     rest = rows - (rows @ basis.T) @ basis
     rest = rest - (rest @ basis.T) @ basis
     columns, triangle, _ = qr(rest.T, mode="economic", pivoting=True)
     found = columns.T[np.abs(np.diag(triangle)) > least]
-    # Rows of very different lengths: what was left of the basis may have grown with normalisation.
+    # If rows have very different lengths, normalisation may amplify their remaining components along the basis.
     found = found - (found @ basis.T) @ basis
     return np.asarray(qr(found.T, mode="economic")[0].T) if len(found) else found
 
@@ -152,9 +152,9 @@ class LowRankPosterior:
     residual
         r (n,) there.
     weights
-        1/σ (n,), times the root of the weights of Gauss–Newton; zero where nothing was measured.
+        1/σ (n,), times the root of the Gauss–Newton weights; zero where nothing was measured.
     prior, spectrum
-        What it is made of.
+        The prior, and the pairs at the mode.
     log_likelihood
         ln p(y | m̂).
     """
@@ -197,9 +197,9 @@ class LowRankPosterior:
 
     @cached_property
     def directions(self) -> FloatArray:
-        """V (r, N): from what the data constrain most to what they hardly do; Vᵀ Γ_pr⁻¹ V = I.
+        """V (r, N), from the most to the least constrained direction; Vᵀ Γ_pr⁻¹ V = I.
 
-        What is orthogonal to all of them in that sense, the data constrain less than the last.
+        Directions orthogonal to all of them in this sense are constrained less than the last.
         """
         return self.prior.root(self.spectrum.vectors)
 
@@ -251,7 +251,7 @@ class LowRankPosterior:
 
     @property
     def log_evidence(self) -> float:
-        """Ln p(y) = ln L(m̂) − ½|ξ̂|² − ½ Σ ln(1+λ); exact for linear models, but for the pairs left out."""
+        """Ln p(y) = ln L(m̂) − ½|ξ̂|² − ½ Σ ln(1+λ); exact for linear models, up to the neglected pairs."""
         return self.log_likelihood - float(self.whitened @ self.whitened) / 2 + self.log_determinant / 2
 
     @property
@@ -271,12 +271,12 @@ class LowRankPosterior:
 
     @cached_property
     def resolution(self) -> FloatArray:
-        """Diagonal (n,) of S: between 0 (the datum says nothing that the others do not) and 1 (it alone says it)."""
+        """Diagonal (n,) of S: from 0 (the datum adds nothing to the others) to 1 (it alone tells its prediction)."""
         return np.asarray((self.spectrum.images**2 / (1 + self.spectrum.values[:, None])).sum(axis=0))
 
     @property
     def predictive_std(self) -> FloatArray:
-        """Standard deviations (n,) of the predicted outputs, without errors of measurement; NaN where not measured."""
+        """Standard deviations (n,) of the predicted outputs, without measurement errors; NaN where not measured."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(self.weights > 0, np.sqrt(self.resolution) / self.weights, np.nan))
 
@@ -289,8 +289,8 @@ class LowRankPosterior:
     def residual_test(self) -> tuple[float, float]:
         """χ² = |r|² + |ξ̂|² of the mode, and the probability of a larger one if model, prior and σ are right.
 
-        For linear models it is that of as many degrees of freedom as there are data. Small probabilities: the model
-        does not explain the data; near one: σ is too large.
+        For linear models it has as many degrees of freedom as there are data. Small probabilities: the model does not
+        explain the data; near one: σ is too large.
         """
         from scipy.special import chdtrc
 

@@ -1,16 +1,17 @@
 """The mode of a posterior of a field: inexact Gauss–Newton steps by conjugate gradients, and a line search.
 
-Conjugate gradients on (I + AᵀA) δ = −g are those of the density of m, preconditioned by the prior covariance. Where
-they become long, the directions that the data constrain most are found (`inverse.fields.low_rank`), and P = I + UΛUᵀ of
-these preconditions all that follow. They end at ‖(I + AᵀA) δ + g‖ ≤ η‖g‖ with η = min(0.1, √(‖g‖/‖g_0‖)), in the norm
-of P⁻¹: S. C. Eisenstat, H. F. Walker, SIAM J. Sci. Comput. 17 (1996) 16–32. Steps are halved until they descend by a
-share of what their slope promises (L. Armijo, Pacific J. Math. 16 (1966) 1–3), also where the model has no answer.
+Conjugate gradients on (I + AᵀA) δ = −g are those of the density of m, preconditioned by the prior covariance. If they
+need many products, the directions that the data constrain most are computed (`inverse.fields.low_rank`), and
+P = I + UΛUᵀ from these preconditions all later steps. They end at ‖(I + AᵀA) δ + g‖ ≤ η‖g‖ with
+η = min(0.1, √(‖g‖/‖g_0‖)), in the norm of P⁻¹: S. C. Eisenstat, H. F. Walker, SIAM J. Sci. Comput. 17 (1996) 16–32.
+Steps are halved until the decrease is a share of that predicted by the slope (L. Armijo, Pacific J. Math. 16 (1966)
+1–3), also if the model has no answer.
 
-In this norm the gradient says how far the mode is: P ≤ I + AᵀA, so that ‖g‖ is no smaller than the length of the step
+In this norm the gradient bounds the distance to the mode: P ≤ I + AᵀA, so that ‖g‖ is at least the length of the step
 to the mode in standard deviations of the posterior.
 
-Second derivatives of the model are left out. They count as much as the residuals, which are noise at the mode; there
-the steps converge fast enough without them.
+Second derivatives of the model are neglected. Their weights are the residuals, which are noise at the mode; there the
+steps converge fast enough without them.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from inverse.fields.low_rank import Spectrum, leading_pairs
 
 ARMIJO = 1e-4
 HALVINGS = 20
-ROUNDING = 1e-12  # of the cost: what it cannot be expected to descend below
+ROUNDING = 1e-12  # of the cost: smaller decreases cannot be expected
 CLOSE = 1e-2  # ‖g‖ at which the search ends
 FORCING = 0.1  # largest η: a solve costs as much as many products
-LONG = 20  # products of one step at which the step ends, and pairs are found
-STRONG = 10.0  # λ of these pairs: what is left takes few products
+LONG = 20  # products at which a step ends, and pairs are computed
+STRONG = 10.0  # λ of these pairs: with them as preconditioner a step takes few products
 ROUGH = 0.5  # their accuracy
 
 
@@ -44,13 +45,13 @@ class Iteration:
     gradient
         ‖g‖ there, in the norm of P⁻¹.
     pairs
-        Pairs of which P is made.
+        Number of pairs in P.
     products
-        Hessian products that the step took, with those of new pairs.
+        Hessian products of the step, with those for new pairs.
     length
-        Fraction of the step that was gone; zero in the last row.
+        Fraction of the step that was taken; zero in the last row.
     solves
-        Solves that took.
+        Solves of the line search.
     """
 
     misfit: float
@@ -64,7 +65,7 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Where the search for the mode ended.
+    """The result of the search for the mode.
 
     Attributes
     ----------
@@ -104,7 +105,7 @@ def find_mode(
     Parameters
     ----------
     posterior
-        Of a model with derivatives.
+        Its model must have derivatives.
     start
         ξ (N,) where the search starts; by default zero, the centre of the prior.
     tolerance
@@ -112,7 +113,7 @@ def find_mode(
     steps
         Largest number of steps.
     products
-        Largest number of Hessian products of the conjugate gradients of one step, once pairs are found.
+        Largest number of Hessian products of the conjugate gradients in one step, once there are pairs.
 
     Raises
     ------
@@ -127,7 +128,7 @@ def find_mode(
         spent = 0
         if pairs is None and used == LONG:
             pairs = leading_pairs(here.jvp, here.vjp, posterior.size, cutoff=STRONG, accuracy=ROUGH)
-            largest, spent = 0.0, pairs.products  # the norm is another
+            largest, spent = 0.0, pairs.products  # in another norm
         size = _norm(here.gradient, pairs)
         largest = max(largest, size)
         rank = 0 if pairs is None else len(pairs.values)
@@ -171,7 +172,7 @@ def conjugate_gradients(here: Point, pairs: Spectrum | None, forcing: float, pro
 
 
 def _search(here: Point, step: FloatArray) -> tuple[Point | None, float, int]:
-    """Return the next point, the fraction of the step that leads there and the number of solves; or no point."""
+    """Return the next point (None if there is none), the fraction of the step to it, and the number of solves."""
     slope = float(here.gradient @ step)
     change = here.predicted(step)
     length = 1.0

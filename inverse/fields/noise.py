@@ -1,13 +1,13 @@
 """Noise of unknown size in the data of a field.
 
 Standard deviations are sσ with an unknown s. With the model linearised at a mode, residuals r + A(ξ − ξ̂) of s = 1 and
-AᵀA u = λu, what remains of the field in the density of s is (D. J. C. MacKay, Neural Comput. 4 (1992) 415–447)
+AᵀA u = λu, the density of s with the field integrated out is (D. J. C. MacKay, Neural Comput. 4 (1992) 415–447)
 
     −ln p(y | s) = ½ dᵀ(s²I + AAᵀ)⁻¹d + n ln s + ½ Σ ln(1 + λ/s²) + const,   d = r − Aξ̂,
 
-in closed form for all s at once, since the pairs of s are those of s = 1 with λ/s². The most probable s gives the noise
-of the next mode, until s stands; linear models need one round, and one to see it. What is then neglected of the spread
-of s in the posterior of the field is of second order: s is known to about 1/√(2n).
+in closed form for all s at once, since the pairs of s are those of s = 1 with λ/s². The most probable s is the noise of
+the next mode, until s converges; linear models need one round, and one to confirm it. Neglecting the uncertainty of s
+in the posterior of the field is an error of second order: s is known to about 1/√(2n).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from uq.inputs.distributions import Distribution
 ROUNDS = 10
 STANDS = 0.1  # change of ln s, over its standard deviation, that ends the rounds
 FARTHEST = 8.0  # of s, in standard deviations of its normal coordinate
-GRID, ZOOMS = 401, 4  # points of the integral over s, and times that they are drawn closer to where it is
+GRID, ZOOMS = 401, 4  # points of the integral over s, and number of times that they are moved closer to its bulk
 VANISHING = 1e-16  # density over the largest one
 
 
@@ -40,15 +40,15 @@ class InferredNoise:
     log_std
         Standard deviation of ln s.
     posterior
-        That of the field, of which the standard deviations are sσ.
+        That of the field, with the standard deviations sσ.
     mode, found
         Its mode and the Gaussian there.
     log_evidence
-        ln p(y) with s integrated out; exact for linear models, but for the pairs left out.
+        ln p(y) with s integrated out; exact for linear models, up to the neglected pairs.
     rounds
         s of each round.
     converged
-        Whether s stands and the mode was found.
+        Whether s has converged and the mode was found.
     """
 
     factor: float
@@ -75,15 +75,15 @@ def infer_noise(
     Parameters
     ----------
     posterior
-        Its standard deviations are those of s = 1.
+        Its standard deviations are those for s = 1.
     prior
-        Of s; the most probable one is that of its standard normal coordinate.
+        Of s; its most probable value is that of the standard normal coordinate.
     start
         ξ (N,) where the first search for the mode starts.
     tolerance
         Change of ln s, over its standard deviation, that ends the rounds.
     cutoff, rank
-        Of the pairs, as of `leading_pairs`.
+        Of the pairs, as in `leading_pairs`.
 
     Raises
     ------
@@ -124,7 +124,7 @@ class Marginal:
     along
         Squares (r,) of d along the eigenvectors of AAᵀ.
     rest
-        What remains of |d|².
+        The remainder of |d|².
     count
         Number n of data.
     constant

@@ -1,21 +1,21 @@
-"""The evidence Z = ∫ p(y | x) N(x; 0, I) dx of a model by weighted points, with its error, by a route that is chosen.
+"""The evidence Z = ∫ p(y | x) N(x; 0, I) dx of a model by weighted points, with its error, by an adaptive route.
 
-Points are drawn from a mixture of the Gaussian of Laplace, made wider, and of the prior, at independent scrambles of
-Sobol' points. A point that either half could have drawn is weighted by the whole mixture,
+Points are drawn from a mixture of Laplace's Gaussian, widened, and the prior, at independent scrambles of Sobol'
+points. Each point is weighted by the whole mixture, whichever component it was drawn from,
 
     w = p(y | x) N(x; 0, I) / (α N(x; x̂, τ² H⁻¹) + (1 − α) N(x; 0, I)) ≤ p(y | x)/(1 − α),
 
 so that no weight is large because the Gaussian is narrow (T. Hesterberg, Technometrics 37 (1995) 185–194). The mean
-weight of a scramble is an unbiased estimate of Z; their scatter gives the error. What the weights are worth beside that
-is told by the effective sample size (Σw)²/Σw² and the shape k̂ of their tail (A. Vehtari et al., J. Mach. Learn. Res. 25
-(2024) 72): above 0.7 they are not to be trusted.
+weight of a scramble is an unbiased estimate of Z; their scatter gives the error. The quality of the weights is also
+measured by the effective sample size (Σw)²/Σw² and the shape k̂ of their tail (A. Vehtari et al., J. Mach. Learn. Res.
+25 (2024) 72): above 0.7 they cannot be trusted.
 
-The first quarter of the points decides. Where the posterior is a Gaussian to rounding, Laplace's formula is the answer.
-Where the weights are even, the other points follow from the same mixture. Else a polynomial is fitted to the points
-(`inverse.low_dimensional.surrogate`), the next quarter is drawn from the posterior of the polynomial, and so on. Then
-all points are weighted by the mixture of all the densities they were drawn from (adaptive multiple importance sampling:
-J.-M. Cornuet et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the polynomials are right, and none is
-large where they are wrong and the first mixture was not.
+The first quarter of the points decides. If the posterior is a Gaussian up to rounding, Laplace's formula is the answer.
+If the weights are even, the other points are drawn from the same mixture. Otherwise a polynomial is fitted to the
+points (`inverse.low_dimensional.surrogate`), the next quarter is drawn from the posterior of the polynomial, and so on.
+Then all points are weighted by the mixture of all the densities they were drawn from (adaptive multiple importance
+sampling: J.-M. Cornuet et al., Scand. J. Stat. 39 (2012) 798–812): weights are even where the polynomials are right,
+and none is large where they are wrong and the first mixture was not.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from inverse.low_dimensional.posterior import Density, Posterior
 from inverse.low_dimensional.surrogate import SCRAMBLES, Mixture, fit, sample
 from uq.inputs.sampling import sobol_points
 
-EVEN = 0.6  # effective share of the first points from which on the Gaussian is good enough to go on with
+EVEN = 0.6  # effective share of the first points from which the Gaussian is good enough for the others
 QUARTERS = 4
 LEAST = QUARTERS * SCRAMBLES  # solves of an estimate
-ROUNDED = 1e-9  # relative difference from a Gaussian that is rounding
+ROUNDED = 1e-9  # relative difference from a Gaussian that counts as rounding error
 
 Route = Literal["closed form", "importance", "surrogate"]
 
@@ -52,9 +52,9 @@ class Evidence:
     route
         How it was found, and `why`.
     ess
-        Effective number of points.
+        Effective sample size of the points.
     pareto_k
-        k̂ of the largest weights; infinite where there are too few points to say.
+        k̂ of the largest weights; infinite if there are too few points.
     density
         The posterior at the points.
     log_weights
@@ -72,7 +72,7 @@ class Evidence:
 
     @property
     def trusted(self) -> bool:
-        """Whether the estimate is worth what it says."""
+        """Whether the estimate can be trusted."""
         return self.route == "closed form" or trustworthy(self.pareto_k, self.ess, len(self.log_weights))
 
     @property
@@ -92,14 +92,14 @@ class Evidence:
 
 
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
-    """Estimate the evidence with so many solves around a Gaussian, by the route that the first of them tell.
+    """Estimate the evidence by `samples` solves around a Gaussian, by the route that the first of them suggest.
 
     Parameters
     ----------
     posterior, gaussian
-        What is weighted, and where.
+        The density that is integrated, and its approximation.
     samples
-        Number of solves, at least 32, rounded down to a multiple of that.
+        Number of solves, at least 32, rounded down to a multiple of 32.
     seed
         Of all draws.
 
@@ -118,12 +118,12 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     misfit = np.abs(_from_gaussian(gaussian, pilot.density))
     even = pilot.ess / quarter
     share = f"the first {quarter} points are worth {pilot.ess:.0f}"
-    # Where there is no model there is no likelihood, and so no Gaussian; ∞ is not below ∞ by rounding.
+    # Where the model is not defined the likelihood is zero, and the posterior not Gaussian; ∞ − ∞ must not pass.
     everywhere = np.isfinite(pilot.density.log_posterior).all()
     if everywhere and (misfit <= ROUNDED * (1 + np.abs(pilot.density.log_posterior))).all():
         near = misfit[pilot.weights > 1e-6 / quarter]
         whole = _continued(posterior, mixture, first, seed, quarter)
-        why = "the posterior is a Gaussian at every point that was tried"
+        why = "the posterior is Gaussian at every point that was tried"
         return replace(whole, log_evidence=gaussian.log_evidence, error=float(near.max()), route="closed form", why=why)
     if even >= EVEN and pilot.pareto_k <= TRUSTED:
         whole = _continued(posterior, mixture, first, seed, quarter)
@@ -136,7 +136,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
 
 
 def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -> Evidence:
-    """Make an estimate of weights (n,) of which every eighth part, in order, is an independent replicate."""
+    """Estimate from weights (n,) whose eight parts, in order, are independent replicates."""
     shift = log_weights.max()
     if not np.isfinite(shift):
         message = "the model has no answer at any of the points drawn for the evidence"
@@ -153,7 +153,7 @@ def weighed(density: Density, log_weights: FloatArray, route: Route, why: str) -
 def _drawn(
     posterior: Posterior, mixture: Mixture, seed: int, start: int, stop: int, *, derivatives: bool
 ) -> tuple[Density, FloatArray]:
-    """Solve at the points from number `start` to `stop` of a mixture, all scrambles together; ln w."""
+    """Solve at points number `start` to `stop` of a mixture, for all scrambles together; return ln w too."""
     c = mixture.centres.shape[1]
     ends = (start // SCRAMBLES, stop // SCRAMBLES)
     x = mixture.draw(np.concatenate([sobol_points(seed, r, *ends, c + 1) for r in range(SCRAMBLES)]))
@@ -173,7 +173,7 @@ def _continued(
 
 
 def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
-    """Difference (n,) of the log posterior from that of the Gaussian; nothing counts as far where there is none."""
+    """Difference (n,) of the log posterior from that of the Gaussian."""
     deviation = density.x - gaussian.mode
     quadratic = gaussian.log_posterior - np.einsum("zi,ij,zj->z", deviation, gaussian.hessian, deviation) / 2
     return np.asarray(density.log_posterior - quadratic)
@@ -182,7 +182,7 @@ def _from_gaussian(gaussian: Laplace, density: Density) -> FloatArray:
 def _by_surrogate(
     posterior: Posterior, mixture: Mixture, first: Density, gaussian: Laplace, seed: int, quarter: int, why: str
 ) -> Evidence:
-    """Draw the other quarters each from the posterior of a polynomial that is fitted to those before."""
+    """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones."""
     parts = [first]
     over: list[Callable[[FloatArray], FloatArray]] = [mixture.log_over_prior]
     errors = []
@@ -197,7 +197,7 @@ def _by_surrogate(
     top = densities.max(axis=0)
     log_over = top + np.log(np.exp(densities - top).mean(axis=0))
     found = weighed(density, density.log_likelihood - log_over, "surrogate", why)
-    # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density that is
-    # wrong by a factor makes its share of the mixture wrong by that.
+    # The sweeps share their polynomials: a scatter smaller than that of the weights is chance. And a density with a
+    # wrong factor makes its share of the mixture wrong by that factor.
     scatter = max(found.error, np.sqrt(1 / found.ess - 1 / len(density.x)))
     return replace(found, error=float(np.hypot(scatter, np.linalg.norm(errors) / QUARTERS)))

@@ -1,4 +1,4 @@
-"""The mode of a posterior, and the Gaussian there (Laplace): few parameters, in standard normal coordinates.
+"""The mode of a posterior and Laplace's Gaussian there: few parameters, in standard normal coordinates.
 
 The mode is found by Gauss–Newton steps of limited length (K. Levenberg, Quart. Appl. Math. 2 (1944) 164–168; D. W.
 Marquardt, J. SIAM 11 (1963) 431–441), from several starts. There −ln p(y | x) + ½|x|² ≈ Φ̂ + ½ δᵀH δ, so that
@@ -19,7 +19,7 @@ from inverse.low_dimensional.posterior import Posterior
 from uq.inputs.sampling import sobol_points
 
 STEPS = 50
-CLOSE = 1e-13  # squared Newton decrement that ends the search: the density is known to half of it
+CLOSE = 1e-13  # squared Newton decrement that ends the search: twice the error of the log density
 FARTHEST = 3.0  # length of a step, in standard deviations of the prior
 STIFFER, SOFTER = 8.0, 3.0
 DIFFERENCE = 0.05  # step of the second derivatives, in standard deviations of the posterior
@@ -54,7 +54,7 @@ class Laplace:
     steps
         The iterations of all starts.
     modes
-        Where each start ended (k, c), and `ends` (k,), the log posterior there.
+        End points (k, c) of the searches, and `ends` (k,), the log posterior there.
     """
 
     mode: FloatArray
@@ -73,7 +73,7 @@ class Laplace:
 
     @property
     def root(self) -> FloatArray:
-        """L (c, c) with L Lᵀ = H⁻¹, which makes samples x̂ + L z of standard normal z."""
+        """L (c, c) with L Lᵀ = H⁻¹: x̂ + L z with standard normal z is a sample."""
         return np.linalg.inv(np.linalg.cholesky(self.hessian)).T
 
     @property
@@ -89,14 +89,14 @@ def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool
     Parameters
     ----------
     posterior
-        Of a model with derivatives.
+        Its model must have derivatives.
     starts
         Number of starts: the centre of the prior, and points of a scrambled Sobol' sequence.
     seed
-        Of that.
+        Of that sequence.
     exact
-        Take second derivatives by central differences of the gradient (two solves for each coordinate), or those of
-        Gauss–Newton.
+        Compute second derivatives by central differences of the gradient (two solves for each coordinate) instead of
+        by Gauss–Newton.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool
     from scipy.special import ndtri
 
     c = len(posterior.names)
-    # Starts at which every coordinate is within a standard deviation or two: the far tails have no answers.
+    # Every coordinate of a start is within a standard deviation or two: in the far tails models have no answer.
     others = ndtri(0.05 + 0.9 * sobol_points(seed, 0, 0, starts - 1, c)) if starts > 1 else np.zeros((0, c))
     ends: list[tuple[FloatArray, float, bool]] = []
     steps: list[Step] = []
@@ -168,13 +168,13 @@ def _climb(
 
 
 def _positive(matrix: FloatArray) -> FloatArray:
-    """Return the nearest matrix whose eigenvalues are those of a posterior that is no wider than 30 priors."""
+    """Return the nearest matrix whose eigenvalues are those of a posterior at most 30 times as wide as the prior."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray(vectors * np.maximum(values, 1e-3) @ vectors.T)
 
 
 def _differences(posterior: Posterior, mode: FloatArray, curvature: FloatArray) -> FloatArray:
-    """Second derivatives by differences of the gradient, along directions in which the posterior is about as wide."""
+    """Second derivatives by differences of the gradient, in directions in which the posterior is about equally wide."""
     directions = np.linalg.inv(np.linalg.cholesky(_positive(curvature))).T  # columns
     moves = DIFFERENCE * directions.T
     found = posterior.at(np.concatenate([mode + moves, mode - moves]), derivatives=True)
@@ -185,5 +185,5 @@ def _differences(posterior: Posterior, mode: FloatArray, curvature: FloatArray) 
     whitened = change @ directions
     inverse = np.linalg.inv(directions)
     values, vectors = np.linalg.eigh((whitened + whitened.T) / 2)
-    # In these coordinates Gauss–Newton says 1.
+    # In these coordinates Gauss–Newton gives 1.
     return np.asarray(inverse.T @ (vectors * np.maximum(values, 1e-2) @ vectors.T) @ inverse)

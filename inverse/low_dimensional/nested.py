@@ -1,7 +1,7 @@
-"""The evidence by nested sampling, which shares nothing with the other routes but the likelihood.
+"""The evidence by nested sampling, which shares only the likelihood with the other routes.
 
-J. Skilling, Bayesian Anal. 1 (2006) 833–860; as of dynesty: J. S. Speagle, Mon. Not. R. Astron. Soc. 493 (2020)
-3132–3158. It takes ten thousand solves or more: for models that cost next to nothing.
+J. Skilling, Bayesian Anal. 1 (2006) 833–860; by dynesty: J. S. Speagle, Mon. Not. R. Astron. Soc. 493 (2020)
+3132–3158. It takes ten thousand solves or more, so it is for very cheap models.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NOTHING = -1e300  # ln p(y | x) where the model has no answer
 
 
 def nested(posterior: Posterior, *, seed: int = 0, live: int = LIVE) -> tuple[float, float]:
-    """Return ln Z and its standard error by nested sampling with so many live points.
+    """Return ln Z and its standard error by nested sampling with `live` live points.
 
     Raises
     ------

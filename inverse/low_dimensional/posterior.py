@@ -4,18 +4,17 @@ With ω = ω(x), x ~ N(0, I) a priori (`Inputs.from_normals`), data y = ψ(ω) +
 
     −ln p(y | x) = ½ r·r + Σ ln(s σ_i) + (m/2) ln 2π,   r_i = (ψ_i(ω) − y_i)/(s σ_i),
 
-where s = 1, or is unknown too, with a prior of its own and one more coordinate. The prior of x has no constants that
-depend on the model, so that evidences of different models compare (for errors with heavy tails see
-`inverse.data.errors`):
+where s = 1, or is unknown too, with its own prior and one more coordinate. The prior of x is normalised, so that
+evidences of different models are comparable (for errors with heavy tails see `inverse.data.errors`):
 
     Z = ∫ p(y | x) N(x; 0, I) dx.
 
-Where only a part A of the prior is of materials (`Inputs.admissible`), the prior is N(x; 0, I)/P(A) in A and zero
-elsewhere: outside A the model has no answer, and what is called p(y | x) here is divided by P(A).
+If the model is defined only on a part A of the prior (`Inputs.admissible`), the prior is N(x; 0, I)/P(A) in A and zero
+elsewhere: outside A the model has no answer, and p(y | x) here includes the factor 1/P(A).
 
-Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
-multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
-Wright, Numerical Optimization (2006), section 10.2.
+Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the latter neglect the term with ∂²ψ
+(Gauss–Newton), which is zero for models that are linear in normal parameters: J. Nocedal, S. J. Wright, Numerical
+Optimization (2006), section 10.2.
 """
 
 from __future__ import annotations
@@ -50,12 +49,12 @@ class Density:
     log_likelihood
         ln p(y | x) (n,); −∞ where the model has no answer.
     everything
-        All outputs (n, M) of the model, of which ψ are those that were measured.
+        All outputs (n, M) of the model; ψ are the measured ones.
     tangents
-        ∂ψ/∂ω (n, M, d) of all outputs, where derivatives were asked for.
+        ∂ψ/∂ω (n, M, d) of all outputs, if derivatives were requested.
     gradient, curvature
-        Of −ln p(y | x) + ½|x|²: (n, c), and its second derivatives (n, c, c) but for those of ψ; NaN where the model
-        has no answer, empty where they were not asked for.
+        Of −ln p(y | x) + ½|x|²: (n, c), and its second derivatives (n, c, c) without those of ψ; NaN where the model
+        has no answer, empty if they were not requested.
     """
 
     x: FloatArray
@@ -69,12 +68,12 @@ class Density:
 
     @property
     def log_posterior(self) -> FloatArray:
-        """Ln p(y | x) − ½|x|² (n,): what the mode is the largest value of."""
+        """Ln p(y | x) − ½|x|² (n,), which is largest at the mode."""
         return np.asarray(self.log_likelihood - (self.x**2).sum(axis=1) / 2)
 
     @classmethod
     def joined(cls, parts: Sequence[Density], order: NDArray[np.intp] | None = None) -> Density:
-        """Put points together, in a new order if one is given; with derivatives where all parts have them."""
+        """Join points, in a new order if one is given; with derivatives if all parts have them."""
 
         def column(name: str) -> FloatArray:
             values = np.concatenate([getattr(part, name) for part in parts])
@@ -95,7 +94,7 @@ class Density:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Measured outputs and what is believed of their parameters and errors before.
+    """Measured outputs, and the priors of parameters and errors.
 
     Parameters
     ----------
@@ -106,13 +105,13 @@ class Posterior:
     data
         y (m,), in the units of the outputs.
     sigma
-        Standard deviations σ (m,) of the errors, or what they are in proportion to where s is unknown.
+        Standard deviations σ (m,) of the errors, up to the factor s if that is unknown.
     noise
-        Prior of s; None where s = 1.
+        Prior of s; None for s = 1.
     which
-        Outputs (m,) of the model that were measured, by number.
+        Numbers (m,) of the outputs of the model that were measured.
     start
-        Where the solver starts.
+        Initial guesses of the solver.
     errors
         Distribution of the errors over their scale sσ.
     """
@@ -128,7 +127,7 @@ class Posterior:
 
     def __post_init__(self) -> None:
         if self.data.shape != self.sigma.shape:
-            message = f"{self.data.size} data with {self.sigma.size} standard deviations, expected as many"
+            message = f"{self.data.size} data with {self.sigma.size} standard deviations, expected equal numbers"
             raise ValueError(message)
         if not (self.sigma > 0).all():
             message = f"standard deviation of the errors {self.sigma.min():g}, expected positive ones"
@@ -136,11 +135,11 @@ class Posterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the c coordinates: the parameters, and the noise where it is unknown."""
+        """Names of the c coordinates: the parameters, and the noise if it is unknown."""
         return self.inputs.names + ((NOISE,) if self.noise is not None else ())
 
     def physical(self, x: FloatArray) -> FloatArray:
-        """Return the parameters, and s where it is unknown, (n, c) at x (n, c)."""
+        """Return the parameters, and s if it is unknown, (n, c) at x (n, c)."""
         d = len(self.inputs.names)
         values = self.inputs.from_normals(x[:, :d])[0]
         if self.noise is None:

@@ -1,11 +1,11 @@
-"""A polynomial that stands for a model where a posterior is, and points drawn from the posterior that it gives.
+"""A polynomial surrogate of a model in the bulk of a posterior, and points drawn from the posterior of the surrogate.
 
 The outputs are fitted by least squares to values and derivatives at points that were solved, in Hermite polynomials
-about the weighted mean of these points; far points count less. Polynomials of the parameters or of their standard
-normal coordinates, and their degree: the ones that predict left-out points best. The posterior of the polynomial costs
-nothing, so it can be sampled as densely as it takes: from a mixture of Gaussians, each as wide as the posterior is
-about its centre, whose centres are drawn from the points of the round before (population Monte Carlo: O. Cappé et al.,
-Stat. Comput. 18 (2008) 447–459).
+about the weighted mean of these points; far points count less. The degree, and whether the polynomials are of the
+parameters or of their standard normal coordinates, are chosen to predict left-out points best. The posterior of the
+polynomial is cheap, so it can be sampled as densely as needed: from a mixture of Gaussians, each as wide as the
+posterior around its centre, with centres drawn from the points of the previous round (population Monte Carlo: O. Cappé
+et al., Stat. Comput. 18 (2008) 447–459).
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from uq.surrogates.basis import Basis, hyperbolic
 DEGREE = 6
 ROWS_PER_TERM = 1.5
 FOLDS = 4
-NEAR = 0.5  # share of the points that the weights of the fit are worth
-COUNTED = 1e-3  # weight, over the largest, of a point that the polynomial can be said to know
-MARGIN = 0.3  # of its size, that is added on either side of the box of these points
-BEYOND = "the polynomial is not known there"
+NEAR = 0.5  # effective sample size of the weights of the fit, over the number of points
+COUNTED = 1e-3  # weight, over the largest, from which a point counts as within the range of the polynomial
+MARGIN = 0.3  # added on either side of the box of these points, over its size
+BEYOND = "outside the range of the polynomial"
 WIDER = 1.3  # τ: standard deviations of the first proposal over those of Laplace
-SHARE = 0.7  # α: of the points from the Gaussians; the others are from the prior
+SHARE = 0.7  # α: share of the points from the Gaussians; the others are from the prior
 CENTRES = 64
-REACH = 0.4  # most that a Gaussian of the mixture is wide, in standard deviations of the prior
+REACH = 0.4  # largest width of a Gaussian in the mixture, in standard deviations of the prior
 SCRAMBLES = 8
-FIRST, LAST = 2**11, 2**13  # points of the first clouds and of the last one
+FIRST, LAST = 2**11, 2**13  # points in the first clouds and in the last one
 ROUNDS = 4
-ENOUGH = 0.2  # effective share of a cloud that needs no better proposal
+ENOUGH = 0.2  # effective share of a cloud from which no better proposal is needed
 
 
 @dataclass(frozen=True)
 class Surrogate:
-    """A polynomial for the outputs of a model; an evaluation that costs nothing.
+    """A polynomial for the outputs of a model, as a cheap evaluation.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Surrogate:
     coefficients
         (P, m).
     lower, upper
-        The box (d,) beyond which there is no answer: a polynomial far from its points says anything.
+        The box (d,) beyond which there is no answer: far from its points a polynomial is meaningless.
     """
 
     parameters: tuple[str, ...]
@@ -69,7 +69,7 @@ class Surrogate:
     node_volumes: FloatArray | None = None
 
     def on(self, model: str) -> Surrogate:
-        """Return itself: it stands for one model."""
+        """Return itself: there is one model."""
         return self
 
     def __call__(self, request: Request) -> Evaluations:
@@ -102,7 +102,7 @@ class Surrogate:
 
 
 def fit(posterior: Posterior, solved: Density) -> Posterior:
-    """Return the posterior of a polynomial that is fitted to points which were solved with their derivatives.
+    """Return the posterior of a polynomial that is fitted to values and derivatives at solved points.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def fit(posterior: Posterior, solved: Density) -> Posterior:
 def _regression(
     points: FloatArray, outputs: FloatArray, tangents: FloatArray, weights: FloatArray
 ) -> tuple[float, Basis, FloatArray]:
-    """Fit values and derivatives by the degree with the smallest error at left-out points; that error too."""
+    """Fit values and derivatives with the degree of the smallest error at left-out points; return that error too."""
     n, d = points.shape
     centre = weights @ points
     scale = np.sqrt(weights @ (points - centre) ** 2)
@@ -176,7 +176,7 @@ def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basi
 
 
 def _tempered(log_density: FloatArray, least: float) -> FloatArray:
-    """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 for which they are worth `least` points."""
+    """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 with an effective sample size of at least `least`."""
 
     def weights(power: float) -> FloatArray:
         w = np.exp(power * (log_density - log_density.max()))
@@ -208,7 +208,7 @@ class Mixture:
 
     @classmethod
     def of(cls, gaussian: Laplace) -> Mixture:
-        """Return that of Laplace's Gaussian, made wider."""
+        """Return the mixture of Laplace's Gaussian, widened, and the prior."""
         return cls(gaussian.mode[None, :], WIDER * gaussian.root[None, :, :])
 
     def draw(self, cubes: FloatArray) -> FloatArray:
@@ -234,16 +234,16 @@ class Mixture:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Many points with their weights in the posterior of a polynomial; every eighth part is a scramble of its own.
+    """Many points with their weights in the posterior of a polynomial, in eight independent scrambles.
 
-    Nine of ten points that are picked from it are drawn by their weights w; one by √w, which reaches farther out.
+    Of ten points picked from it, nine are drawn by their weights w, and one by √w, which reaches farther out.
 
     Attributes
     ----------
     surrogate
         The posterior of the polynomial.
     mixture
-        What the points were drawn from.
+        The proposal from which the points were drawn.
     x
         Points (N, c).
     log_weights
@@ -262,7 +262,7 @@ class Cloud:
 
     @property
     def ess(self) -> float:
-        """Effective number of points."""
+        """Effective sample size of the points."""
         return effective_sample_size(self.weights)
 
     @property
@@ -274,7 +274,7 @@ class Cloud:
     def pick(self, seed: int, count: int) -> FloatArray:
         """Draw points (count, c), in eight independent sweeps."""
         chance = np.exp(self._log_picked(self.log_weights)) / len(self.x)
-        # Neighbours along the longest axis of the cloud stand beside each other, so that a sweep covers it evenly.
+        # Neighbours along the longest axis of the cloud are adjacent, so that a sweep covers it evenly.
         w = self.weights
         deviation = self.x - w @ self.x
         axis = np.linalg.eigh((deviation * w[:, None]).T @ deviation)[1][:, -1]
@@ -292,7 +292,7 @@ class Cloud:
         return np.asarray(over + self._log_picked(self.surrogate.at(x).log_likelihood - over))
 
     def _log_picked(self, log_weights: FloatArray) -> FloatArray:
-        """Ln of the density of picked points over q, where ln w is known."""
+        """Ln of the density of picked points over q, from ln w."""
         top = self.log_weights.max()
         mean, mean_root = (np.exp(power * (self.log_weights - top)).mean() for power in (1.0, 0.5))
         parts = (0.9 * np.exp(log_weights - top) / mean, 0.1 * np.exp((log_weights - top) / 2) / mean_root)
@@ -300,7 +300,7 @@ class Cloud:
 
 
 def sample(surrogate: Posterior, gaussian: Laplace, seed: int) -> Cloud:
-    """Draw a cloud from the posterior of a polynomial, with proposals that are fitted to it round by round."""
+    """Draw a cloud from the posterior of a polynomial, with proposals adapted to it round by round."""
     mixture = Mixture.of(gaussian)
     cloud = _cloud(surrogate, mixture, seed, FIRST)
     for k in range(ROUNDS):
@@ -325,7 +325,7 @@ def _cloud(surrogate: Posterior, mixture: Mixture, seed: int, count: int) -> Clo
 
 
 def _mixture(surrogate: Posterior, cloud: Cloud, seed: int) -> Mixture:
-    """Gaussians about points of a cloud, with the covariances (H + I/ρ²)⁻¹ of the posterior about each."""
+    """Gaussians around points of a cloud, with the covariances (H + I/ρ²)⁻¹ of the posterior around each."""
     tempered = _tempered(cloud.log_weights, 2 * CENTRES)
     places = (np.arange(CENTRES) + np.random.default_rng([seed, CENTRES]).random()) / CENTRES
     order = np.argsort(cloud.x[:, 0], kind="stable")

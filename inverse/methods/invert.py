@@ -1,4 +1,4 @@
-"""The method `invert`, as a study has it: what displacements or outputs say of what is unknown."""
+"""The method `invert` of a study: inference of unknowns from displacements or outputs."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from uq.inputs.random_parameters import Inputs
 
 
 class Invert(Settings):
-    """Inversion of measured displacements: the most probable interior, its uncertainty, and what the data do not say.
+    """Inversion of measured displacements: the most probable interior, its uncertainty, and what the data leave open.
 
     Parameters
     ----------
     samples
-        Solves that correct Laplace's Gaussian: by default 256 for few parameters, none for a field. With 64, intervals
-        of 90 % held the truth in 82 % of the specimens where posteriors are thin and bent (docs/design.md).
+        Solves that correct Laplace's Gaussian: by default 256 for few parameters, none for a field. With 64, 90 %
+        intervals contained the truth in 82 % of specimens with thin and curved posteriors (docs/design.md).
     noise
-        Prior of the factor on all standard deviations of the errors; without it they are what they are said to be.
+        Prior of the factor on all standard deviations of the errors; by default these are as stated.
     chains
-        Run Markov chains too: "pcn", of proposals that a Gaussian of the posterior makes (5 204 solves; of a field
-        4 804), or, for few parameters, "emcee" (35 208 solves, or more). Where they have mixed, moments and draws of
-        few parameters are theirs; of a field, where Laplace's are not to be trusted.
+        Run Markov chains too: "pcn", with proposals from a Gaussian of the posterior (5 204 solves; for a field 4 804),
+        or, for few parameters, "emcee" (35 208 solves, or more). If they have mixed, moments and draws of few
+        parameters are theirs; for a field, only if Laplace's cannot be trusted.
     starts
         Starts of the search for the mode of few parameters.
     cutoff, rank
-        Directions of a field with λ below `cutoff` are left out; and largest number of directions.
+        Directions of a field with λ below `cutoff` are neglected; and largest number of directions.
     draws
-        Draws of the posterior that are kept, of few parameters; of a field a tenth.
+        Draws of the posterior that are stored for few parameters; for a field, a tenth of it.
     seed
         Of all draws.
     mesh_check
-        Solve once more, at the mode on a finer mesh with thinner cells at the faces that are held: what the error of
-        the mesh does to the data, in deviations of their noise, and to the unknowns, in deviations of the posterior.
-        Without it no posterior is said to be trusted.
+        Solve once more, at the mode on a finer mesh with thinner cells at the fixed faces: the effect of the error of
+        the mesh on the data, in standard deviations of their noise, and on the unknowns, in those of the posterior.
+        Without it no posterior counts as trusted.
     """
 
     kind: Literal["invert"] = "invert"
@@ -62,11 +62,11 @@ class Invert(Settings):
         return self
 
     def solves(self, *, field: bool) -> int:
-        """Number of solves of a data set that correct the Gaussian."""
+        """Number of solves for a data set that correct the Gaussian."""
         return (0 if field else 256) if self.samples is None else self.samples
 
     def chain_solves(self, size: int, *, field: bool) -> int:
-        """Number of solves of the chains of a data set with so many unknown parameters."""
+        """Number of solves of the chains for a data set with `size` unknown parameters."""
         if self.chains is None:
             return 0
         if field:
@@ -75,5 +75,5 @@ class Invert(Settings):
 
 
 def names_of(inputs: Inputs, method: Invert) -> tuple[str, ...]:
-    """Return the names of the parameters, and of the noise where it is inferred."""
+    """Return the names of the parameters, and of the noise if it is inferred."""
     return (*inputs.names, *((NOISE,) if method.noise is not None else ()))

@@ -1,7 +1,7 @@
 """Inversion for few parameters: the mode from several starts, Laplace's Gaussian, weighted points that correct it.
 
-The posterior is that of `inverse.low_dimensional.posterior`. One function has a group of ranks work by itself, the
-other has all groups solve at different points of one posterior.
+The posterior is that of `inverse.low_dimensional.posterior`. With one function a rank group works by itself, with the
+other all groups solve at different points of one posterior.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from uq.surrogates.linearisation import linearise
 if TYPE_CHECKING:
     import xarray as xr
 
-DRAWS = 4096  # of Laplace's Gaussian, for what it says of physical parameters
+DRAWS = 4096  # of Laplace's Gaussian, to map it to physical parameters
 Look = Callable[[FloatArray], FloatArray]  # parameters (n, d) → ln of the stiffness factor (n, N) at the vertices
 
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """A linear prediction of the state from a solution that this group of ranks has; a `Start`.
+    """A linear prediction of the state from a solution of this rank group; a `Start`.
 
     Attributes
     ----------
     point
-        Where (d,).
+        Its parameters (d,).
     state, slopes
         State (U_local,) there, and its derivatives (d, U_local).
     spread
@@ -90,16 +90,16 @@ def invert_by_group(
     finer: Finer | None = NOT_LOOKED,
     evaluate: Evaluate | None = None,
 ) -> xr.Dataset:
-    """Invert a data set on the model of one group of ranks, or by an evaluation of it; collective over the group.
+    """Invert a data set on the model of one rank group, or by an evaluation of it; collective over the group.
 
     Parameters
     ----------
     inputs, model, data, method, errors
-        What is unknown, of what, from what, how, and of which errors.
+        The unknowns, the model, the data, the method, and the distribution of the errors.
     look
-        What is seen of the interior; None where nothing is.
+        The stiffness of the interior as a function of the parameters; None if there is none.
     finer
-        The model on a finer mesh; None where it has no mesh.
+        The model on a finer mesh; None if it has no mesh.
     evaluate
         Of the model.
 
@@ -121,7 +121,7 @@ def invert_by_all(
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
 ) -> xr.Dataset:
-    """Invert a data set with all groups of ranks, each of which solves at other points; raises as the other."""
+    """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
     return _invert(
         inputs,
         evaluate,
@@ -148,7 +148,7 @@ def _invert(
     posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     d = len(inputs.names)
     which = slice(None) if data.which is None else list(data.which)
-    with suppress(SolveError):  # or else every solve begins at zero
+    with suppress(SolveError):  # otherwise every solve starts from zero
         posterior = replace(posterior, start=start(inputs.mean))
     gaussian = laplace(posterior, starts=method.starts, seed=method.seed)
     best = posterior.physical(gaussian.mode[None])[0]
@@ -217,7 +217,7 @@ def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: In
         case "emcee":
             return ensemble(posterior, gaussian, seed=method.seed)
         case "pcn":
-            # Fewer points than that say little of a covariance.
+            # Fewer points say little about a covariance.
             enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
             return chains_of_few(posterior, found if enough else gaussian, seed=method.seed)
         case _:
@@ -262,14 +262,14 @@ def _normals(seed: int, count: int, dimension: int) -> FloatArray:
 
 
 def _thinned(chains: Chains, count: int) -> FloatArray:
-    """At most `count` draws (n, k), chain after chain and as many of each."""
+    """At most `count` draws (n, k), chain after chain, equally many from each."""
     each = max(count // len(chains.draws), 1)
     steps = np.linspace(0, chains.draws.shape[1] - 1, each).round().astype(int)
     return chains.draws[:, steps].reshape(-1, chains.draws.shape[2])[:count]
 
 
 def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Data) -> Record:
-    """Standard deviations (c,) by the model linearised at the mode, of all load cases and of each alone."""
+    """Standard deviations (c,) by the model linearised at the mode, from all load cases and from each alone."""
     d, c = len(posterior.inputs.names), len(posterior.names)
     slopes = posterior.inputs.from_normals(gaussian.mode[None, :d])[1][0]
     A = spectrum.images.T @ spectrum.vectors
@@ -285,7 +285,7 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Da
 def _draws(
     draws: FloatArray, outputs: FloatArray, data: Data, method: Invert, errors: NormalErrors | StudentErrors
 ) -> Record:
-    """Draws of equal weight with what the data say of each."""
+    """Draws of equal weight with the likelihood of the data for each."""
     scale = data.sigma * (draws[:, -1:] if method.noise is not None else 1.0)
     gaps = (outputs - data.values) / scale
     return {"draw": draws, "draw_log_likelihood": -errors.minus_log(gaps) - np.log(scale)}

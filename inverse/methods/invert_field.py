@@ -1,4 +1,4 @@
-"""Inversion for a field: mode by conjugate gradients, low-rank Gaussian, and what corrects it.
+"""Inversion for a field: mode by conjugate gradients, low-rank Gaussian, and its corrections.
 
 The posterior is that of `inverse.fields.field_posterior`.
 """
@@ -51,14 +51,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Vertices:
-    """What makes values at the vertices a stiffness.
+    """Quantities that turn values at the vertices into a stiffness.
 
     Attributes
     ----------
     offset
-        ln of the factor (N,) where the values are zero.
+        ln of the factor (N,) at values of zero.
     volumes
-        Of the vertices (N,), in m³.
+        Volumes of the vertices (N,), in m³.
     """
 
     offset: FloatArray
@@ -68,7 +68,7 @@ class Vertices:
 def invert_field(
     posterior: FieldPosterior, data: Data, method: Invert, vertices: Vertices, finer: Finer = NOT_LOOKED
 ) -> xr.Dataset:
-    """Invert a data set for a field; collective over the group of ranks that has the model.
+    """Invert a data set for a field; collective over the rank group of the model.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def invert_field(
     g = vertices.volumes / vertices.volumes.sum()
     chains = whole = None
     if method.chains is not None:
-        # Chains are judged by the mean over the body: that all vertices have mixed would ask for far more draws.
+        # Chains are judged by the mean over the body: mixing at all vertices would need far more draws.
         whole = chains_of_field(mode.point, found, keep=lambda m: np.column_stack([m @ g, m]), seed=method.seed)
         chains = replace(whole, names=("mean",), draws=whole.draws[:, :, :1])
     drawn = None if whole is None else whole.flat[:, 1:]
@@ -148,7 +148,7 @@ def invert_field(
 def _corrected(
     verdict: Verdict, weighed: FieldWeights | None, chains: Chains | None, drawn: FloatArray | None
 ) -> tuple[FloatArray | None, FloatArray]:
-    """Values (n, N) of the field with weights (n,) that correct the Gaussian where it is not to be trusted."""
+    """Values (n, N) of the field with weights (n,) that correct the Gaussian if it cannot be trusted."""
     if verdict.trust != "corrected":
         return None, np.zeros(0)
     if chains is not None and drawn is not None and chains.mixed:
@@ -211,7 +211,7 @@ def _of_mean(
 
 
 def _directions(found: LowRankPosterior) -> Record:
-    """The directions that the data constrain most, and the last that were found."""
+    """The directions that the data constrain most, and the last ones found."""
     count = len(found.spectrum.values)
     first = np.arange(min(SHOWN, count))
     last = np.arange(max(count - SHOWN, len(first)), count)
@@ -224,7 +224,7 @@ def _directions(found: LowRankPosterior) -> Record:
 
 
 def _alone_std(found: LowRankPosterior, rows: NDArray[np.bool_]) -> FloatArray:
-    """Standard deviations (N,) by one load case alone."""
+    """Standard deviations (N,) from one load case alone."""
     values, turn = ritz(found.spectrum, rows)
     share = values / (1 + values)
     return np.asarray(np.sqrt(np.maximum(found.prior.variance - share @ (turn @ found.directions) ** 2, 0)))

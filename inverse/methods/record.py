@@ -1,8 +1,8 @@
-"""What an inversion leaves: its dataset, and the parts of it that few parameters and fields have in common.
+"""The results of an inversion: its dataset, and the parts that few parameters and fields have in common.
 
-The rows of A, the derivative of the normalised data by the whitened unknowns at the mode, also tell what one load case
-alone would say: λ of A_kᵀA_k of its rows, without another solve. For fields these are the Ritz values in the directions
-that all cases together constrain, exact to the first λ that was left out.
+The rows of A, the derivative of the normalised data by the whitened unknowns at the mode, also show what one load case
+alone determines: λ of A_kᵀA_k with its rows, without another solve. For fields these are the Ritz values in the
+directions that all cases together constrain, exact to the first λ that was neglected.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 ENDS = (0.025, 0.975)  # of credible intervals
-SHOWN = 4  # directions of a field that are kept from each end of the spectrum
-STEPS = 256  # rows of the table of iterations, or more where there are more
+SHOWN = 4  # directions of a field that are stored from each end of the spectrum
+STEPS = 256  # rows of the table of iterations, or more if there are more
 TRUST = ("laplace", "corrected", "neither")
 COLUMNS = {
     "parameters": ("start", "log_posterior", "decrement", "damping"),
@@ -110,7 +110,7 @@ class Data(Protocol):
 
     @property
     def values(self) -> FloatArray:
-        """What was measured (m,)."""
+        """Measured values (m,)."""
 
     @property
     def sigma(self) -> FloatArray:
@@ -118,22 +118,22 @@ class Data(Protocol):
 
     @property
     def cases(self) -> NDArray[np.int64]:
-        """Numbers (m,) of the parts (load cases, outputs) of which it is asked what each alone would say."""
+        """Numbers (m,) of the parts (load cases, outputs) whose information is also shown separately."""
 
     @property
     def which(self) -> tuple[int, ...] | None:
-        """Numbers (m,) of the outputs of the model that were measured; None where these are all, in their order."""
+        """Numbers (m,) of the outputs of the model that were measured; None if these are all, in order."""
 
     @property
     def described(self) -> dict[str, FloatArray]:
-        """What else is known of the data, by its name in results."""
+        """Further information on the data, by its name in results."""
 
     def neighbours(self) -> Neighbours:
         """Return pairs of data that are expected to agree if the model is wrong."""
 
 
 def as_dataset(record: Record) -> xr.Dataset:
-    """Return what an inversion leaves as a dataset, of numbers and of sentences."""
+    """Return the results of an inversion, numbers and sentences, as a dataset."""
     import xarray as xr
 
     held = {name: (DIMS[name], record[name]) for name in DIMS if name in record}
@@ -148,14 +148,14 @@ def as_dataset(record: Record) -> xr.Dataset:
 def stacked(
     found: Sequence[xr.Dataset | None], least: Mapping[str, int]
 ) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
-    """Put the numbers of several data sets on top of each other, with the dimension `data_set`.
+    """Stack the numbers of several data sets, along the dimension `data_set`.
 
     Parameters
     ----------
     found
         Datasets, some of which may be missing.
     least
-        Smallest sizes of dimensions, by name; what is shorter is filled up with NaN.
+        Smallest sizes of dimensions, by name; shorter ones are filled with NaN.
     """
     there = [one for one in found if one is not None]
     sizes = dict(least)
@@ -179,7 +179,7 @@ def usual_sizes(method: Invert, *, field: bool) -> dict[str, int]:
 
 
 def of_data(data: Data, predicted: FloatArray, residual: FloatArray, scale: FloatArray, spectrum: Spectrum) -> Record:
-    """Data, residuals over the errors `scale`, and resolution, and what each load case has of them."""
+    """Data, residuals over the errors `scale`, and resolution, also by load case."""
     values, cases = spectrum.values, int(data.cases.max()) + 1
     resolution = (spectrum.images**2 / (1 + values[:, None])).sum(axis=0)
     per_case = [data.cases == k for k in range(cases)]
@@ -190,7 +190,7 @@ def of_data(data: Data, predicted: FloatArray, residual: FloatArray, scale: Floa
         "measured": data.values,
         "sigma": data.sigma,
         "predicted": predicted,
-        "predicted_std": scale * np.sqrt(resolution),  # S is the covariance of what the model predicts, over the errors
+        "predicted_std": scale * np.sqrt(resolution),  # S is the covariance of predictions, over the errors
         "residual": residual,
         "resolution": resolution,
         "misfit": np.array([(residual[rows] ** 2).sum() for rows in per_case]),
@@ -204,14 +204,14 @@ def of_data(data: Data, predicted: FloatArray, residual: FloatArray, scale: Floa
 
 
 def ritz(spectrum: Spectrum, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Return λ (r,) of A_kᵀA_k in the span of the pairs, falling, and the coordinates (r, r) of the directions."""
+    """Return λ (r,) of A_kᵀA_k in the span of the pairs, descending, and the coordinates (r, r) of the directions."""
     images = spectrum.images[:, rows]
     values, vectors = np.linalg.eigh(images @ images.T)
     return np.maximum(values[::-1], 0), vectors[:, ::-1].T
 
 
 def of_test(test: ResidualTest) -> Record:
-    """What residuals say of the model."""
+    """Tests of the model by its residuals."""
     return {
         "residual_square": np.array(test.square),
         "residual_degrees": np.array(test.degrees),
@@ -221,9 +221,9 @@ def of_test(test: ResidualTest) -> Record:
 
 
 def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
-    """How far the mode x (N,) is from the centre of the prior, in the directions that the data say more of than it.
+    """Distance of the mode x (N,) from the centre of the prior, in directions better known from data than from it.
 
-    There x has the variance λ/(1+λ) where the truth is drawn from the prior: the squares are of χ².
+    There x has the variance λ/(1+λ) if the truth is drawn from the prior: the sum of squares is χ².
     """
     seen = spectrum.values > 1
     values = spectrum.values[seen]
@@ -232,7 +232,7 @@ def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
 
 
 def of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArray) -> Record:
-    """What a finer mesh adds to the data, over their errors, and to the unknowns."""
+    """The effect of a finer mesh on the data, over their errors, and on the unknowns."""
     return {
         "mesh_checked": np.array(float(gap is not None)),
         "mesh_why": why,
@@ -242,7 +242,7 @@ def of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArr
 
 
 def of_chains(chains: Chains | None) -> Record:
-    """What chains are worth, and how many have mixed: none where there are none."""
+    """The diagnostics of chains, and how many have mixed; zero if there are none."""
     if chains is None:
         return {"chains": np.array(0.0), "chain_rhat": np.array(np.nan), "chain_effective": np.array(np.nan)}
     return {

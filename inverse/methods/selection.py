@@ -1,9 +1,9 @@
-"""Model selection as a method: which evidences are found, and with which variants.
+"""Model selection as a method: the evidences that are found, and their variants.
 
 The probability of model k given the data is P_k ∝ π_k Z_k (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995)
-773–795). Groups of data (specimens, regions) have constants of their own under one law: the ln Z of the groups add.
-What it depends on is shown by variants: other noise, other data, and priors half and twice as wide, which reweight the
-points that were solved already (in standard normal coordinates, N(0, s²I) in place of N(0, I)).
+773–795). Groups of data (specimens, regions) each have their own constants under one law: the ln Z of the groups add.
+Variants show what it depends on: other noise, other data, and priors half and twice as wide, which reweight the points
+that were solved already (in standard normal coordinates, N(0, s²I) instead of N(0, I)).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Noise(Settings):
     Parameters
     ----------
     absolute, relative
-        In the units of the data, and in proportion to them; without both, σ_i stands with the data.
+        In the units of the data, and relative to them; without both, σ_i is given with the data.
     factor
         Prior of s; without it s = 1.
     """
@@ -52,7 +52,7 @@ class Noise(Settings):
 
     @property
     def given(self) -> bool:
-        """Whether σ stands with the data."""
+        """Whether σ is given with the data."""
         return self.absolute == 0 and self.relative == 0
 
     def sigma(self, values: FloatArray, given: FloatArray | None) -> FloatArray:
@@ -76,26 +76,26 @@ class Noise(Settings):
 
 
 class Select(Settings):
-    """Bayesian model selection: evidence and probability of every candidate, and what they are worth.
+    """Bayesian model selection: evidence and probability of every candidate, and how far they can be trusted.
 
     Parameters
     ----------
     samples
-        Solves for each evidence, beside those of the search for the mode.
+        Solves for each evidence, in addition to those of the search for the mode.
     noise
         Errors of the data.
     other_noises
-        By name: what else the errors might be; all evidences are found again with each.
+        Other assumptions on the errors, by name; all evidences are computed again with each.
     subsets
-        By name: tests whose data are taken alone; all evidences are found again with each.
+        Tests whose data are used alone, by name; all evidences are computed again with each.
     held_out
-        Predict every test from the others too: all evidences are found again without each of them.
+        Predict every test from the others too: all evidences are computed again without each of them.
     seed
         Of all draws.
     starts
         Starts of each search for the mode.
     check
-        "dynesty": find the evidences by nested sampling too.
+        "dynesty": compute the evidences by nested sampling too.
     """
 
     kind: Literal["select"] = "select"
@@ -118,7 +118,7 @@ class Select(Settings):
 
     @property
     def variants(self) -> int:
-        """Number of times that all evidences are found, without those for tests that are held out."""
+        """Number of times that all evidences are computed, not counting held-out tests."""
         return 1 + len(self.other_noises) + len(self.subsets)
 
     def run(
@@ -138,7 +138,7 @@ class Select(Settings):
         data_groups
             Data by the name of the group.
         evaluate
-            The model of a candidate in a group; its first outputs are the data of the group, others are predicted.
+            The model of a candidate for a group; its first outputs are the data of the group, others are predicted.
         free
             The same without cost, for nested sampling.
         finer
@@ -224,9 +224,9 @@ class SelectSpecimens(Select):
     Parameters
     ----------
     mesh_check
-        Solve once more for each candidate, at its mode on a finer mesh with thinner cells at the faces that are held:
-        what the error of the mesh does to the data, to the evidence and to the unknowns. Without it no evidence is
-        said to be trusted.
+        Solve once more for each candidate, at its mode on a finer mesh with thinner cells at the fixed faces: the
+        effect of the error of the mesh on the data, the evidence and the unknowns. Without it no evidence counts as
+        trusted.
     """
 
     mesh_check: bool = True
@@ -239,7 +239,7 @@ def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate
 
 
 def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
-    """Let solves of a model with states start from its tangent at a point (d,), by default the mean of the prior."""
+    """Start solves of a model with states from its tangent at a point (d,), by default the mean of the prior."""
     if posterior.start is None and point is not None:
         return posterior  # a model without states, or without an answer at the mean
     try:

@@ -1,4 +1,4 @@
-"""The method `synthesize`: data of a specimen that is known, with errors."""
+"""The method `synthesize`: data of a known specimen, with errors."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ class SyntheticNoise(Settings):
 
 
 class Synthesize(Settings):
-    """Synthetic data: displacements of a specimen that is known, with errors.
+    """Synthetic data: displacements of a known specimen, with errors.
 
     Parameters
     ----------
     noise
         The errors.
     fraction
-        Share of the points that each data set has: there are as many data sets as numbers.
+        Share of the points in each data set; one number for each data set.
     missing
-        Share of the components that are lost beside that.
+        Share of the components that are missing in addition.
     seed
         Of the errors, of the points, and of parameters that have distributions.
     """
@@ -74,11 +74,11 @@ class Synthesize(Settings):
         Parameters
         ----------
         inputs
-            What is drawn afresh for every data set; may be nothing.
+            The parameters that are drawn anew for every data set; may be empty.
         evaluate
             The specimen.
         cases, points
-            Number of the load case, and of the point, of each output (m,).
+            Numbers of the load case and of the point of each output (m,).
 
         Raises
         ------

@@ -209,7 +209,7 @@ def test_control_variate_that_hurts_is_called_so(tmp_path, sampled, undrawn):
     [
         ("none", "with Sobol"),
         ("tangent", "points and the control variate"),
-        ("chaos", "fitted to 7 samples of its own"),
+        ("chaos", "fitted to 7 separate samples"),
     ],
 )
 def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
