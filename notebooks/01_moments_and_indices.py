@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Moments and Sobol' indices of a finished study
 #
-# A study leaves one file, `results.nc`, that xarray reads. This notebook reads the directory that
-# `TISSUQ_RESULTS` names; where it names none, it runs a coarse beam first, which takes some seconds.
+# A study writes one file, `results.nc`, that xarray reads. This notebook reads the directory in
+# `TISSUQ_RESULTS`; if that is not set, it runs a coarse beam first, which takes a few seconds.
 
 # %%
 # %matplotlib inline
@@ -36,7 +36,7 @@ data = read_dataset(directory)
 data
 
 # %% [markdown]
-# ## What is in it
+# ## What it contains
 #
 # Every estimate `x` has its standard error beside it, `x_error`. Units are in the coordinate `unit`.
 
@@ -47,7 +47,7 @@ table
 # %% [markdown]
 # ## Which parameter matters
 #
-# The total index of a parameter is the share of the variance that would be left if all others were known.
+# The total index of a parameter is the share of the variance that would remain if all others were known.
 
 # %%
 data["sobol_total"].to_pandas().round(4)
@@ -60,7 +60,7 @@ plots.index_bars(data, output).figure
 plots.index_shares(data).figure
 
 # %% [markdown]
-# To first order the same can be read from derivatives at the mean parameters, which cost one solve:
+# To first order, derivatives at the mean parameters show the same, at the cost of one solve:
 
 # %%
 plots.tornado(data, output).figure
@@ -68,8 +68,8 @@ plots.tornado(data, output).figure
 # %% [markdown]
 # ## Where on the body
 #
-# Indices of the displacement at every node. Bodies are drawn by pyvista without a display; on a machine that
-# cannot draw them at all, there is no picture.
+# Indices of the displacement at every node. Bodies are drawn by pyvista without a display; if the machine
+# cannot draw them, there is no picture.
 
 # %%
 strongest = str(data["parameter"].values[data["field_sobol_total"].argmax().item()])

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Error against time
 #
-# What does a method really err, and what does that cost? `compare` runs methods with growing numbers of samples,
-# each several times over, against a reference. Here on the coarse beam, or from the directory that
-# `TISSUQ_COMPARISON` names, such as `results/beam-compare`.
+# How large is the true error of a method, and what does it cost? `compare` runs methods with increasing numbers
+# of samples, each several times, against a reference. Here with the coarse beam, or from the directory in
+# `TISSUQ_COMPARISON`, such as `results/beam-compare`.
 
 # %%
 # %matplotlib inline
@@ -54,7 +54,7 @@ data = read_dataset(directory)
 # %% [markdown]
 # ## Errors of the mean
 #
-# Root mean square over the repeats; set-up is charged. Hollow markers are below what the reference can resolve.
+# Root mean square over the repeats; costs include set-up. Hollow markers are below the resolution of the reference.
 
 # %%
 output = str(data["output"].values[0])
@@ -67,8 +67,8 @@ plots.errors(data, output, "mean", "cpu_seconds").figure
 # ## Are claimed errors honest?
 #
 # A method claims a standard error with each estimate. Over the repeats, the claims (`mean_claimed`) should be
-# about as large as what was really erred (`mean_rmse`). With three repeats both are known to 40 % only: for more,
-# more repeats.
+# about as large as the true errors (`mean_rmse`). With three repeats both are known only to 40 %: take more
+# repeats to know better.
 
 # %%
 one = data.sel(output=output)
@@ -76,7 +76,7 @@ table = one[["row_method", "budget", "solves", "mean_rmse", "mean_claimed", "mea
 table.drop(columns=["output", "unit"], errors="ignore")
 
 # %% [markdown]
-# ## What a method is worth
+# ## The gain of a method
 #
 # Plain Monte Carlo needs σ²/error² samples for the same error. The gain is that number over the solves of the
 # method.

@@ -13,12 +13,12 @@
 # %% [markdown]
 # # Exploring a posterior
 #
-# A cube was sheared, compressed and extended; displacements of four faces were measured. What do they say of the
-# stiffness inside? The study is `configs/stiffness-field.toml`, here on a mesh of 4³ cells, for speed;
-# `TISSUQ_INVERSION=results/stiffness-field` shows the whole one.
+# A cube was sheared, compressed and extended; displacements of four faces were measured. What do they say about
+# the stiffness inside? The study is `configs/stiffness-field.toml`, here on a mesh of 4³ cells, for speed;
+# `TISSUQ_INVERSION=results/stiffness-field` shows the full one.
 #
-# So coarse a mesh errs by more than the data do. The size of the errors is therefore inferred too, by
-# `method.noise`; the findings below, which also stand at the head of the report, say whether that was enough.
+# The error of such a coarse mesh is larger than that of the data. So the size of the errors is inferred too, by
+# `method.noise`; the findings below, which are also at the top of the report, say whether that was enough.
 
 # %%
 # %matplotlib inline
@@ -46,7 +46,7 @@ print(*(f"{one.severity}: {one.text}" for one in findings(data)), sep="\n")
 # %% [markdown]
 # ## What was found
 #
-# The logarithm of the stiffness factor on a plane: truth (these data were made by a finer mesh), mean of the
+# The logarithm of the stiffness factor on a plane: truth (these data were made with a finer mesh), mean of the
 # posterior, and its standard deviation beside that of the prior.
 
 # %%
@@ -56,8 +56,8 @@ plots.inversion.slices(one, cut).figure
 # %% [markdown]
 # ## How much is from the data: the spectrum
 #
-# λ compares the data with the prior, direction by direction. Above 1 the data say more; below, what the picture
-# shows is the prior. The posterior width of a direction is the prior's over √(1 + λ).
+# λ compares the data with the prior, direction by direction. Above 1 the data say more; below, the picture shows
+# the prior. The posterior width of a direction is that of the prior over √(1 + λ).
 
 # %%
 plots.inversion.spectrum(one).figure
@@ -71,14 +71,14 @@ print(f"{seen} directions of {one.sizes['node']} have λ > 1; determined in all:
 # %% [markdown]
 # ## Which directions
 #
-# The first ones are what the data know best, the last ones what they hardly see: fine variations, and those far
-# from the faces that were measured.
+# The data determine the first ones best, and the last ones hardly: fine variations, and those far from the faces
+# that were measured.
 
 # %%
 plots.inversion.direction_slices(one, cut).figure
 
 # %% [markdown]
-# Each load case alone would have said less:
+# Each load case alone determines less:
 
 # %%
 plots.inversion.alone_slices(one, cut).figure
@@ -86,8 +86,8 @@ plots.inversion.alone_slices(one, cut).figure
 # %% [markdown]
 # ## Draws, and what they predict
 #
-# Draws of the posterior are fields as likely as the data allow; whatever is computed from each of them has the
-# spread of a prediction. Here the mean stiffness factor of the upper and of the lower half:
+# Draws from the posterior are fields that agree with the data and the prior; a quantity computed from each of them
+# has the distribution of a prediction. Here the mean stiffness factor of the upper and of the lower half:
 
 # %%
 draws = np.exp(one["stiffness_draw"].values)  # ln of the factor: (sample, node)
@@ -103,11 +103,11 @@ ax.figure
 # %% [markdown]
 # ## Does the model explain the data?
 #
-# |r|² of each load case beside what is expected: a bar far above its mark says that mesh, material or stated
-# errors are wrong. The coarse mesh fails here although the size of the errors was inferred: it errs more in one
-# load case than in another, and smoothly, so that residuals of neighbours agree. The whole study, on 12³ cells and
-# with the errors as stated, passes: probability 0.26 of larger residuals, 0.08 of neighbours that agree more. No
-# posterior should be read further before this test is passed.
+# |r|² of each load case beside its expected value: a bar far above its mark means that the mesh, the material or
+# the stated errors are wrong. The coarse mesh fails here although the size of the errors was inferred: its error is
+# larger in one load case than in another, and smooth, so that residuals of neighbours agree. The full study, on 12³
+# cells and with the errors as stated, passes: probability 0.26 of larger residuals, 0.08 of neighbours that agree
+# more. Do not interpret a posterior that has not passed this test.
 
 # %%
 plots.inversion.misfits(one).figure

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Comparing materials
 #
-# Treloar stretched rubber in three ways. Which law do his tests support? Here three candidates with few solves;
-# `configs/treloar.toml` has five, and `TISSUQ_SELECTION=results/treloar` shows that study.
+# Treloar stretched rubber in three ways. Which law do his tests support? Here are three candidates with few
+# solves; `configs/treloar.toml` has five, and `TISSUQ_SELECTION=results/treloar` shows that study.
 
 # %%
 # %matplotlib inline
@@ -68,8 +68,7 @@ print(*findings(data), sep="\n")
 # %% [markdown]
 # ## Evidence
 #
-# ln Z of each model less the largest, with three standard errors. Before anything is read from it: can all of
-# them be trusted?
+# ln Z of each model minus the largest, with three standard errors. First of all: can all of them be trusted?
 
 # %%
 data["trusted"].to_pandas()
@@ -88,8 +87,8 @@ plots.selection.probability_bars(data).figure
 # %% [markdown]
 # ## Is the best one any good?
 #
-# The most probable of the candidates may still be wrong. If a model were true, residuals as large, and neighbours
-# as much alike, as those that were found would have these probabilities:
+# The most probable candidate may still be wrong. If a model were true, residuals at least as large as these, and
+# neighbours that agree at least as much, would have these probabilities:
 
 # %%
 data[["misfit_probability", "correlation_probability"]].min("group").to_pandas()
@@ -109,8 +108,8 @@ best = str(data["model"].values[data["log_evidence"].argmax().item()])
 plots.selection.corner(data, best, group).figure
 
 # %% [markdown]
-# Any other picture is some lines of matplotlib on `plots.axes()`: the predicted stress at the last stretch, with
-# what the models do not agree on.
+# Any other picture takes a few lines of matplotlib on `plots.axes()`: the predicted stress at the last stretch,
+# with the disagreement of the models.
 
 # %%
 last = data.isel(output=[i for i, name in enumerate(data["output_test"].values) if name == test][-1])

@@ -11,7 +11,7 @@
 # ---
 
 # %% [markdown]
-# # A forward model of one's own in 15 lines
+# # Your own forward model in 15 lines
 #
 # Everything that maps numbers to numbers is a model: a formula, a table, another program. Here the tip deflection
 # of a slender beam.
@@ -37,7 +37,7 @@ def slopes(p):
 model = FunctionModel(deflection, ("E", "q", "L"), ("tip",), slopes)
 
 # %% [markdown]
-# Derivatives may be left out; methods that need them say so. Where they are given, check them once:
+# Derivatives are optional; methods that need them say so. If you provide them, check them once:
 
 # %%
 from forward.conformance import check_derivatives
@@ -67,8 +67,8 @@ for method in (Chaos(samples=20), QuasiMonteCarlo(samples=256, control="tangent"
     print(f"{method.kind:18} {found['mean'].item():.6e} ± {found['mean_error'].item():.1e} m")
 
 # %% [markdown]
-# The exact mean is a product, since the parameters are independent: of a log-normal modulus, E[1/E] = (1 +
-# v²)/1e6 with v = 0.1.
+# The exact mean is a product, since the parameters are independent: for a log-normal modulus,
+# E[1/E] = (1 + v²)/1e6 with v = 0.1.
 
 # %%
 L4 = (0.11**5 - 0.09**5) / (5 * 0.02)
@@ -77,7 +77,7 @@ print(f"{'exact':18} {L4 / (8 * 0.02 * 0.01**3 / 12) * 1.01 / 1e6:.6e} m")
 # %% [markdown]
 # ## As a study, for `tissuq run` and many processors
 #
-# The same function in a module, named by a study: a report, restarts and ranks come with it.
+# Put the same function in a module and name it in a study: that adds a report, restarts and parallel runs.
 
 # %%
 import sys

@@ -3,14 +3,14 @@
     import tissuq
 
     study = tissuq.load("configs/beam.toml")
-    data = study.run()                                          # an xarray dataset, which all pictures take
+    data = study.run()                                          # an xarray dataset, for all plots
     print(float(data["mean"].sel(output="uy_max")), tissuq.findings(data))
 
     model = tissuq.Model(study.model)
-    solution = model.solve({"material.C1": 9e3})                # numbers by their names
+    solution = model.solve({"material.C1": 9e3})                # numbers by name
     print(solution["uy_max"], solution.displacement_at([0.28, 0.01, 0.04]), solution.gradient("uy_max"))
 
-Names are imported when they are first used: `import tissuq` itself imports neither FEniCSx nor MPI.
+Names are imported when first used: `import tissuq` itself imports neither FEniCSx nor MPI.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PACKAGES = ("forward", "uq", "inverse", "workflows")
 
 
 class _Finder:
-    """Finds the packages of the program where they are installed: within this one, under no name of their own."""
+    """Finds the packages of the program where they are installed: within this one, not at the top level."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = str(folder)
@@ -52,7 +52,7 @@ def _installed() -> None:
 
 _installed()
 
-_PUBLIC = {  # MODULE:NAME of what is found here, or a module
+_PUBLIC = {  # MODULE:NAME of each public name, or a module
     "load": "tissuq.studies:load",
     "run": "workflows.run.from_python:run",
     "read": "tissuq.studies:read",

@@ -1,4 +1,4 @@
-"""A model by the names of its numbers: what scripts and notebooks have of a body without a study."""
+"""A model by the names of its numbers, for scripts and notebooks without a study."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
 
 
 class Model:
-    """A model that is built, ready to be solved again and again.
+    """A model that is built, ready to be solved repeatedly.
 
     Parameters
     ----------
     spec
-        What it is: `study.model`, or a block made in Python.
+        Its specification: `study.model`, or a block made in Python.
     parameters
-        Paths of the numbers that change, such as "material.C1"; by default all that can.
+        Paths of the numbers that can change, such as "material.C1"; by default all.
     comm
         mpi4py communicator of the ranks that share it; by default each process has its own model.
 
     Attributes
     ----------
     parameters
-        The numbers that can change, as the specification has them, by their paths.
+        The numbers that can change, with their values in the specification, by path.
     units
-        Of the outputs, by their names.
+        Of the outputs, by name.
     nodes
-        Coordinates (N, 3) of the nodes (m), sorted by x, then y, then z; None for a model without a body. All fields of
+        Coordinates (N, 3) of the nodes (m), sorted by x, then y, then z; None for a model without a body. All fields in
         results have this order, on any number of ranks.
     """
 
@@ -58,17 +58,17 @@ class Model:
         Parameters
         ----------
         values
-            The numbers by their paths; all others are as specified.
+            The numbers by path; all others are as specified.
         near
-            A solution that was found before, whose factor may save time; it does not change the answer beyond the
-            tolerance of the solver.
+            An earlier solution, whose factor may save time; it changes the answer only within the tolerance of the
+            solver.
 
         Raises
         ------
         KeyError
             For a number that the model does not have.
         SolveError
-            Where there is no answer.
+            If there is no answer.
         """
         values = values or {}
         for path in values:
@@ -81,19 +81,19 @@ class Model:
 
     @property
     def model(self) -> contract.ForwardModel:
-        """The model as methods know it: vectors in, vectors out."""
+        """The model as methods see it: vectors in, vectors out."""
         return self._model  # type: ignore[no-any-return]
 
 
 class Solution(Mapping[str, float]):
-    """What a model answers: its outputs by name, its displacements, and derivatives of both.
+    """A solution of a model: its outputs by name, its displacements, and derivatives of the outputs.
 
     Attributes
     ----------
     point
-        The parameters (d,) that it was solved at.
+        The parameters (d,) at which it was solved.
     solved
-        The solution as methods know it.
+        The solution as methods see it.
     """
 
     def __init__(self, model: Model, point: FloatArray, solved: contract.Solution) -> None:
@@ -114,7 +114,7 @@ class Solution(Mapping[str, float]):
         return f"Solution({shown})"
 
     def gradient(self, output: str) -> dict[str, float]:
-        """Return the derivatives of an output with respect to all numbers that change, by their paths.
+        """Return the derivatives of an output with respect to all numbers that can change, by path.
 
         Raises
         ------

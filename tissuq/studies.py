@@ -20,12 +20,12 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Any:
     path
         The file.
     changes
-        Assignments such as "method.samples=512", as of ``--set``.
+        Assignments such as "method.samples=512", as for ``--set``.
 
     Raises
     ------
     StudyError
-        With every mistake in it.
+        Lists every mistake in it.
     """
     from workflows.config.study import load as from_file
 
@@ -38,6 +38,6 @@ def read(directory: str | Path) -> xr.Dataset:
     Raises
     ------
     FileNotFoundError
-        If the directory holds none.
+        If the directory holds no results.
     """
     return read_dataset(Path(directory))
