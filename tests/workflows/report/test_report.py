@@ -414,7 +414,7 @@ def test_what_cannot_be_reported_is_one_line(tmp_path, sampled, undrawn, capsys)
     old = sampled.assign_attrs(config=sampled.attrs["config"].replace("samples", "draws"), tissuq="0.0.1")
     assert main(["report", str(write(tmp_path / "old", old))]) == 2
     assert (
-        "is no study of this version of tissuq, it was made by version 0.0.1 (method.draws" in capsys.readouterr().err
+        "not a study of this version of tissuq, it was made by version 0.0.1 (method.draws" in capsys.readouterr().err
     )
 
 
