@@ -270,7 +270,7 @@ def test_sobol_indices_are_reported(tmp_path, undrawn, design):
     page = write_report(write(tmp_path / "out", dataset)).read_text()
     sag = dataset.sel(output="sag", parameter="material.D1")
     for told in (
-        "The share of the variance that a parameter has alone",
+        "The share of the variance due to a parameter alone",
         numbers.with_error(float(sag["sobol_total"]), float(sag["sobol_total_error"])),
         "group both",
         "second order",
