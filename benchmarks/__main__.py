@@ -19,6 +19,7 @@ from benchmarks import (
     levels,
     locking,
     mesh_error,
+    meshes,
     predictions,
     realisation,
     scaling,
@@ -52,11 +53,12 @@ ALL = {
     "chaos": chaos.main,
     "skewed": skewed.main,
     "coverage": coverage.main,
+    "meshes": meshes.main,
     "scaling": scaling.main,
     "startup": startup.main,
     "adaptive": adaptive.main,
 }
-WITH_OPTIONS = {"tails": tails.main, "coverage": coverage.main}
+WITH_OPTIONS = {"tails": tails.main, "coverage": coverage.main, "meshes": meshes.main}
 
 
 def main() -> int:

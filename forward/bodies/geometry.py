@@ -106,7 +106,9 @@ class _SixSided(Settings):
         return self.shaped(np.column_stack(moved))
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
-        """Return the same body with so many times the cells along each edge, thinner ones at some faces and beside.
+        """Return the same body with so many times the cells along each edge, graded to some faces and those beside.
+
+        Where the body is graded more than that, it stays so.
 
         Raises
         ------
@@ -117,8 +119,8 @@ class _SixSided(Settings):
         graded = {}
         for face in self.boundaries:
             rims = any(face[0] != other[0] for other in towards)
-            more = grading if face in towards else beside if rims else 1.0
-            graded[face] = more * self.grading.get(face, 1.0)  # type: ignore[call-overload]
+            least = grading if face in towards else beside if rims else 1.0
+            graded[face] = max(least, self.grading.get(face, 1.0))  # type: ignore[call-overload]
         return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
 
     @abstractmethod

@@ -34,7 +34,7 @@ from uq.inputs.random_parameters import Inputs
 if TYPE_CHECKING:
     import xarray as xr
 
-    from inverse.criticism.finer import Moved
+    from inverse.criticism.finer import MeshFound
 
 DRAWS = 4000  # of independent errors, for the correlation of neighbours
 QUANTILES = (0.05, 0.95)
@@ -133,10 +133,7 @@ def criticise(found: Evidence, posterior: Posterior, data: Data) -> Criticism:
     w, density = found.weights, found.density
     used = w > 0
     w, outputs = w[used], density.outputs[used]
-    scale = np.tile(posterior.sigma, (len(w), 1))
-    if posterior.noise is not None:
-        scale = scale * posterior.physical(density.x[used])[:, -1:]
-    r = (outputs - posterior.data) / scale
+    scale, r = posterior.scale(density.x[used]), posterior.residuals(outputs, density.x[used])
     pointwise = -(r**2) / 2 - np.log(scale) - np.log(2 * np.pi) / 2
     log_ratio = np.log(w)[:, None] - pointwise
     top = log_ratio.max(axis=0)
@@ -175,7 +172,7 @@ def comparison(
     variants: Mapping[str, Mapping[Pair, tuple[float, float]]],
     checks: Mapping[Pair, tuple[float, float]],
     left_out: Mapping[str, Mapping[Pair, tuple[float, float]]],
-    meshes: Mapping[Pair, Moved],
+    meshes: Mapping[Pair, MeshFound],
 ) -> xr.Dataset:
     """Collect everything that is known about the candidates in a dataset.
 
@@ -299,7 +296,8 @@ def _predictions(
     for k, name in enumerate(names):
         evidence = stated[name, group].evidence
         used = evidence.weights > 0
-        w, outputs = evidence.weights[used], evidence.density.everything[used]
+        w, outputs = evidence.weights[used], evidence.density.everything[used].copy()
+        outputs[:, :m] = evidence.density.outputs[used]  # corrected for the mesh, where that was done
         mean[k] = w @ outputs
         std[k] = np.sqrt(w @ (outputs - mean[k]) ** 2)
         bands[:, k] = np.array([quantiles(column, w) for column in outputs.T]).T
@@ -379,12 +377,12 @@ def _meshes(
     data_groups: Mapping[str, Data],
     parameters: list[str],
     posteriors: Mapping[Pair, Posterior],
-    meshes: Mapping[Pair, Moved],
+    meshes: Mapping[Pair, MeshFound],
     std: FloatArray,
 ) -> dict[str, tuple[Any, Any]]:
     """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations `std`."""
     shape = (len(names), len(data_groups))
-    whys, added = np.full(shape, "", dtype=object), np.full(shape, np.nan)
+    whys, added, fixed = np.full(shape, "", dtype=object), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     shift, errors = np.full(std.shape, np.nan), []
     for g, (group, data) in enumerate(data_groups.items()):
         error = np.full((len(names), len(data.tests)), np.nan)
@@ -393,12 +391,13 @@ def _meshes(
             whys[k, g], added[k, g] = found.why, found.log_evidence
             error[k, : len(found.error)] = found.error
             columns = [parameters.index(p) for p in posteriors[name, group].inputs.names]
-            shift[k, g, columns] = found.parameters / std[k, g, columns]
+            shift[k, g, columns], fixed[k, g] = found.shift, found.corrected and found.settled
         errors.append(error)
     dims = ("model", "group")
     return {
         "mesh_checked": (dims, whys == ""),
         "mesh_why": (dims, whys.astype(str)),
+        "mesh_corrected": (dims, fixed),
         "mesh_log_evidence": (dims, added),
         "mesh_error": (("model", "output"), np.concatenate(errors, axis=1)),
         "mesh_shift": ((*dims, "parameter"), shift),

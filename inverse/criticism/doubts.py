@@ -29,6 +29,7 @@ BIASED, WRONG = (
     0.5,
     2.0,
 )  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
+EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 GRID = np.linspace(-40.0, 40.0, 8001)
 
 
@@ -204,17 +205,52 @@ def mesh_too_coarse(
         return [Doubt("warning", f"not checked for the mesh: {why}", "not checked for the mesh")]
     size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
     data = f"a finer mesh moves the data by {size:.2g} standard deviations of the noise (at most {most:.2g})"
-    moved = {name: shift for name, shift in shifts.items() if np.isfinite(shift)}
-    everywhere = float(np.sqrt((nodes**2).mean())) if len(nodes) else 0.0
-    worst = max([abs(shift) for shift in moved.values()] + [everywhere], default=0.0)
-    listed = [f"{name} {shift:+.2g}" for name, shift in sorted(moved.items(), key=lambda item: -abs(item[1]))]
-    listed += [f"values at the vertices {everywhere:.2g} (root mean square)"] if len(nodes) else []
-    text = f"{data} and the unknowns, in deviations of the posterior, by: {', '.join(listed)}"
+    listed, worst = _moves(shifts, nodes)
+    text = f"{data} and the unknowns, in deviations of the posterior, by: {listed}"
     if worst <= BIASED:
         return [Doubt("note", text, "")]
     severity: Severity = "error" if worst > WRONG else "warning"
     short = f"its mesh is too coarse: unknowns move by {worst:.2g} deviations"
     return [Doubt(severity, f"{text}. The mesh is too coarse for the noise: {ADVICE}", short)]
+
+
+def mesh_corrected(
+    error: FloatArray, shifts: Mapping[str, float], left: Mapping[str, float], nodes: FloatArray, *, settled: bool
+) -> list[Doubt]:
+    """Say what correcting the error of the mesh has done, and doubt it where it decides.
+
+    Parameters
+    ----------
+    error, shifts, nodes
+        As of `mesh_too_coarse`: what the correction has moved.
+    left
+        Standard deviations of what is uncertain of that, by name, over those of the posterior.
+    settled
+        Whether the error at the mode is the one that was corrected.
+    """
+    size, most = float(np.sqrt((error**2).mean())), float(np.abs(error).max())
+    listed, worst = _moves(shifts, nodes)
+    uncertain = max([value for value in left.values() if np.isfinite(value)], default=0.0)
+    text = (
+        f"the error of the mesh, {size:.2g} standard deviations of the noise (at most {most:.2g}), was corrected, "
+        f"which moved the unknowns, in deviations of the posterior, by: {listed}; what is uncertain of it is among the "
+        f"errors of the data, and makes up to {uncertain:.2g} of these deviations"
+    )
+    if not settled:
+        return [Doubt("warning", f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
+    if worst > EXTREME or uncertain > DECIDES:
+        return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
+    return [Doubt("note", text, "")]
+
+
+def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:
+    """Shifts of unknowns in words, the largest first, and its size."""
+    moved = {name: shift for name, shift in shifts.items() if np.isfinite(shift)}
+    everywhere = float(np.sqrt((nodes**2).mean())) if len(nodes) else 0.0
+    worst = max([abs(shift) for shift in moved.values()] + [everywhere], default=0.0)
+    listed = [f"{name} {shift:+.2g}" for name, shift in sorted(moved.items(), key=lambda item: -abs(item[1]))]
+    listed += [f"values at the vertices {everywhere:.2g} (root mean square)"] if len(nodes) else []
+    return ", ".join(listed), worst
 
 
 def meshes_too_coarse(

@@ -1,6 +1,6 @@
-"""The effect of a finer mesh on data, unknowns and evidence, from one solve on it at the mode.
+"""What finer meshes say of data, unknowns and evidence.
 
-With δ, what that solve adds to the outputs ψ at the mode x̂, the model is y = ψ + δ + A(x − x̂) + e. Where the posterior
+With δ, what they add to the outputs ψ at the mode x̂, the model is y = ψ + δ + A(x − x̂) + e. Where the posterior
 is a Gaussian of covariance H⁻¹, its mode moves by −H⁻¹Aᵀδ (data over the errors). With e₀ = y − ψ + A x̂ and errors of
 scale s, the evidence of the linear model is in closed form,
 
@@ -25,66 +25,97 @@ if TYPE_CHECKING:
     from inverse.low_dimensional.posterior import Posterior
     from uq.inputs.distributions import Distribution
 
-SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: enough even for millions of data
+SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: data by the million make it no finer
+Solved = tuple[FloatArray, FloatArray | None]  # outputs (2M,) of `forward.extrapolated`, and their derivatives (2M, d)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What finer meshes say at one point of M outputs.
+
+    Attributes
+    ----------
+    outputs
+        What they tend to (M,).
+    between
+        The difference (M,) between two of them.
+    tangents
+        Derivatives (M, d) of what they tend to; None where they were not asked for.
+    """
+
+    outputs: FloatArray
+    between: FloatArray
+    tangents: FloatArray | None
 
 
 @dataclass(frozen=True)
 class Finer:
-    """Outputs (m,) on a finer mesh at parameters (d,) of the model, or why they are unknown."""
+    """A model on finer meshes, or why there is none.
 
-    outputs: Callable[[FloatArray], FloatArray] | None
+    Attributes
+    ----------
+    solve
+        At parameters (d,), with derivatives or without.
+    why
+        Why that is not possible.
+    """
+
+    solve: Callable[[FloatArray, bool], Solved] | None
     why: str = ""
 
-    def gap(self, point: FloatArray, outputs: FloatArray) -> tuple[FloatArray | None, str]:
-        """Return what the finer mesh adds to outputs (m,), or why that is unknown."""
-        if self.outputs is None:
+    def look(self, point: FloatArray, *, tangents: bool = False) -> tuple[Look | None, str]:
+        """Solve at parameters (d,): what finer meshes say, or why that is not known."""
+        if self.solve is None:
             return None, self.why
         try:
-            return self.outputs(point) - outputs, ""
+            outputs, slopes = self.solve(point, tangents)
         except (SolveError, ModelError, ValueError) as error:
             return None, f"the solve on a finer mesh failed: {error}"
+        there, between = np.split(outputs, 2)
+        return Look(there, between, None if slopes is None else np.split(slopes, 2)[0]), ""
 
 
 NOT_LOOKED = Finer(None, "no finer mesh was given")
 
 
-@dataclass(frozen=True)
-class Moved:
-    """The effect of a finer mesh on an evidence and its posterior.
+@dataclass(frozen=True, eq=False)
+class MeshFound:
+    """What finer meshes said of m data and k unknowns.
 
     Attributes
     ----------
     why
-        Why it is unknown; empty if it is known.
+        Why nothing is known; empty where something is.
     error
-        What it adds to the data (m,), over their errors.
-    parameters
-        What that adds to the most probable parameters (d,).
+        Error of the mesh at the mode (m,), over the noise.
+    shift
+        How far correcting it moves, or would move, the unknowns (k,), over their posterior deviations.
+    left
+        Standard deviation (k,) that what is uncertain of the correction makes, over those.
+    corrected
+        Whether the posterior is corrected.
+    settled
+        Whether the error at its mode is the one that it is corrected by.
     log_evidence
-        And to ln Z.
+        What correcting it adds, or would add, to ln Z of the linear model, but for what is uncertain; NaN of fields.
+    solves
+        Number of solves on finer meshes.
     """
 
     why: str
     error: FloatArray
-    parameters: FloatArray
-    log_evidence: float
+    shift: FloatArray
+    left: FloatArray
+    corrected: bool = False
+    settled: bool = True
+    log_evidence: float = np.nan
+    solves: int = 0
 
-
-def moved(posterior: Posterior, gaussian: Laplace, finer: Finer) -> Moved:
-    """Find the effect of a finer mesh at the mode of few parameters with normal errors: one solve on each mesh."""
-    d, m = len(posterior.inputs.names), posterior.data.size
-    at = posterior.at(gaussian.mode[None], derivatives=True)
-    assert at.tangents is not None
-    best = posterior.physical(gaussian.mode[None])[0]
-    gap, why = finer.gap(best[:d], at.everything[0])
-    if gap is None:
-        return Moved(why, np.full(m, np.nan), np.full(d, np.nan), np.nan)
-    which = slice(None) if posterior.which is None else list(posterior.which)
-    A = at.tangents[0][which] @ posterior.inputs.from_normals(at.x[:, :d])[1][0] / posterior.sigma[:, None]
-    residual, error = ((values / posterior.sigma) for values in (posterior.data - at.outputs[0], gap[which]))
-    factor = best[-1] if posterior.noise is not None else 1.0
-    added = evidence_moved(A, residual + A @ gaussian.mode[:d], error, posterior.noise)
-    return Moved("", error / factor, parameters_moved(posterior, gaussian, A / factor, error / factor), added)
+    @classmethod
+    def unknown(cls, why: str, data: int, unknowns: int, solves: int = 0) -> MeshFound:
+        """Nothing is known."""
+        nans = np.full(unknowns, np.nan)
+        return cls(why, np.full(data, np.nan), nans, nans, solves=solves)
 
 
 def parameters_moved(posterior: Posterior, gaussian: Laplace, A: FloatArray, error: FloatArray) -> FloatArray:

@@ -183,11 +183,8 @@ def examine(
 def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     """Return all pairs of AᵀA of few parameters at a point with derivatives; the noise is no parameter of these."""
     d = len(posterior.inputs.names)
-    assert at.tangents is not None
-    which = slice(None) if posterior.which is None else list(posterior.which)
-    scale = _scale(posterior, at.x)
-    root = np.sqrt(posterior.errors.information((at.outputs[0] - posterior.data) / scale))
-    A = at.tangents[0][which] @ posterior.inputs.from_normals(at.x[:, :d])[1][0] * (root / scale)[:, None]
+    root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, at.x)[0]))
+    A = posterior.sensitivities(at)[0] * root[:, None]
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T
     return Spectrum(values, vectors, vectors @ A.T, np.zeros(d), 0.0, d)
@@ -196,10 +193,5 @@ def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
 def examine_few(posterior: Posterior, gaussian: Laplace, neighbours: Neighbours | None = None) -> ResidualTest:
     """Test the residuals of few parameters at the mode: a solve with derivatives."""
     at = posterior.at(gaussian.mode[None], derivatives=True)
-    residual = posterior.errors.normal_scores((at.outputs[0] - posterior.data) / _scale(posterior, at.x))
+    residual = posterior.errors.normal_scores(posterior.residuals(at.outputs, at.x)[0])
     return examine(residual, spectrum_of(posterior, at), np.ones_like(residual), neighbours)
-
-
-def _scale(posterior: Posterior, x: FloatArray) -> FloatArray:
-    scale = posterior.sigma
-    return scale if posterior.noise is None else np.asarray(scale * posterior.physical(x)[0, -1])

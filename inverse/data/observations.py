@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.settings import nearest, one_line
+from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
 
 TABLES = (".csv", ".txt")
@@ -202,6 +203,11 @@ class Components:
     def described(self) -> dict[str, FloatArray]:
         """Places and axes, by their names in results."""
         return {"place": self.places, "datum_axis": self.axes.astype(float)}
+
+    @property
+    def spread(self) -> Places:
+        """Where they are, by load case and component."""
+        return Places(3 * self.cases + self.axes, self.places)
 
     def neighbours(self) -> Neighbours:
         """Return pairs of neighbouring data of the same component and load case."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.settings import nearest
+from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.data.observations import TRUTH, DataError, read_table
 
@@ -72,6 +73,11 @@ class OutputData:
     def described(self) -> dict[str, FloatArray]:
         """Nothing else: the parts are the outputs."""
         return {}
+
+    @property
+    def spread(self) -> Places:
+        """At no places, by output."""
+        return Places(self.cases)
 
     def neighbours(self) -> Neighbours:
         """Return pairs of repeated measurements."""

@@ -15,13 +15,14 @@ Vectors are rows: k of them are (k, N) in the field and (k, n) in the data.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
+from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import HALF_LOG, NORMAL, NormalErrors, StudentErrors
 
 BLOCK = 32  # vectors whose products are computed together
@@ -70,6 +71,9 @@ class FieldPosterior:
         Told of each solve, and whether it failed.
     errors
         Distribution of the errors over their scale σ.
+    mesh
+        What the mesh of the model takes away from the outputs, the same for all fields; None where that is not known,
+        or nothing.
     """
 
     model: ForwardModel
@@ -80,6 +84,7 @@ class FieldPosterior:
     counts: Counts = field(default_factory=Counts)
     progress: Callable[[int, int], None] = lambda done, failed: None
     errors: NormalErrors | StudentErrors = NORMAL
+    mesh: ApproximationError | None = None
 
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
@@ -103,9 +108,17 @@ class FieldPosterior:
         return np.isfinite(self.data).astype(float)
 
     @cached_property
+    def whitening(self) -> Whitening:
+        """What makes the errors of what was measured independent."""
+        mesh = self.mesh
+        if mesh is not None:
+            mesh = replace(mesh, root=mesh.root * self.measured, apart=mesh.apart * self.measured)
+        return Whitening.of(self.sigma, mesh, self.errors)
+
+    @cached_property
     def weights(self) -> FloatArray:
-        """1/σ (n,) of measured outputs, zero for others."""
-        return self.measured / self.sigma
+        """1/σ (n,) of what was measured."""
+        return self.measured / self.whitening.sigma
 
     def values(self, whitened: FloatArray) -> FloatArray:
         """Return the field m_0 + Lξ (N,), or (k, N)."""
@@ -155,8 +168,14 @@ class Point:
     def gaps(self) -> FloatArray:
         """Predicted minus measured outputs, over σ (n,); zero where nothing was measured."""
         posterior = self.posterior
-        gap = np.where(posterior.measured > 0, self.solution.outputs - posterior.data, 0.0)
-        return np.asarray(posterior.weights * gap)
+        gap = np.where(posterior.measured > 0, self.predicted_outputs - posterior.data, 0.0)
+        return posterior.whitening(posterior.weights * gap)
+
+    @property
+    def predicted_outputs(self) -> FloatArray:
+        """What is predicted (n,), corrected where the error of the mesh is known."""
+        mesh = self.posterior.mesh
+        return np.asarray(self.solution.outputs if mesh is None else self.solution.outputs + mesh.error)
 
     @cached_property
     def root(self) -> FloatArray:
@@ -178,7 +197,8 @@ class Point:
     def log_likelihood(self) -> float:
         """Ln p(y | ξ)."""
         weights = self.posterior.weights[self.posterior.weights > 0]
-        return -self.misfit + float(np.log(weights).sum()) - len(weights) * HALF_LOG
+        more = self.posterior.whitening.log_determinant
+        return -self.misfit - more + float(np.log(weights).sum()) - len(weights) * HALF_LOG
 
     @property
     def penalty(self) -> float:
@@ -199,13 +219,15 @@ class Point:
         """Return the Jacobian-vector product Aξ (n,), or (k, n) for k of them."""
         posterior = self.posterior
         posterior.counts.tangents += len(np.atleast_2d(whitened))
-        return self.root * posterior.weights * self.solution.tangent(posterior.prior.root(whitened))
+        moved = posterior.weights * self.solution.tangent(posterior.prior.root(whitened))
+        return self.root * posterior.whitening(moved)
 
     def vjp(self, data: FloatArray) -> FloatArray:
         """Return the vector-Jacobian product Aᵀr (N,), or (k, N) for k of them."""
         posterior = self.posterior
         posterior.counts.adjoints += len(np.atleast_2d(data))
-        return posterior.prior.root_transposed(self.solution.adjoint(self.root * posterior.weights * data))
+        weights = posterior.weights * posterior.whitening(self.root * data)
+        return posterior.prior.root_transposed(self.solution.adjoint(weights))
 
     def product(self, whitened: FloatArray) -> FloatArray:
         """Return AᵀAξ (N,), or (k, N) for k of them."""

@@ -145,6 +145,7 @@ class Marginal:
         along = (spectrum.images @ gap) ** 2 / np.where(values > 0, values, 1.0)
         weights = mode.posterior.weights[mode.posterior.weights > 0]
         constant = len(weights) / 2 * float(np.log(2 * np.pi)) - float(np.log(weights).sum())
+        constant += mode.posterior.whitening.log_determinant
         rest = max(float(gap @ gap) - float(along.sum()), 0.0)
         return cls(values, along, rest, len(weights), constant)
 

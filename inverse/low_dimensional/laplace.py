@@ -83,7 +83,9 @@ class Laplace:
         return np.asarray(root @ root.T)
 
 
-def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool = True) -> Laplace:
+def laplace(
+    posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool = True, first: FloatArray | None = None
+) -> Laplace:
     """Find the mode, and the second derivatives there.
 
     Parameters
@@ -91,12 +93,14 @@ def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool
     posterior
         Its model must have derivatives.
     starts
-        Number of starts: the centre of the prior, and points of a scrambled Sobol' sequence.
+        Number of starts: the first, and points of a scrambled Sobol' sequence.
     seed
         Of that sequence.
     exact
-        Compute second derivatives by central differences of the gradient (two solves for each coordinate) instead of
-        by Gauss–Newton.
+        Take second derivatives by central differences of the gradient (two solves for each coordinate), or those of
+        Gauss–Newton.
+    first
+        The first start (c,); by default the centre of the prior.
 
     Raises
     ------
@@ -110,7 +114,7 @@ def laplace(posterior: Posterior, *, starts: int = 4, seed: int = 0, exact: bool
     others = ndtri(0.05 + 0.9 * sobol_points(seed, 0, 0, starts - 1, c)) if starts > 1 else np.zeros((0, c))
     ends: list[tuple[FloatArray, float, bool]] = []
     steps: list[Step] = []
-    for number, x in enumerate(np.vstack([np.zeros((1, c)), others])):
+    for number, x in enumerate(np.vstack([np.zeros(c) if first is None else first, others])):
         found = _climb(posterior, x, number, steps)
         if found is not None:
             ends.append(found)

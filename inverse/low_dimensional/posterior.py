@@ -12,20 +12,25 @@ evidences of different models are comparable (for errors with heavy tails see `i
 If the model is defined only on a part A of the prior (`Inputs.admissible`), the prior is N(x; 0, I)/P(A) in A and zero
 elsewhere: outside A the model has no answer, and p(y | x) here includes the factor 1/P(A).
 
-Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the latter neglect the term with ∂²ψ
-(Gauss–Newton), which is zero for models that are linear in normal parameters: J. Nocedal, S. J. Wright, Numerical
-Optimization (2006), section 10.2.
+Where the error of the model's mesh is known, ψ is corrected by it, and what is uncertain of that is another error of
+the data (`inverse.data.approximation_error`): r is then W r.
+
+Gradient and second derivatives of −ln p(y | x) + ½|x|² follow from ∂r/∂x = A; the second ones leave out what
+multiplies ∂²ψ (Gauss–Newton), which is nothing for models that are linear in normal parameters: J. Nocedal, S. J.
+Wright, Numerical Optimization (2006), section 10.2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.data.approximation_error import ApproximationError, Whitening
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
 from uq.evaluation.evaluate import Evaluate, Request, Start
 from uq.inputs.distributions import Distribution
@@ -45,11 +50,11 @@ class Density:
     parameters
         The model's parameters ω (n, d) there.
     outputs
-        ψ (n, m); NaN where the model has no answer.
+        ψ (n, m), corrected where the error of the mesh is known; NaN where the model has no answer.
     log_likelihood
         ln p(y | x) (n,); −∞ where the model has no answer.
     everything
-        All outputs (n, M) of the model; ψ are the measured ones.
+        All outputs (n, M) of the model, not corrected, of which ψ are those that were measured.
     tangents
         ∂ψ/∂ω (n, M, d) of all outputs, if derivatives were requested.
     gradient, curvature
@@ -114,6 +119,8 @@ class Posterior:
         Initial guesses of the solver.
     errors
         Distribution of the errors over their scale sσ.
+    mesh
+        What the mesh of the model takes away from the data; None where that is not known, or nothing.
     """
 
     inputs: Inputs
@@ -124,6 +131,7 @@ class Posterior:
     which: tuple[int, ...] | None = None
     start: Start | None = None
     errors: NormalErrors | StudentErrors = NORMAL
+    mesh: ApproximationError | None = None
 
     def __post_init__(self) -> None:
         if self.data.shape != self.sigma.shape:
@@ -146,33 +154,58 @@ class Posterior:
             return values
         return np.column_stack([values, self.noise.from_normal(x[:, d])[0]])
 
+    @cached_property
+    def whitening(self) -> Whitening:
+        """What makes the errors independent."""
+        return Whitening.of(self.sigma, self.mesh, self.errors)
+
+    def scale(self, x: FloatArray) -> FloatArray:
+        """Return the standard deviations (n, m) of the independent errors at x (n, c)."""
+        s = np.ones(len(x)) if self.noise is None else self.noise.from_normal(x[:, -1])[0]
+        return s[:, None] * self.whitening.sigma
+
+    def residuals(self, outputs: FloatArray, x: FloatArray) -> FloatArray:
+        """Return independent residuals (n, m) of corrected outputs (n, m) at x (n, c)."""
+        return self.whitening((outputs - self.data) / self.scale(x))
+
+    def sensitivities(self, at: Density) -> FloatArray:
+        """Return derivatives (n, m, d) of these residuals by the normal coordinates of the parameters."""
+        assert at.tangents is not None
+        which = slice(None) if self.which is None else list(self.which)
+        tangents = at.tangents[:, which]
+        if self.mesh is not None and self.mesh.slopes.size:
+            tangents = tangents + self.mesh.slopes
+        slopes = self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1]
+        A = tangents @ slopes / self.scale(at.x)[:, :, None]
+        return np.swapaxes(self.whitening(np.swapaxes(A, 1, 2)), 1, 2)
+
     def at(self, x: FloatArray, *, derivatives: bool = False) -> Density:
         """Solve at the points x (n, c)."""
         d, m = len(self.inputs.names), self.data.size
         errors = self.errors
         n, c = x.shape
-        points, slopes = self.inputs.from_normals(x[:, :d])
+        points = self.inputs.from_normals(x[:, :d])[0]
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
         which = slice(None) if self.which is None else list(self.which)
         outputs = found.outputs[:, which]
-        s, ln_s_slope = np.ones(n), np.zeros(n)
-        if self.noise is not None:
-            s, s_slope = self.noise.from_normal(x[:, d])
-            ln_s_slope = s_slope / s
-        scale = s[:, None] * self.sigma
-        residual = (outputs - self.data) / scale
-        misfit = errors.misfit(residual, np.log(scale).sum(axis=1)) + np.log(self.inputs.admitted)
+        if self.mesh is not None:
+            outputs = outputs + self.mesh.at(points)
+        residual = self.residuals(outputs, x)
+        logs = np.log(self.scale(x)).sum(axis=1) + self.whitening.log_determinant
+        misfit = errors.misfit(residual, logs) + np.log(self.inputs.admitted)
         log_likelihood = np.where(found.ok, -misfit, -np.inf)
+        empty = np.zeros((n, 0))
+        plain = Density(x, points, outputs, log_likelihood, found.outputs, None, empty, empty[:, :, None])
         if not derivatives:
-            empty = np.zeros((n, 0))
-            return Density(x, points, outputs, log_likelihood, found.outputs, None, empty, empty[:, :, None])
-        assert found.tangents is not None
+            return plain
         A = np.zeros((n, m, c))
-        A[:, :, :d] = found.tangents[:, which] @ slopes / scale[:, :, None]
+        A[:, :, :d] = self.sensitivities(replace(plain, tangents=found.tangents))
         score = errors.score(residual)
         gradient = x + np.einsum("zm,zmc->zc", score, A)
         curvature = np.eye(c) + np.einsum("zmc,zm,zme->zce", A, errors.information(residual), A)
         if self.noise is not None:
+            s, s_slope = self.noise.from_normal(x[:, d])
+            ln_s_slope = s_slope / s
             # r falls with ln s: d(Σρ + m ln s)/d ln s = m − r·ψ; the second derivatives are exact in ln s.
             gradient[:, d] += (m - (residual * score).sum(axis=1)) * ln_s_slope
             turn = errors.turn(residual)
@@ -180,4 +213,4 @@ class Posterior:
             curvature[:, d, :] += cross
             curvature[:, :, d] += cross
             curvature[:, d, d] += (residual * turn).sum(axis=1) * ln_s_slope**2
-        return Density(x, points, outputs, log_likelihood, found.outputs, found.tangents, gradient, curvature)
+        return replace(plain, tangents=found.tangents, gradient=gradient, curvature=curvature)

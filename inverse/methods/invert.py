@@ -11,6 +11,7 @@ from inverse.criticism.chains import FEW, FIELD, walkers
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
+from inverse.methods.mesh_correction import Treatment
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
@@ -37,10 +38,13 @@ class Invert(Settings):
         Draws of the posterior that are stored for few parameters; for a field, a tenth of it.
     seed
         Of all draws.
+    mesh_error
+        What the error of the mesh does to the data, in deviations of their noise, and to the unknowns, in deviations of
+        the posterior, by solves on finer meshes with thinner cells at the faces that are held: "correct" the model by
+        it where it exceeds a fifth of either, with what is uncertain of it among the errors of the data; "report" it
+        only; false: not at all, and no posterior is said to be trusted.
     mesh_check
-        Solve once more, at the mode on a finer mesh with thinner cells at the fixed faces: the effect of the error of
-        the mesh on the data, in standard deviations of their noise, and on the unknowns, in those of the posterior.
-        Without it no posterior counts as trusted.
+        An older name: false is mesh_error = false.
     """
 
     kind: Literal["invert"] = "invert"
@@ -52,6 +56,7 @@ class Invert(Settings):
     rank: Annotated[int, Field(ge=1)] = 256
     draws: Annotated[int, Field(ge=10)] = 400
     seed: Annotated[int, Field(ge=0)] = 0
+    mesh_error: Literal["correct", "report", False] = "correct"
     mesh_check: bool = True
 
     @model_validator(mode="after")
@@ -60,6 +65,16 @@ class Invert(Settings):
             message = f"samples = {self.samples}, expected at least {LEAST}"
             raise ValueError(message)
         return self
+
+    @property
+    def treatment(self) -> Treatment | None:
+        """What is done about the error of the mesh; None where it is not asked for."""
+        return (self.mesh_error or None) if self.mesh_check else None
+
+    @property
+    def unchecked(self) -> str:
+        """Why the mesh is not looked at, where it is not."""
+        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
     def solves(self, *, field: bool) -> int:
         """Number of solves for a data set that correct the Gaussian."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, SolveError
 from inverse.criticism.chains import Chains, chains_of_few, ensemble, verdict_on_few
 from inverse.criticism.comparison import quantiles
-from inverse.criticism.finer import NOT_LOOKED, Finer, parameters_moved
+from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.weights import FEWEST, resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
@@ -25,6 +26,7 @@ from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
+from inverse.methods.mesh_correction import corrected_few, of_the_mean
 from inverse.methods.record import (
     ENDS,
     TRUST,
@@ -89,6 +91,7 @@ def invert_by_group(
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
     evaluate: Evaluate | None = None,
+    say: Callable[[str], None] = lambda line: None,
 ) -> xr.Dataset:
     """Invert a data set on the model of one rank group, or by an evaluation of it; collective over the group.
 
@@ -99,9 +102,11 @@ def invert_by_group(
     look
         The stiffness of the interior as a function of the parameters; None if there is none.
     finer
-        The model on a finer mesh; None if it has no mesh.
+        The model on finer meshes; None where it has no mesh.
     evaluate
         Of the model.
+    say
+        Shows the user a line before the search.
 
     Raises
     ------
@@ -109,7 +114,8 @@ def invert_by_group(
         If the model has no answer where the search needs one.
     """
     solve = evaluate or SerialEvaluate(model)
-    return _invert(inputs, solve, data, method, look, errors, finer, lambda point: Nearby.at(model, point, inputs.std))
+    near = partial(Nearby.at, model, spread=inputs.std)
+    return _invert(inputs, solve, data, method, look, errors, finer, near, say)
 
 
 def invert_by_all(
@@ -120,6 +126,7 @@ def invert_by_all(
     look: Look | None,
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
+    say: Callable[[str], None] = lambda line: None,
 ) -> xr.Dataset:
     """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
     return _invert(
@@ -131,6 +138,7 @@ def invert_by_all(
         errors,
         finer,
         lambda point: linearise(inputs, evaluate, point).prediction,
+        say,
     )
 
 
@@ -143,53 +151,51 @@ def _invert(
     errors: NormalErrors | StudentErrors,
     finer: Finer | None,
     start: Callable[[FloatArray], Start | None],
+    say: Callable[[str], None],
 ) -> xr.Dataset:
     counted = Recorder(evaluate)
     posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     d = len(inputs.names)
-    which = slice(None) if data.which is None else list(data.which)
-    with suppress(SolveError):  # otherwise every solve starts from zero
+    with suppress(SolveError):  # or else every solve begins at zero
         posterior = replace(posterior, start=start(inputs.mean))
-    gaussian = laplace(posterior, starts=method.starts, seed=method.seed)
+    before = _before(posterior, finer, say) if finer is not None and method.treatment is not None else None
+    searched = laplace(posterior, starts=method.starts, seed=method.seed)
+    gaussian, mesh = searched, None
+    posterior = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d]))
+    if finer is not None:
+        treatment = method.treatment or "report"
+        posterior, gaussian, mesh = corrected_few(posterior, gaussian, finer, data.spread, treatment)
     best = posterior.physical(gaussian.mode[None])[0]
-    posterior = replace(posterior, start=start(best[:d]))
     found = evidence(posterior, gaussian, method.solves(field=False) or LEAST, seed=method.seed)
     at = posterior.at(gaussian.mode[None], derivatives=True)
     spectrum = spectrum_of(posterior, at)
-    scale = data.sigma * (best[-1] if method.noise is not None else 1.0)
-    raw = (at.outputs[0] - data.values) / scale
+    scale = posterior.scale(at.x)[0]
+    raw = posterior.residuals(at.outputs, at.x)[0]
     residual, root = errors.normal_scores(raw), np.sqrt(errors.information(raw))
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
     chains = _chains(posterior, gaussian, found, method)
     verdict = verdict_on_few(gaussian, found, test, chains)
     if chains is not None and chains.mixed:
+        which = slice(None) if data.which is None else list(data.which)
         points = chains.flat
         weights = np.full(len(points), 1 / len(points))
         draws = _thinned(chains, method.draws)
         outputs = counted(Request(draws[:, :d], start=posterior.start)).outputs[:, which]
+        if posterior.mesh is not None:
+            outputs = outputs + posterior.mesh.at(draws[:, :d])
     else:
         weights, points = found.weights, posterior.physical(found.density.x)
         chosen = resampled(weights, method.draws, method.seed)
         draws, outputs = points[chosen], found.density.outputs[chosen]
     moments = _moments(posterior, gaussian, weights, points, look)
-    std = np.asarray(moments["std"])
-    mesh: Record = {}
-    if finer is not None:
-        gap, why = finer.gap(best[:d], at.everything[0])
-        shift = np.full(len(best), np.nan)
-        if gap is not None:
-            gap = gap[which]
-            A = spectrum.images.T @ spectrum.vectors
-            shift[:d] = parameters_moved(posterior, gaussian, A, root * gap / scale) / std[:d]
-        mesh = of_mesh(gap, why, scale, shift)
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
-        **mesh,
+        **({} if mesh is None else of_mesh(mesh, before, len(best) - d)),
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
-        **_draws(draws, outputs, data, method, errors),
+        **_draws(posterior, draws, outputs),
         **of_chains(chains),
         "mode": best,
         "log_evidence": np.array(found.log_evidence),
@@ -202,9 +208,9 @@ def _invert(
         "why": str(verdict),
         "solves": np.array(counted.solves),
         "zero_likelihood": np.array(sum(one.inadmissible for part in counted.log for one in part.failures)),
-        "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in gaussian.steps]).reshape(-1, 4),
-        "start_mode": posterior.physical(gaussian.modes),
-        "start_log_posterior": gaussian.ends,
+        "step": np.array([[s.start, s.log_posterior, s.decrement, s.damping] for s in searched.steps]).reshape(-1, 4),
+        "start_mode": posterior.physical(searched.modes),
+        "start_log_posterior": searched.ends,
         "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),
     }
     return as_dataset(record)
@@ -282,10 +288,23 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Da
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
 
 
-def _draws(
-    draws: FloatArray, outputs: FloatArray, data: Data, method: Invert, errors: NormalErrors | StudentErrors
-) -> Record:
-    """Draws of equal weight with the likelihood of the data for each."""
-    scale = data.sigma * (draws[:, -1:] if method.noise is not None else 1.0)
-    gaps = (outputs - data.values) / scale
-    return {"draw": draws, "draw_log_likelihood": -errors.minus_log(gaps) - np.log(scale)}
+def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:
+    """Draws of equal weight with what the data say of each."""
+    s = np.ones(len(draws)) if posterior.noise is None else draws[:, -1]
+    scale = s[:, None] * posterior.whitening.sigma
+    gaps = posterior.whitening((outputs - posterior.data) / scale)
+    return {"draw": draws, "draw_log_likelihood": -posterior.errors.minus_log(gaps) - np.log(scale)}
+
+
+def _before(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -> float:
+    """Hold the error of the mesh at the mean of the prior against the noise, before the search; its size."""
+    point = posterior.inputs.mean
+    look, _ = finer.look(point)
+    own = posterior.evaluate(Request(point[None], start=posterior.start))
+    if look is None or own.failures:
+        return np.nan
+    which = slice(None) if posterior.which is None else list(posterior.which)
+    error = (look.outputs - own.outputs[0])[which] / posterior.sigma
+    size = float(np.sqrt((error**2).mean()))
+    say(of_the_mean(size, float(np.abs(error).max())))
+    return size

@@ -5,7 +5,9 @@ The posterior is that of `inverse.fields.field_posterior`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +31,7 @@ from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode, find_mode
 from inverse.fields.noise import infer_noise
 from inverse.methods.invert import Invert
+from inverse.methods.mesh_correction import corrected_field, of_the_mean
 from inverse.methods.record import (
     COLUMNS,
     ENDS,
@@ -65,8 +68,35 @@ class Vertices:
     volumes: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The mode of a posterior and the Gaussian there; its noise where that is inferred, and ln p(y) with it."""
+
+    mode: Mode
+    found: LowRankPosterior
+    converged: bool
+    factor: float = 1.0
+    log_std: float = 0.0
+    log_evidence: float | None = None
+
+
+def _solve(method: Invert, posterior: FieldPosterior, start: FloatArray | None) -> _Solved:
+    if method.noise is None:
+        mode = find_mode(posterior, start)
+        found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
+        return _Solved(mode, found, mode.converged)
+    inferred = infer_noise(posterior, method.noise, start=start, cutoff=method.cutoff, rank=method.rank)
+    size = (inferred.factor, inferred.log_std, inferred.log_evidence)
+    return _Solved(inferred.mode, inferred.found, inferred.converged, *size)
+
+
 def invert_field(
-    posterior: FieldPosterior, data: Data, method: Invert, vertices: Vertices, finer: Finer = NOT_LOOKED
+    posterior: FieldPosterior,
+    data: Data,
+    method: Invert,
+    vertices: Vertices,
+    finer: Finer = NOT_LOOKED,
+    say: Callable[[str], None] = lambda line: None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
 
@@ -75,23 +105,19 @@ def invert_field(
     SolveError
         If the model has no answer at the centre of the prior.
     """
-    settings = {"cutoff": method.cutoff, "rank": method.rank}
-    factor, log_std, log_evidence = 1.0, 0.0, None
-    if method.noise is None:
-        mode = find_mode(posterior)
-        found = LowRankPosterior.at(mode.point, cutoff=method.cutoff, rank=method.rank, seed=method.seed)
-        converged = mode.converged
-    else:
-        inferred = infer_noise(posterior, method.noise, **settings)  # type: ignore[arg-type]
-        mode, found, converged = inferred.mode, inferred.found, inferred.converged
-        factor, log_std, log_evidence = inferred.factor, inferred.log_std, inferred.log_evidence
+    g = vertices.volumes / vertices.volumes.sum()
+    before = _before(posterior, finer, say) if method.treatment is not None else None
+    solve = partial(_solve, method)
+    treatment = method.treatment or "report"
+    solved, moved, mesh = corrected_field(posterior, solve, finer, data.spread, treatment, g)
+    mode, found, converged, factor = solved.mode, solved.found, solved.converged, solved.factor
+    log_evidence = solved.log_evidence
     spectrum = found.spectrum
     errors, root = posterior.errors, mode.point.root
     residual = errors.normal_scores(mode.point.gaps)
     test = examine(residual, spectrum, np.ones_like(residual), data.neighbours())
     samples = method.solves(field=True)
     weighed = weigh_field(mode.point, found, samples, seed=method.seed) if samples else None
-    g = vertices.volumes / vertices.volumes.sum()
     chains = whole = None
     if method.chains is not None:
         # Chains are judged by the mean over the body: mixing at all vertices would need far more draws.
@@ -102,25 +128,20 @@ def invert_field(
     error = np.nan
     if log_evidence is None and weighed is not None and weighed.trusted:
         log_evidence, error = weighed.log_evidence, weighed.error
-    scale = data.sigma * factor
+    scale = mode.point.posterior.whitening.sigma  # with the factor where that is inferred
     cases = int(data.cases.max()) + 1
-    inferred_noise = (factor, log_std) if method.noise is not None else None
+    inferred_noise = (factor, solved.log_std) if method.noise is not None else None
     values, weights = _corrected(verdict, weighed, chains, drawn)
-    predicted = np.asarray(mode.point.solution.outputs)
+    predicted = mode.point.predicted_outputs
     mean, stiffness = (
         _of_mean(found, vertices, inferred_noise, values, weights),
         _of_stiffness(found, vertices, method, values, weights),
     )
-    gap, why = finer.gap(mode.point.values, predicted)
-    moved, shift = np.full(len(found.mean), np.nan), np.full(np.size(mean["mode"]), np.nan)
-    if gap is not None:
-        moved = -(spectrum.images @ (root * gap / scale) / (1 + spectrum.values)) @ found.directions
-        shift[0] = g @ moved / np.asarray(mean["std"])[0]
     record: Record = {
         **of_data(data, predicted, residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(mode.point.whitened, spectrum),
-        **of_mesh(gap, why, scale, shift),
+        **of_mesh(mesh, before, np.size(mean["mode"]) - 1),
         **mean,
         **stiffness,
         "stiffness_mesh_shift": moved / np.maximum(np.asarray(stiffness["stiffness_std"]), 1e-300),
@@ -143,6 +164,18 @@ def invert_field(
         "information": np.array(found.information),
     }
     return as_dataset(record)
+
+
+def _before(posterior: FieldPosterior, finer: Finer, say: Callable[[str], None]) -> float:
+    """Hold the error of the mesh at the centre of the prior against the noise, before the search; its size."""
+    values = posterior.values(np.zeros(posterior.size))
+    look, _ = finer.look(values)
+    if look is None:
+        return np.nan
+    error = posterior.weights * (look.outputs - posterior.model.solve(values).outputs)
+    size = float(np.sqrt((error**2).sum() / posterior.measured.sum()))
+    say(of_the_mean(size, float(np.abs(error).max())))
+    return size
 
 
 def _corrected(

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.chains import Chains
+from inverse.criticism.finer import MeshFound
 from inverse.criticism.predictive import ResidualTest
+from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
@@ -70,6 +72,11 @@ DIMS: dict[str, tuple[str, ...]] = {
     "mesh_why": (),
     "mesh_error": ("datum",),
     "mesh_shift": ("parameter",),
+    "mesh_left": ("parameter",),
+    "mesh_corrected": (),
+    "mesh_settled": (),
+    "mesh_solves": (),
+    "mesh_before": (),
     "step": ("iteration", "column"),
     "place": ("datum", "axis"),
     "datum_axis": ("datum",),
@@ -127,6 +134,10 @@ class Data(Protocol):
     @property
     def described(self) -> dict[str, FloatArray]:
         """Further information on the data, by its name in results."""
+
+    @property
+    def spread(self) -> Places:
+        """Where the data are, for what is uncertain of their mesh error."""
 
     def neighbours(self) -> Neighbours:
         """Return pairs of data that are expected to agree if the model is wrong."""
@@ -231,13 +242,19 @@ def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
     return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
 
 
-def of_mesh(gap: FloatArray | None, why: str, scale: FloatArray, shift: FloatArray) -> Record:
-    """The effect of a finer mesh on the data, over their errors, and on the unknowns."""
+def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
+    """What finer meshes said, of data and unknowns; of some `others` (the noise) they say nothing."""
+    nans = np.full(others, np.nan)
     return {
-        "mesh_checked": np.array(float(gap is not None)),
-        "mesh_why": why,
-        "mesh_error": np.full(len(scale), np.nan) if gap is None else gap / scale,
-        "mesh_shift": shift,
+        "mesh_checked": np.array(float(not found.why)),
+        "mesh_why": found.why,
+        "mesh_error": found.error,
+        "mesh_shift": np.append(found.shift, nans),
+        "mesh_left": np.append(found.left, nans),
+        "mesh_corrected": np.array(float(found.corrected)),
+        "mesh_settled": np.array(float(found.settled)),
+        "mesh_solves": np.array(float(found.solves + (before is not None))),
+        "mesh_before": np.array(np.nan if before is None else before),
     }
 
 

@@ -18,11 +18,13 @@ from pydantic import Field, model_validator
 from forward.model import FloatArray, SolveError
 from forward.settings import Settings
 from inverse.criticism.comparison import Assessment, Candidate, Data, comparison
-from inverse.criticism.finer import Finer, moved
+from inverse.criticism.finer import Finer, MeshFound
+from inverse.data.approximation_error import Places
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.mesh_correction import Treatment, corrected_few
 from uq.evaluation.evaluate import Evaluate
 from uq.inputs.distributions import Distribution
 from uq.surrogates.linearisation import linearise
@@ -155,10 +157,13 @@ class Select(Settings):
             If a model has no answer at any start or any point.
         """
         pairs = [(name, group) for name in candidates for group in data_groups]
-        posteriors, stated = {}, {}
+        posteriors, stated, meshes = {}, {}, {}
         for name, group in pairs:
             one = started(posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group)))
-            posteriors[name, group], stated[name, group] = self._assess(one, (name, group))
+            look = None if finer is None else (finer(name, group), _places(data_groups[group]))
+            posteriors[name, group], stated[name, group], found = self._assess(one, (name, group), look)
+            if found is not None:
+                meshes[name, group] = found
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
             STATED: {pair: (found.evidence.log_evidence, found.evidence.error) for pair, found in stated.items()}
         }
@@ -186,9 +191,6 @@ class Select(Settings):
             if self.held_out
             else {}
         )
-        meshes = {}
-        if finer is not None:
-            meshes = {pair: moved(posteriors[pair], stated[pair].gaussian, finer(*pair)) for pair in pairs}
         return comparison(candidates, data_groups, posteriors, stated, variants, checks, left_out, meshes)
 
     def _without(
@@ -203,12 +205,21 @@ class Select(Settings):
                 found[pair] = self._value(_only(posterior, data_groups[pair[1]], others), pair)
         return found
 
-    def _assess(self, posterior: Posterior, pair: tuple[str, str]) -> tuple[Posterior, Assessment]:
-        """Find mode and evidence; the posterior too, with solves that start from the mode."""
+    @property
+    def treatment(self) -> Treatment | None:
+        """What is done about the error of meshes: there are none."""
+        return None
+
+    def _assess(
+        self, posterior: Posterior, pair: tuple[str, str], look: tuple[Finer, Places] | None = None
+    ) -> tuple[Posterior, Assessment, MeshFound | None]:
+        """Find mode and evidence; the posterior too, with solves that start from the mode, corrected for its mesh."""
         try:
-            gaussian = laplace(posterior, starts=self.starts, seed=self.seed)
+            gaussian, found = laplace(posterior, starts=self.starts, seed=self.seed), None
             near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
-            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed))
+            if look is not None:
+                near, gaussian, found = corrected_few(near, gaussian, *look, self.treatment or "report")
+            return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed)), found
         except SolveError as error:
             message = f"candidate '{pair[0]}': {error.reason}"
             raise SolveError(message, error.history) from None
@@ -223,19 +234,40 @@ class SelectSpecimens(Select):
 
     Parameters
     ----------
+    mesh_error
+        What the error of each candidate's mesh does to the data, to the evidence and to the unknowns, by solves on
+        finer meshes with thinner cells at the faces that are held: "correct" the candidate by it where it exceeds a
+        fifth of the noise or of an unknown's deviation; "report" it only; false: not at all, and no evidence is said to
+        be trusted.
     mesh_check
-        Solve once more for each candidate, at its mode on a finer mesh with thinner cells at the fixed faces: the
-        effect of the error of the mesh on the data, the evidence and the unknowns. Without it no evidence counts as
-        trusted.
+        An older name: false is mesh_error = false.
     """
 
+    mesh_error: Literal["correct", "report", False] = "correct"
     mesh_check: bool = True
+
+    @property
+    def treatment(self) -> Treatment | None:
+        """What is done about the error of meshes; None where it is not asked for."""
+        return (self.mesh_error or None) if self.mesh_check else None
+
+    @property
+    def unchecked(self) -> str:
+        """Why meshes are not looked at, where they are not."""
+        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
 
 def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate) -> Posterior:
     """Return the posterior of a candidate."""
     sigma = noise.sigma(data.values, data.sigma)
     return Posterior(candidate.inputs, evaluate, data.values, sigma, noise.factor, tuple(range(data.values.size)))
+
+
+def _places(data: Data) -> Places:
+    """Where the data are that were measured, by their kind."""
+    _, places, kinds = data.sorted
+    order = np.argsort(data.sorted[0])
+    return Places(kinds[order], places[order] if places.shape[1] == 3 else None)
 
 
 def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
@@ -266,7 +298,9 @@ def _testnames(data_groups: Mapping[str, Data]) -> tuple[str, ...]:
 def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior:
     """The same with the data of some tests only."""
     which = np.array([i for i in range(data.values.size) if data.tests[i] in tests])
-    return replace(posterior, data=posterior.data[which], sigma=posterior.sigma[which], which=tuple(which.tolist()))
+    mesh = None if posterior.mesh is None else posterior.mesh.of(which)
+    values, sigma = posterior.data[which], posterior.sigma[which]
+    return replace(posterior, data=values, sigma=sigma, which=tuple(which.tolist()), mesh=mesh)
 
 
 def _rescaled(found: Evidence, posterior: Posterior, width: float) -> tuple[float, float]:

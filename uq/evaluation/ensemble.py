@@ -38,6 +38,8 @@ class Ensemble:
         This rank's group: the communicator of its model.
     rank_groups
         Number of groups.
+    say
+        Shows the user a line while something runs; set on the rank that has one.
     """
 
     def __init__(self, world: Any, group: Any, rank_groups: int, index: int) -> None:
@@ -45,6 +47,7 @@ class Ensemble:
         self.group = group
         self.rank_groups = rank_groups
         self.index = index
+        self.say: Callable[[str], None] = lambda line: None
         self._turns: Turns | None = None
 
     def count(self, done: int, failed: int) -> None:

@@ -120,6 +120,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
     checkpoint = None
+    ensemble.say = say
     try:
         study = study.prepared(ensemble, directory, say)
         progress = Progress(study.solves, quiet=quiet, silent=silent or world.rank > 0, failures=not study.explains)

@@ -88,4 +88,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
     nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
     why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]
+    if bool(one["mesh_corrected"]):
+        left = dict(zip(names, one["mesh_left"].to_numpy().tolist(), strict=True))
+        return found + criticism.mesh_corrected(error, shifts, left, nodes, settled=bool(one["mesh_settled"]))
     return found + criticism.mesh_too_coarse(bool(one["mesh_checked"]), why, error, shifts, nodes)

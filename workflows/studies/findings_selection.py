@@ -159,7 +159,11 @@ def doubts_of_selection(
         if "mesh_checked" in dataset:
             shifts = dict(zip(names, of["mesh_shift"].sel(parameter=names).to_numpy().tolist(), strict=True))
             error, why = rows["mesh_error"].sel(model=best).to_numpy(), str(of["mesh_why"].item())
-            found += criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
+            none = np.zeros(0)
+            if bool(of["mesh_corrected"]):
+                found += criticism.mesh_corrected(error, shifts, {}, none, settled=True)
+            else:
+                found += criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, none)
         where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
         said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
     return said + _doubts_of_meshes(dataset, best)
@@ -172,26 +176,29 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     if "mesh_checked" not in dataset:
         return []
     weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
-    values, added = weights.to_series().to_dict(), dataset["mesh_log_evidence"].sum("group", skipna=False)
+    left = dataset["mesh_log_evidence"].where(~dataset["mesh_corrected"], 0.0)  # of what is corrected nothing
+    values, added = weights.to_series().to_dict(), left.sum("group", skipna=False)
     said = [
         Finding("warning", f"{model}: not checked for the mesh: {one['mesh_why'].item()}.")
         for model in map(str, dataset.model.values)
         for one in [dataset.isel(group=0).sel(model=model)]
         if model != best and not bool(one["mesh_checked"])
     ]
-    shifts = abs(dataset["mesh_shift"]).max(("group", "parameter")).to_series().to_dict()
+    moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
+    shifts = moved.max(("group", "parameter")).to_series().to_dict()
     doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
-    """Trust no evidence whose mesh was not checked, or whose ln Z a finer mesh moves or may move."""
+    """Trust no evidence whose mesh was not looked at, or whose ln Z it moves or may move and is not corrected."""
     from inverse.criticism.doubts import certain
 
     if "mesh_checked" not in dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
-    return dataset.assign(trusted=dataset["trusted"] & certain(dataset["mesh_log_evidence"], shift))
+    known = dataset["mesh_corrected"] | certain(dataset["mesh_log_evidence"], shift)
+    return dataset.assign(trusted=dataset["trusted"] & known)
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:

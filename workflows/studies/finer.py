@@ -1,4 +1,4 @@
-"""Specimens on finer meshes, as models that groups of ranks can solve."""
+"""Models on finer meshes, as inversions and selections look at them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from forward.model import FunctionModel, SolveError
-from inverse.criticism.finer import Finer
+from forward.model import SolveError
+from inverse.criticism.finer import Finer, Solved
 from uq.evaluation.evaluate import Request
 
 if TYPE_CHECKING:
-    from forward.fem.finer import FinerMesh
+    from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray, ForwardModel
     from uq.evaluation.evaluate import Evaluate
@@ -20,45 +20,44 @@ if TYPE_CHECKING:
 FINER = "finer mesh"  # in names of models
 
 
-def finer_mesh(model: SpecimenModel) -> tuple[FinerMesh | None, str]:
-    """Return a specimen on a finer mesh, or why there is none."""
-    from forward.fem.finer import FinerMesh
+def finer_meshes(model: SpecimenModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+    """Return a specimen on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+    from forward.fem.finer import extrapolated
 
     try:
-        return FinerMesh(model), ""
+        return extrapolated(model, start), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
         return None, str(error)
 
 
-def on_finer_mesh(observed: ForwardModel, outputs: Callable[[FloatArray], FloatArray]) -> ForwardModel:
-    """Return a model of the observations on a finer mesh; if it cannot be made, its solves fail."""
-
-    def solve(point: FloatArray) -> FloatArray:
-        try:
-            return outputs(point)
-        except ValueError as error:  # as on all ranks of the group
-            raise SolveError(str(error)) from None
-
-    return FunctionModel(solve, observed.parameters, observed.outputs)
-
-
-def once_on_finer_mesh(make: Callable[[], ForwardModel]) -> ForwardModel:
-    """Return a model on a finer mesh of a specimen, made anew for each solve: there is one for each candidate."""
-    from forward.fem.finer import FinerMesh
+def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
+    """Return the model on finer meshes of a specimen."""
+    from forward.fem.finer import extrapolated
     from forward.fem.specimen import SpecimenModel
 
     specimen = make()
     assert isinstance(specimen, SpecimenModel)
-    return on_finer_mesh(specimen, lambda point: FinerMesh(specimen).outputs(specimen, point))
+    return extrapolated(specimen, start).observing(specimen)
+
+
+def solved_on(model: ForwardModel) -> Finer:
+    """Let this group of ranks solve on finer meshes."""
+
+    def solve(point: FloatArray, tangents: bool) -> Solved:
+        found = model.solve(point)
+        slopes = found.tangent(np.eye(len(point))).T if tangents else None
+        return np.asarray(found.outputs), slopes
+
+    return Finer(solve)
 
 
 def solved_by(evaluate: Evaluate) -> Finer:
-    """Let all groups of ranks solve on a finer mesh."""
+    """Let all groups of ranks solve on finer meshes."""
 
-    def outputs(point: FloatArray) -> FloatArray:
-        found = evaluate(Request(point[None]))
+    def solve(point: FloatArray, tangents: bool) -> Solved:
+        found = evaluate(Request(point[None], tangents=tangents))
         for failure in found.failures:
             raise SolveError(failure.reason)
-        return np.asarray(found.outputs[0])
+        return np.asarray(found.outputs[0]), None if found.tangents is None else found.tangents[0]
 
-    return Finer(outputs)
+    return Finer(solve)

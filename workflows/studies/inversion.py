@@ -32,6 +32,7 @@ from workflows.config.priors import (
 )
 from workflows.config.report import Report
 from workflows.studies.measured import DataFiles, DataSet, read_measurement
+from workflows.studies.predictions import meshes_of
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -311,6 +312,14 @@ class Inversion(InversionStudy):
     def together(self) -> bool:
         """Whether all groups of ranks work on one data set, point by point."""
         return super().together and not self.model.fields
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The specimen, and the same on the finer meshes that it is looked at on."""
+        try:
+            return self.model, *(meshes_of(self.specimen) if self.method.treatment is not None else ())
+        except ValueError:  # there are none, which is said elsewhere
+            return (self.model,)
 
     def measured(self, number: int) -> Components:
         """Return a data set that can be used."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 import numpy as np
 
 from forward.external.derivatives import contradicted
+from forward.extrapolated import HALVED, Extrapolated
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.settings import one_line
 from inverse.criticism.finer import NOT_LOOKED, Finer
@@ -18,11 +19,10 @@ from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
-from uq.evaluation.turns import Progress
 from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
-from workflows.studies.finer import FINER, finer_mesh, on_finer_mesh, solved_by
+from workflows.studies.finer import FINER, finer_meshes, solved_by, solved_on
 from workflows.studies.inversion import Inversion, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MethodJob, TasksJob
@@ -31,14 +31,13 @@ from workflows.studies.output_inversion import OutputInversion, derivable
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.finer import FinerMesh
+    from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.kept import KeptEvaluate, KeptModel
 
-UNCHECKED = "method.mesh_check = false"
-Outputs = Callable[[FloatArray], FloatArray]  # parameters (d,) → outputs (m,)
+There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
 def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> MethodJob | TasksJob:
@@ -49,7 +48,7 @@ def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: 
         assert isinstance(study, Inversion)
         made = _Specimen.of(study, ensemble)
     derivable(made.model, study.model.kind)
-    return _one(study, made) if study.together else _many(study, made, ensemble, directory, checkpoint)
+    return _one(study, made, ensemble.say) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
 
 class _Made(Protocol):
@@ -81,8 +80,8 @@ class _Made(Protocol):
             If there is none.
         """
 
-    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
-        """Return outputs on a finer mesh, or why they are unknown; None if the model has no mesh."""
+    def finer(self, observed: ForwardModel) -> There:
+        """Return the model on finer meshes (`forward.extrapolated`)."""
 
 
 @dataclass(frozen=True)
@@ -105,28 +104,28 @@ class _Outputs:
         """Return the model: the data tell which of its outputs were measured."""
         return self.model
 
-    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str] | None:
-        """Return outputs of the same model on the mesh whose cells are halved."""
+    def finer(self, observed: ForwardModel) -> There:
+        """Return the same model on the mesh whose cells are halved, and on its own."""
         if not self.study.spec.meshed:
             return None
-        if not self.study.method.mesh_check:
-            return None, UNCHECKED
+        if self.study.method.treatment is None:
+            return None, self.study.method.unchecked
         try:
             self.study.spec.refined(1)
         except ValueError as error:  # a mesh that is not divided, or would be too large
             return None, one_line(str(error))
-        return lambda point: np.asarray(self.fine().solve(point).outputs), ""
+        return Extrapolated(self.fine(), self.model, HALVED, self.study.inputs.mean), ""
 
 
 @dataclass(frozen=True)
 class _Specimen:
-    """A specimen; making it is collective. `mesh` is the same on a finer mesh, or `why` there is none."""
+    """A specimen; making it is collective. `meshes` are finer ones, or `why` there are none."""
 
     study: Inversion
     model: SpecimenModel
     vertices: Vertices
     look: Look
-    mesh: FinerMesh | None
+    meshes: FinerMeshes | None
     why: str
 
     @classmethod
@@ -138,8 +137,10 @@ class _Specimen:
         def look(points: FloatArray) -> FloatArray:
             return study.stiffness(vertices[0], points) + model.log_fields(points)
 
-        mesh, why = finer_mesh(model) if study.method.mesh_check else (None, UNCHECKED)
-        return cls(study, model, vertices, look, mesh, why)
+        start = np.zeros(len(names)) if study.field else study.inputs.mean
+        method = study.method
+        meshes, why = finer_meshes(model, start) if method.treatment is not None else (None, method.unchecked)
+        return cls(study, model, vertices, look, meshes, why)
 
     def observing(self, number: int) -> SpecimenModel:
         """Return the model of the displacements of a data set; errors as for every model."""
@@ -149,9 +150,9 @@ class _Specimen:
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
 
-    def finer(self, observed: ForwardModel) -> tuple[Outputs | None, str]:
-        """Return the observations on a finer mesh."""
-        return None if self.mesh is None else partial(self.mesh.outputs, cast("SpecimenModel", observed)), self.why
+    def finer(self, observed: ForwardModel) -> There:
+        """Return the model of what is observed on finer meshes."""
+        return None if self.meshes is None else self.meshes.observing(cast("SpecimenModel", observed)), self.why
 
 
 def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset:
@@ -175,15 +176,15 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
             raise SolveError(study.data.sets[number].refused)
         observed = made.observing(number)
         there = made.finer(observed)
-        finer = None if there is None else Finer(*there)
+        finer = _solved(there, solved_on)
         if invert_field is not None:
             states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
             solving.append(states)
-            return invert_field(number, states, finer or NOT_LOOKED, ensemble.count)
+            return invert_field(number, states, finer or NOT_LOOKED, ensemble)
         kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
         solving.append(kept)
         data = study.measured(number)
-        return invert_by_group(study.inputs, observed, data, method, made.look, errors, finer, kept)
+        return invert_by_group(study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say)
 
     def forget() -> None:
         """Remove the solves of a data set, whose results are stored."""
@@ -207,8 +208,8 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     )
 
 
-def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, ForwardModel, Finer, Progress], xr.Dataset]:
-    """Return the function that inverts a data set, by its number, for a field of a specimen."""
+def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, ForwardModel, Finer, Ensemble], xr.Dataset]:
+    """Return what inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
 
@@ -216,29 +217,37 @@ def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, Forwa
     model, prior = made.model, study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
 
-    def invert(number: int, states: ForwardModel, finer: Finer, progress: Progress) -> xr.Dataset:
-        data = study.measured(number)
-        posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=progress, errors=study.data.errors)
-        return invert_field(posterior, data, study.method, Vertices(offset, prior.matern.mass), finer)
+    def invert(number: int, states: ForwardModel, finer: Finer, ensemble: Ensemble) -> xr.Dataset:
+        data, errors = study.measured(number), study.data.errors
+        posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
+        return invert_field(posterior, data, study.method, Vertices(offset, prior.matern.mass), finer, ensemble.say)
 
     return invert
 
 
-def _one(study: InversionStudy, made: _Made) -> MethodJob:
+def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:
+    """Return what finer meshes are solved by; None where there is no mesh."""
+    if there is None:
+        return None
+    model, why = there
+    return Finer(None, why) if model is None else solved(model)
+
+
+def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     observed, data = made.observing(0), study.measured(0)
     there = made.finer(observed)
-    outputs, why = (None, "") if there is None else there
     recorders: dict[str, Recorder] = {}
     others: dict[str, Callable[[], ForwardModel]] = {}
-    if outputs is not None:
-        others = {FINER: partial(on_finer_mesh, observed, outputs)}
+    model = None if there is None else there[0]
+    if model is not None:
+        others = {FINER: lambda: model}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        finer = solved_by(recorders["/"].on(FINER)) if others else None if there is None else Finer(None, why)
+        finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
         errors = study.data.errors
-        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer)
+        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(

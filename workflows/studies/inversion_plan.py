@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from workflows.config.priors import ranges
-from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
+from workflows.studies.predictions import LOOKS, NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
     from workflows.studies.inversion import Inversion
@@ -34,7 +34,7 @@ def plan(study: Inversion) -> list[str]:
         unknown = f"{len(study.names)}: {', '.join(study.names)}"
         seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
-    once, checked = mesh_check(spec) if study.method.mesh_check else (0.0, NOT_ASKED)
+    once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
     seconds += once
     return [
         f"method      {study.method.kind}",
@@ -75,9 +75,9 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
     else:
         d = len(study.inputs.names)
         seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4)
-        if method.mesh_check:
-            seconds += 8**2 * cost.textbook
-            lines.append(f"mesh check  one solve of about {8 * spec.unknowns:,} unknowns")
+        if method.treatment is not None:
+            seconds += LOOKS * 8**2 * cost.textbook
+            lines.append(f"mesh check  about {LOOKS} solves of about {8 * spec.unknowns:,} unknowns")
         else:
             lines.append(f"mesh check  {NOT_ASKED}")
         lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")

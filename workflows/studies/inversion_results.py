@@ -184,14 +184,23 @@ def _one(found: xr.Dataset) -> dict[str, Any]:
     if not bool(found["ok"]):
         return {"failed": str(found["why"].item())}
     numbers = ("log_evidence", "log_evidence_error", "determined", "residual_probability")
+    keys = ("mode", "std", "lower", "upper", *(("mesh_shift", "mesh_left") if "mesh_checked" in found else ()))
     return {
         "posterior": {
-            str(name): {key: _number(found[key].sel(parameter=name)) for key in ("mode", "std", "lower", "upper")}
-            for name in found.parameter.values
+            str(name): {key: _number(found[key].sel(parameter=name)) for key in keys} for name in found.parameter.values
         },
         **{key: _number(found[key]) for key in numbers},
+        **({"mesh": _mesh(found)} if "mesh_checked" in found else {}),
         "verdict": str(found["why"].item()),
     }
+
+
+def _mesh(found: xr.Dataset) -> dict[str, Any]:
+    """What finer meshes said: the error over the noise (root mean square), whether it is corrected, and solves."""
+    error = found["mesh_error"].to_numpy()
+    size = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+    corrected, solves = bool(found["mesh_corrected"] == 1), found["mesh_solves"]
+    return {"error": _number(size), "corrected": corrected, "solves": int(solves) if np.isfinite(solves) else 0}
 
 
 def _number(value: Any) -> float | None:
@@ -228,6 +237,9 @@ def _head(names: Sequence[str], cases: Sequence[str]) -> list[str]:
         "residual_probability",
         *of_cases,
         "why",
+        "mesh_error",
+        "mesh_corrected",
+        *(f"{name} mesh_shift" for name in names),
     ]
 
 
@@ -246,7 +258,17 @@ def _row(one: xr.Dataset) -> list[Any]:
         int(one["points_moved"]) if "points_moved" in one else 0,
         *shown,
         str(one["why"].item()),
+        *_mesh_cells(one),
     ]
+
+
+def _mesh_cells(one: xr.Dataset) -> list[str]:
+    """Cells of what finer meshes said; empty where they said nothing."""
+    if "mesh_checked" not in one or one["mesh_checked"] != 1:
+        return [""] * (2 + one.sizes["parameter"])
+    shifts = [f"{value:.4g}" if np.isfinite(value) else "" for value in one["mesh_shift"].to_numpy()]
+    error = _mesh(one)["error"]
+    return ["" if error is None else f"{error:.4g}", "yes" if one["mesh_corrected"] == 1 else "no", *shifts]
 
 
 class Rows:
@@ -272,8 +294,9 @@ class Rows:
         sets, measurement = self._study.data.sets[number], self._study.measurements[number]
         if outcome.dataset is None:
             moved = int((getattr(measurement, "moved", np.zeros(0)) > 0).sum())
-            empty = [""] * (len(self._head) - 5)
-            self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason]
+            after = len(self._head) - self._head.index("why") - 1
+            empty = [""] * (len(self._head) - 5 - after)
+            self._rows[number] = [sets.name, "no", 0, moved, *empty, outcome.reason, *[""] * after]
         else:
             data = self._study.data.model_copy(update={"sets": (sets,)})
             alone = self._study.model_copy(update={"data": data, "measurements": (measurement,)})

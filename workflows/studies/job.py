@@ -85,8 +85,16 @@ class MethodJob:
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
-        """What was evaluated, by the name under which it is stored."""
-        return {name: merge(recorder.log) for name, recorder in self.recorders.items()}
+        """What was evaluated, by the name that it is kept under."""
+        found: dict[str, Evaluations] = {}
+        for name, recorder in self.recorders.items():
+            parts: dict[str, list[Evaluations]] = {}
+            for one, model in zip(recorder.log, recorder.models, strict=True):
+                # Models on several meshes have other outputs, and so a name of their own.
+                alike = one.outputs.shape[1] == recorder.log[0].outputs.shape[1]
+                parts.setdefault(name if alike else f"{name.rstrip('/')}/{model.rsplit('/', 1)[-1]}", []).append(one)
+            found |= {label: merge(part) for label, part in parts.items()}
+        return found
 
     @property
     def outcomes(self) -> Sequence[Outcome]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
+from forward.extrapolated import HALVED, Extrapolated
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.settings import Settings, one_line
@@ -144,8 +145,8 @@ class OutputSelection(ModelSelection):
         return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
 
     def _unchecked(self, spec: ModelSpec) -> str:
-        if not self.method.mesh_check:
-            return "method.mesh_check = false"
+        if self.method.treatment is None:
+            return self.method.unchecked
         try:
             spec.refined(1)
         except ValueError as error:  # without a mesh, with one that is not divided, or that would be too large
@@ -189,8 +190,9 @@ class OutputSelection(ModelSelection):
         return self._measured(name, self.of_candidates[name], comm)
 
     def build_finer(self, name: str, make: Callable[[], ForwardModel], comm: Any = None) -> ForwardModel:
-        """Make the same on a mesh with halved cells; collective."""
-        return self._measured(name, self.of_candidates[name].refined(1), comm)
+        """Make the same on a mesh with halved cells, and on its own; collective."""
+        fine = self._measured(name, self.of_candidates[name].refined(1), comm)
+        return Extrapolated(fine, make(), HALVED, self.models[name].inputs.mean)
 
     def _measured(self, name: str, spec: ModelSpec, comm: Any) -> ForwardModel:
         model = spec.build(comm, tuple(self.candidates[name].parameters))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.finer import finer
+from forward.fem.finer import finer, graded
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
@@ -29,18 +29,37 @@ def formulation(decision: Decision) -> str:
     return f"form        {'mixed' if decision.mixed else 'displacement'}: {decision.why}"
 
 
+LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and at the corrected one
+
+
+def meshes_of(spec: Specimen) -> tuple[Specimen, ...]:
+    """Return a specimen on the finer meshes that it is looked at on, where these are known before a run.
+
+    Raises
+    ------
+    ValueError
+        If there are none, or they would be too large.
+    """
+    if isinstance(spec.body, MeshFile):
+        return ()
+    beside = graded(spec)
+    return (finer(spec),) if beside is None else (finer(spec), beside)
+
+
 def mesh_check(spec: Specimen) -> tuple[float, str]:
-    """Predict the processor time (s) of a solve on a finer mesh, and say what is solved."""
+    """Predict the processor time (s) of solves on finer meshes, and say what is solved."""
     try:
         if isinstance(spec.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
             unknowns, once = 8 * spec.unknowns, 8**2 * sum(times_of(spec.loaded(case)).textbook for case in spec.cases)
         else:
-            fine = finer(spec)
-            unknowns, once = fine.unknowns, sum(times_of(fine.loaded(case)).textbook for case in fine.cases)
+            fine = meshes_of(spec)
+            unknowns = fine[0].unknowns
+            once = sum(times_of(one.loaded(case)).textbook for one in fine for case in one.cases)
     except ValueError as error:
         return 0.0, f"not possible: {error}; no result will be called trusted"
     longest = duration(HOPELESS * once)
-    return once, f"one solve of {unknowns:,} displacements, about {duration(once)}; up to {longest} if it has no answer"
+    each = f"each about {duration(once)}; up to {longest} if it has no answer"
+    return LOOKS * once, f"about {LOOKS} solves of {unknowns:,} displacements on finer meshes, {each}"
 
 
 def duration(seconds: float) -> str:

@@ -182,9 +182,9 @@ class Comparison(StudyKind):
         comm
             As of `build`.
         """
-        from workflows.studies.finer import once_on_finer_mesh
+        from workflows.studies.finer import once_on_finer_meshes
 
-        return once_on_finer_mesh(make)
+        return once_on_finer_meshes(make, self.models[name].inputs.mean)
 
     @property
     def group_names(self) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ def plan(study: Comparison) -> list[str]:
     evidences = study.evidences
     seconds = study.seconds_of_solves + SECONDS_PER_SURROGATE * evidences
     meshes = study.mesh_checks
-    if not getattr(method, "mesh_check", True):
+    if study.unchecked and method.treatment is None:
         meshes = [(0.0, NOT_ASKED)]
     seconds += sum(once for once, _ in meshes)
     check = " and nested sampling, which takes minutes" if method.check else ""

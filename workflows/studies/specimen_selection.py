@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import AXES, Vector, tolerance
-from forward.bodies.mesh_file import MeshFile
 from forward.fem.finer import finer
 from forward.scalars import Mistake
 from forward.settings import Settings
@@ -23,7 +22,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE
 from workflows.studies.model_selection import ModelSelection, Positive, changed
-from workflows.studies.predictions import mesh_check
+from workflows.studies.predictions import mesh_check, meshes_of
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -161,10 +160,9 @@ class SpecimenSelection(ModelSelection):
 
     @property
     def specs(self) -> tuple[Specimen, ...]:
-        """The specimens of all candidates, and the largest of the finer meshes that they are checked on."""
+        """The specimens of all candidates, and the finer meshes that they are looked at on."""
         checked = [specimen for name, specimen in self.of_candidates.items() if not self.unchecked[name]]
-        fine = [finer(one) for one in checked if not isinstance(one.body, MeshFile)]
-        return *self.of_candidates.values(), *sorted(fine, key=lambda one: one.unknowns)[-1:]
+        return *self.of_candidates.values(), *(fine for one in checked for fine in meshes_of(one))
 
     @cached_property
     def unchecked(self) -> dict[str, str]:
@@ -172,8 +170,8 @@ class SpecimenSelection(ModelSelection):
         return {name: self._unchecked(specimen) for name, specimen in self.of_candidates.items()}
 
     def _unchecked(self, specimen: Specimen) -> str:
-        if not self.method.mesh_check:
-            return "method.mesh_check = false"
+        if self.method.treatment is None:
+            return self.method.unchecked
         try:
             finer(specimen)
         except ValueError as error:  # a mesh that is not divided, or would be too large

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
 from forward.bodies.mesh_file import MeshFile, contents, divided
-from forward.fem.finer import FinerMesh, finer
+from forward.fem.finer import OtherMesh, extrapolated, finer, graded, share
 from forward.model import ModelError
 from forward.specimen import Specimen
 from tests.meshes import box, numbered
@@ -136,6 +136,14 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     assert spec.body.cells == (3, 3, 3)
     beside = dict.fromkeys(("x-min", "x-max", "y-min", "y-max"), 4.0)
     assert {face: ratio for face, ratio in spec.body.grading.items() if ratio > 1} == {"z-min": 8.0} | beside
+    same = graded(Specimen.model_validate(CUBE))
+    assert same.body.cells == (2, 2, 2)
+    assert same.body.grading == spec.body.grading
+    assert share(Specimen.model_validate(CUBE)) == pytest.approx(1 / (1.5**2 - 1))
+    # A body that is graded more stays so, and one that is graded so is its own.
+    steep = CUBE["body"] | {"grading": {"z-min": 20.0}}
+    assert finer(Specimen.model_validate(CUBE | {"body": steep})).body.grading["z-min"] == 20.0
+    assert graded(same) is None
     fields = [{**FIELD, "basis": "modes", "modes": 3}, {**FIELD, "of": "density", "basis": "modes", "modes": 3}]
     heavy = {"kind": "gravity", "direction": (0, 0, -1), "density": 1000}
     cases = [{**CUBE["cases"][0], "loads": [*CUBE["cases"][0]["loads"], heavy]}]
@@ -148,7 +156,7 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
     """And the same as a specimen that has this mesh from the start."""
     model = Specimen.model_validate(CUBE).build(MPI.COMM_SELF, ("material.mu",))
     point = np.array([1.1e4])
-    here, there = model.solve(point).outputs, FinerMesh(model).outputs(model, point)
+    here, there = model.solve(point).outputs, OtherMesh(model, finer(model.spec)).solve(point).outputs
     spec = finer(model.spec)
     plain = spec.build(MPI.COMM_SELF, ("material.mu",)).observing(model.places, model.axes, model.cases)
     np.testing.assert_allclose(there, plain.solve(point).outputs, rtol=1e-12)
@@ -157,6 +165,17 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
     truth = best.observing(model.places, model.axes, model.cases).solve(point).outputs
     seen = (there - here) @ (truth - here) / ((truth - here) @ (truth - here))
     assert 0.4 < seen < 1
+    # What is extrapolated from it is nearer still; so are its derivatives, from a start elsewhere.
+    limit = extrapolated(model, np.array([1e4])).observing(model).solve(point)
+    tends, between = np.split(limit.outputs, 2)
+    assert np.linalg.norm(truth - tends) < 0.5 * np.linalg.norm(truth - there)
+    assert np.linalg.norm(between) > np.linalg.norm(truth - there)
+    slopes = best.observing(model.places, model.axes, model.cases).solve(point).tangent(np.ones(1))
+    gaps = [
+        np.linalg.norm(slopes - one)
+        for one in (limit.tangent(np.ones(1))[: len(here)], model.solve(point).tangent(np.ones(1)))
+    ]
+    assert gaps[0] < 0.3 * gaps[1]
 
 
 @pytest.mark.fem
@@ -169,13 +188,16 @@ def test_fields_are_those_of_the_mesh_itself(basis):
     model = spec.build(MPI.COMM_SELF, names)
     rest = np.zeros(2) if basis == "modes" else model.vertices.coordinates @ [0.3, -0.2, 0.5]
     log = model.log_fields(np.array([[*rest, 1e4]]))[0]
-    mesh = FinerMesh(model)
+    mesh = OtherMesh(model, finer(spec))
     around, weights = mesh._interpolation
     fine = (weights * log[around]).sum(axis=1)
     if basis == "nodes":
-        places = mesh._model.vertices.coordinates
+        places = mesh._mesh.vertices.coordinates
         np.testing.assert_allclose(fine - fine[0], (places - places[0]) @ [0.3, -0.2, 0.5], atol=1e-12)
-    there = mesh.outputs(model, np.array([*rest, 1e4]))
-    np.testing.assert_allclose(
-        there, model.solve(np.array([*rest, 1e4])).outputs, rtol=0.2, atol=0.05 * np.abs(there).max()
-    )
+    point = np.array([*rest, 1e4])
+    there, here = mesh.solve(point), model.solve(point)
+    np.testing.assert_allclose(there.outputs, here.outputs, rtol=0.2, atol=0.05 * np.abs(there.outputs).max())
+    along = np.array([0.3, -0.5, 100.0]) if basis == "modes" else np.append(rest, 100.0)
+    step = 1e-3
+    there, before = (mesh.solve(point + sign * step * along).outputs for sign in (1, -1))
+    np.testing.assert_allclose(mesh.solve(point).tangent(along), (there - before) / (2 * step), rtol=1e-4, atol=1e-9)

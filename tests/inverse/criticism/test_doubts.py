@@ -6,6 +6,7 @@ import pytest
 from inverse.criticism.doubts import (
     at_an_end,
     far_from_prior,
+    mesh_corrected,
     mesh_too_coarse,
     noise_far,
     scores,
@@ -126,3 +127,17 @@ def test_the_mesh_is_doubted_by_what_it_does_to_the_unknowns():
     (doubt,) = mesh_too_coarse(False, "method.mesh_check = false", np.full(2, np.nan), {"x": np.nan}, none)
     assert doubt.text == "not checked for the mesh: method.mesh_check = false"
     assert doubt.severity == "warning"
+
+
+def test_a_corrected_mesh_is_a_note_unless_it_decides():
+    error, shifts, none = np.array([0.4, -1.2]), {"x": 3.1, "y": -0.2, "noise": np.nan}, np.zeros(0)
+    (note,) = mesh_corrected(error, shifts, {"x": 0.3, "noise": np.nan}, none, settled=True)
+    assert note.severity == "note"
+    assert "was corrected" in note.text
+    assert "x +3.1, y -0.2" in note.text
+    assert "up to 0.3 of these deviations" in note.text
+    for changed in ({"settled": False}, {"left": {"x": 0.9}}, {"shifts": {"x": -25.0}}, {"nodes": np.full(3, 30.0)}):
+        given = {"shifts": shifts, "left": {"x": 0.3}, "nodes": none, "settled": True} | changed
+        (doubt,) = mesh_corrected(error, **given)
+        assert doubt.severity == "warning"
+        assert "take a finer one" in doubt.text

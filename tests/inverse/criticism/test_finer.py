@@ -7,9 +7,11 @@ from scipy.stats import multivariate_normal
 
 from forward.model import FunctionModel, SolveError
 from inverse.criticism.doubts import certain, meshes_too_coarse
-from inverse.criticism.finer import Finer, moved
+from inverse.criticism.finer import Finer
+from inverse.data.approximation_error import Places
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.mesh_correction import corrected_few
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Normal
 from uq.inputs.random_parameters import Inputs
@@ -30,8 +32,13 @@ def posterior(noise=None):
     return Posterior(INPUTS, SerialEvaluate(model), DATA, SIGMA, noise)
 
 
-def outputs(point):
-    return B @ point + OFFSET + GAP
+def solve(point, tangents):
+    """On finer meshes, between which there is nothing."""
+    return np.concatenate([B @ point + OFFSET + GAP, np.zeros(7)]), np.concatenate([B, np.zeros((7, 2))])
+
+
+def reported(given, gaussian, finer):
+    return corrected_few(given, gaussian, finer, Places(np.zeros(7, dtype=int)), "report")[2]
 
 
 def exact(gap, scale=1.0):
@@ -42,11 +49,15 @@ def exact(gap, scale=1.0):
 def test_known_errors():
     """The exact change of ln Z and of the mode."""
     given = posterior()
-    found = moved(given, laplace(given, starts=1), Finer(outputs))
+    gaussian = laplace(given, starts=1)
+    found = reported(given, gaussian, Finer(solve))
     assert found.log_evidence == pytest.approx(exact(GAP) - exact(0.0), rel=1e-9)
     assert abs(found.log_evidence) > 0.5
     precision = np.linalg.inv(PRIOR) + B.T @ (B / SIGMA[:, None] ** 2)
-    np.testing.assert_allclose(found.parameters, -np.linalg.solve(precision, B.T @ (GAP / SIGMA**2)), rtol=1e-9)
+    deviations = np.sqrt(np.diag(np.linalg.inv(precision)))
+    moves = -np.linalg.solve(precision, B.T @ (GAP / SIGMA**2)) / deviations
+    np.testing.assert_allclose(found.shift, moves, rtol=1e-7)
+    assert not found.corrected
     np.testing.assert_allclose(found.error, GAP / SIGMA, rtol=1e-12)
 
 
@@ -55,7 +66,7 @@ def test_errors_of_unknown_size():
     noise = LogNormal(mean=1.0, std=0.8)
     given = posterior(noise)
     gaussian = laplace(given, starts=1)
-    found = moved(given, gaussian, Finer(outputs))
+    found = reported(given, gaussian, Finer(solve))
     x = np.linspace(-6, 6, 601)
     logs = [[exact(gap, s) for s in noise.from_normal(x)[0]] for gap in (GAP, 0.0)]
     there, here = (logsumexp(np.array(each) - x**2 / 2) for each in logs)
@@ -67,15 +78,15 @@ def test_errors_of_unknown_size():
 def test_what_is_not_known_is_said():
     given = posterior()
 
-    def fails(point):
+    def fails(point, tangents):
         message = "no equilibrium"
         raise SolveError(message)
 
     for finer, why in ((Finer(None, "no mesh"), "no mesh"), (Finer(fails), "the solve on a finer mesh failed: no eq")):
-        found = moved(given, laplace(given, starts=1), finer)
+        found = reported(given, laplace(given, starts=1), finer)
         assert found.why.startswith(why)
         assert np.isnan(found.log_evidence)
-        assert np.isnan(found.parameters).all()
+        assert np.isnan(found.shift).all()
 
 
 def test_meshes_that_decide_are_an_error():

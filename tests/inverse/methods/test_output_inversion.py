@@ -213,17 +213,18 @@ def test_outputs_of_a_body(tmp_path):
     """What is predicted at the mode is what was measured; the finer mesh is looked at."""
     (tmp_path / "bar.toml").write_text(BAR)
     study = load(tmp_path / "bar.toml")
-    assert any("mesh check  one solve" in line for line in plan(study))
+    assert any("mesh check  about 4 solves" in line for line in plan(study))
     assert ran(tmp_path / "bar.toml", tmp_path / "out") in (0, 3)
     one = results(tmp_path / "out").isel(data_set=0)
     assert one["predicted"].item() == pytest.approx(0.03, rel=2e-3)
-    assert one["predicted_std"].item() == pytest.approx(3e-4, rel=0.1)
+    assert one["predicted_std"].item() >= 3e-4 * 0.9  # with what is uncertain of the error of the mesh
     assert bool(one["mesh_checked"])
     model = study.spec.build(MPI.COMM_SELF, ("material.mu",))
     finer = study.spec.refined(1).build(MPI.COMM_SELF, ("material.mu",))
     mode = one["mode"].to_numpy()
-    error = (finer.solve(mode).outputs - model.solve(mode).outputs)[1] / one["sigma"].item()
-    assert one["mesh_error"].item() == pytest.approx(error, rel=1e-5)
+    # Half of what the finer mesh adds is still missed there.
+    error = 1.5 * (finer.solve(mode).outputs - model.solve(mode).outputs)[1] / one["sigma"].item()
+    assert one["mesh_error"].item() == pytest.approx(error, rel=1e-3)
 
 
 def test_studies_are_written_down(folder, capsys):

@@ -1,0 +1,153 @@
+"""The error of a mesh in data: corrected where it is known, an error of theirs where it is not.
+
+A model on a mesh predicts ψ_h(ω). With what finer meshes say of its error,
+
+    y = ψ_h(ω) + δ(ω) + Uz + e,   δ(ω) = δ̂ + T (ω − ω̂),   z ~ N(0, I),   e ~ N(0, diag (σ² + τ²)),
+
+where U and τ are what remains uncertain of δ: approximation errors as in J. Kaipio, E. Somersalo, J. Comput. Appl.
+Math. 198 (2007) 493–504, and S. R. Arridge et al., Inverse Problems 22 (2006) 175–195, linearised at the mode in place
+of the mean of the prior. With τ in σ, the errors have the covariance σ(I + ŨŨᵀ)σ, Ũ = U/σ = VSQᵀ, and residuals over σ
+become independent again by W = (I + ŨŨᵀ)^(−1/2) = I − V (1 − (1 + S²)^(−1/2)) Vᵀ, symmetric and of low rank: whatever
+knows independent errors only goes on with W r and W A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.data.errors import NormalErrors, StudentErrors
+
+# Standard deviations of what finer meshes still miss: of the pattern of the difference between them and of the error
+# itself, over these, and datum by datum, over the difference (chosen by `python -m benchmarks meshes`).
+OF_DIFFERENCE, OF_ERROR, OF_DATUM = 0.35, 0.1, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ApproximationError:
+    """What a mesh takes away from m data, in their units.
+
+    Attributes
+    ----------
+    point
+        Parameters ω̂ (d,) where it was found.
+    error
+        δ̂ (m,).
+    slopes
+        T (m, d), or none (m, 0): then δ is taken to be the same everywhere.
+    root
+        Uᵀ (k, m).
+    apart
+        τ (m,).
+    scale
+        Factor on σ at which it counts, where that is unknown.
+    """
+
+    point: FloatArray
+    error: FloatArray
+    slopes: FloatArray
+    root: FloatArray
+    apart: FloatArray
+    scale: float = 1.0
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Return δ (n, m) at parameters (n, d)."""
+        if not self.slopes.size:
+            return np.broadcast_to(self.error, (len(points), len(self.error)))
+        return self.error + (points - self.point) @ self.slopes.T
+
+    def of(self, rows: NDArray[np.intp]) -> ApproximationError:
+        """Return that of some of the data, by number."""
+        return ApproximationError(
+            self.point, self.error[rows], self.slopes[rows], self.root[:, rows], self.apart[rows], self.scale
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where m data are, for what is uncertain of their mesh error.
+
+    Attributes
+    ----------
+    groups
+        Numbers (m,) of load case and component, or of the output.
+    points
+        Places (m, 3); None where there are none.
+    """
+
+    groups: NDArray[np.int64]
+    points: FloatArray | None = None
+
+
+def uncertain(error: FloatArray, between: FloatArray, places: Places) -> FloatArray:
+    """Return Uᵀ (k, m): what finer meshes still miss, of the patterns of the error and of the difference between them.
+
+    The rest is extrapolated by one factor; in truth the factor is another in each load case, for each component, and
+    varies slowly over the body.
+
+    Parameters
+    ----------
+    error
+        δ (m,).
+    between
+        Difference (m,) between the two finer meshes.
+    places
+        Where the data are.
+    """
+    shapes, points, groups = [np.ones(len(between))], places.points, places.groups
+    if points is not None:
+        low, high = points.min(axis=0), points.max(axis=0)
+        shapes += list((2 * (points - low) / np.where(high > low, high - low, 1.0) - (high > low)).T)
+    patterns = (OF_DIFFERENCE * between, OF_ERROR * error)
+    rows = [
+        pattern * shape * (groups == group) for pattern in patterns for group in np.unique(groups) for shape in shapes
+    ]
+    found = np.array(rows).reshape(-1, len(between))
+    return np.asarray(found[np.abs(found).max(axis=1, initial=0.0) > 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """What makes errors independent.
+
+    Attributes
+    ----------
+    sigma
+        Standard deviations (m,) that residuals are divided by before.
+    basis
+        Vᵀ (r, m), orthonormal rows.
+    less
+        1 − (1 + S²)^(−1/2) (r,).
+    log_determinant
+        ½ ln det(I + ŨŨᵀ), which −ln of the likelihood has more.
+    """
+
+    sigma: FloatArray
+    basis: FloatArray
+    less: FloatArray
+    log_determinant: float
+
+    @classmethod
+    def of(cls, sigma: FloatArray, mesh: ApproximationError | None, errors: NormalErrors | StudentErrors) -> Whitening:
+        """Make it for standard deviations (m,), and what a mesh adds to them.
+
+        Errors with heavy tails are no multivariate ones: of those the scales only become larger.
+        """
+        none = np.zeros((0, len(sigma)))
+        if mesh is None:
+            return cls(sigma, none, np.zeros(0), 0.0)
+        more = mesh.apart**2 if errors.kind == "normal" else mesh.apart**2 + (mesh.root**2).sum(axis=0)
+        wider = np.sqrt(sigma**2 + more / mesh.scale**2)
+        if errors.kind != "normal" or not len(mesh.root):
+            return cls(wider, none, np.zeros(0), 0.0)
+        _, sizes, basis = np.linalg.svd(mesh.root / (mesh.scale * wider), full_matrices=False)
+        return cls(wider, basis, 1 - 1 / np.sqrt(1 + sizes**2), float(np.log1p(sizes**2).sum() / 2))
+
+    def __call__(self, rows: FloatArray) -> FloatArray:
+        """Return W r (…, m) of rows over σ (…, m); W is symmetric."""
+        if not len(self.less):
+            return rows
+        return np.asarray(rows - ((rows @ self.basis.T) * self.less) @ self.basis)

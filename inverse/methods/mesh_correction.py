@@ -1,0 +1,216 @@
+"""Posteriors corrected for the error of the mesh: found at the mode on finer meshes, and again at the next mode.
+
+Each round solves on the finer meshes at the mode, corrects the model there (`inverse.data.approximation_error`) and
+searches on from that mode, until the error at the new mode moves no unknown any more. Of few parameters the derivatives
+of the error are known too. Of a field they are left out: they move its mode by Γ_post(A_f − A)ᵀr, a share of its
+deviations as small as that by which the mesh changes the derivatives A of what the data see well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from forward.model import FloatArray
+from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
+from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, uncertain
+from inverse.low_dimensional.laplace import Laplace, laplace
+from inverse.low_dimensional.posterior import Density, Posterior
+
+if TYPE_CHECKING:
+    from inverse.fields.field_posterior import FieldPosterior
+    from inverse.fields.low_rank import LowRankPosterior
+    from inverse.fields.newton_cg import Mode
+
+
+class SolvedField(Protocol):
+    """The mode of a posterior of a field, and the Gaussian there."""
+
+    @property
+    def mode(self) -> Mode:
+        """The mode."""
+
+    @property
+    def found(self) -> LowRankPosterior:
+        """The Gaussian."""
+
+
+S = TypeVar("S", bound=SolvedField)
+Treatment = Literal["correct", "report"]
+EXCEEDS = 0.2  # of a datum's noise, or of an unknown's deviation, from which on the error of the mesh is corrected
+SETTLED = 0.1  # deviations of an unknown that are left when it is
+ROUNDS = 5
+
+
+def of_the_mean(size: float, largest: float) -> str:
+    """Say what the mesh does to data at the mean of the prior, in deviations of the noise, before the search."""
+    words = f"at the mean of the prior the error of the mesh is {size:.2g} standard deviations of the noise"
+    done = "it will be looked at again at the mode, and corrected where it exceeds a fifth"
+    return f"{words} (root mean square; at most {largest:.2g}); {done}"
+
+
+def error_of(
+    look: Look, outputs: FloatArray, point: FloatArray, places: Places, tangents: FloatArray | None = None
+) -> ApproximationError:
+    """Return the error of a mesh on which a model has outputs (m,) at parameters (d,), and tangents (m, d)."""
+    slopes = np.zeros((len(outputs), 0))
+    if tangents is not None and look.tangents is not None:
+        slopes = look.tangents - tangents
+    error = look.outputs - outputs
+    root, apart = uncertain(error, look.between, places), OF_DATUM * np.abs(look.between)
+    return ApproximationError(point, error, slopes, root, apart)
+
+
+def part(look: Look, which: list[int] | slice) -> Look:
+    """Return what is said of some of the outputs."""
+    return Look(look.outputs[which], look.between[which], None if look.tangents is None else look.tangents[which])
+
+
+def corrected_few(
+    posterior: Posterior, gaussian: Laplace, finer: Finer, places: Places, treatment: Treatment
+) -> tuple[Posterior, Laplace, MeshFound]:
+    """Look at the error of the mesh at the mode, and correct it where it is not small.
+
+    Raises
+    ------
+    SolveError
+        If the model has no answer at the mode.
+    """
+    d, m = len(posterior.inputs.names), posterior.data.size
+    which = slice(None) if posterior.which is None else list(posterior.which)
+    plain, known, left = gaussian.mode, None, np.zeros(d)
+    settled = False
+    for solves in range(1, ROUNDS + 1):
+        x = gaussian.mode[None]
+        at = posterior.at(x, derivatives=True)
+        point = at.parameters[0]
+        look, why = finer.look(point, tangents=True)
+        if look is None:
+            break
+        assert at.tangents is not None
+        found = error_of(part(look, which), at.everything[0, which], point, places, at.tangents[0, which])
+        scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
+        root = np.sqrt(posterior.errors.information(posterior.residuals(at.outputs, x)))[0]
+        A = posterior.sensitivities(at)[0] * root[:, None]
+        deviations = np.sqrt(np.diag(slopes @ gaussian.covariance[:d, :d] @ slopes.T))
+        rest = found.error if posterior.mesh is None else found.error - posterior.mesh.at(point[None])[0]
+        shift = parameters_moved(posterior, gaussian, A, root * posterior.whitening(rest / scale)) / deviations
+        if posterior.mesh is not None:
+            gain = slopes @ np.linalg.solve(gaussian.hessian[:d, :d], (root[:, None] * A).T)
+            left = _left(posterior.whitening(gain) / scale, posterior.mesh) / deviations
+        added = _evidence(posterior, at, found.error)
+        factor = posterior.physical(x)[0, -1] if posterior.noise is not None else 1.0
+        known = MeshFound(
+            "", found.error / (factor * posterior.sigma), shift, left, posterior.mesh is not None, True, added, solves
+        )
+        largest = np.abs(shift).max()
+        # The size of the noise that the covariance was made for must be that of this mode too.
+        if posterior.mesh is not None and max(largest, abs(np.log(factor / posterior.mesh.scale))) <= SETTLED:
+            settled = True
+            break
+        small = posterior.mesh is None and max(largest, np.abs(known.error).max()) <= EXCEEDS
+        if treatment == "report" or small or solves == ROUNDS:
+            settled = posterior.mesh is None
+            break
+        posterior = replace(posterior, mesh=replace(found, scale=float(factor)))
+        gaussian = laplace(posterior, starts=1, first=gaussian.mode, exact=False)
+    if known is None:
+        return posterior, gaussian, MeshFound.unknown(why, m, d, 0 if finer.solve is None else 1)
+    if posterior.mesh is not None:
+        final = laplace(posterior, starts=1, first=gaussian.mode)
+        slopes = posterior.inputs.from_normals(final.mode[None, :d])[1][0]
+        deviations = np.sqrt(np.diag(slopes @ final.covariance[:d, :d] @ slopes.T))
+        moved_by = posterior.physical(final.mode[None])[0] - posterior.physical(plain[None])[0]
+        known = replace(known, shift=moved_by[:d] / deviations, corrected=True)
+        gaussian = final
+    return posterior, gaussian, replace(known, settled=settled)
+
+
+def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
+    """What predictions that are larger by `error` (m,) add to ln Z of the model that is linear at a point."""
+    alone = replace(posterior, mesh=None)
+    d, s = len(posterior.inputs.names), float((alone.scale(at.x) / alone.sigma)[0, 0])
+    which = slice(None) if posterior.which is None else list(posterior.which)
+    A = s * alone.sensitivities(at)[0]
+    residual = (posterior.data - at.everything[0, which]) / posterior.sigma
+    return evidence_moved(A, residual + A @ at.x[0, :d], error / posterior.sigma, posterior.noise)
+
+
+def corrected_field(
+    posterior: FieldPosterior,
+    solve: Callable[[FieldPosterior, FloatArray | None], S],
+    finer: Finer,
+    places: Places,
+    treatment: Treatment,
+    weights: FloatArray,
+) -> tuple[S, FloatArray, MeshFound]:
+    """Do the same for a field of N values: what was solved last, how far its mode moves (N,), and what was found.
+
+    Parameters
+    ----------
+    posterior
+        Not corrected.
+    solve
+        Finds the mode of a posterior, from ξ (N,) or from the centre of the prior, and the Gaussian there.
+    finer, places, treatment
+        As of few parameters.
+    weights
+        Of the vertices (N,) in the mean over the body.
+    """
+    here = solve(posterior, None)
+    plain, known, mesh = here.found.mean, None, None
+    settled, moved, left = False, np.full(len(weights), np.nan), np.zeros(1)
+    for solves in range(1, ROUNDS + 1):
+        point = here.mode.point
+        look, why = finer.look(point.values)
+        if look is None:
+            break
+        found = error_of(look, np.asarray(point.solution.outputs), point.values, places)
+        over = found.error * posterior.measured / point.posterior.sigma  # nothing is said of data that are not there
+        rest = found.error if mesh is None else found.error - mesh.error
+        moved = _moved(here, rest)
+        deviations = here.found.std
+        width = here.found.marginal(weights)[1]
+        shift = np.array([weights @ moved / width])
+        largest = max(abs(float(shift[0])), float(np.sqrt(((moved / deviations) ** 2).mean())))
+        if mesh is not None:
+            left = _left(_gain(here, weights)[None], mesh) / width
+        known = MeshFound("", over, shift, left, mesh is not None, solves=solves)
+        if mesh is not None and largest <= SETTLED:
+            settled = True
+            break
+        small = mesh is None and max(largest, float(np.abs(known.error).max())) <= EXCEEDS
+        if treatment == "report" or small or solves == ROUNDS:
+            settled = mesh is None
+            break
+        mesh = found
+        here = solve(replace(posterior, mesh=mesh), point.whitened)
+    if known is None:
+        return here, moved, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1)
+    if mesh is not None:
+        moved = here.found.mean - plain
+        width = here.found.marginal(weights)[1]
+        known = replace(known, shift=np.array([weights @ moved / width]), corrected=True)
+    return here, moved, replace(known, settled=settled)
+
+
+def _moved(here: SolvedField, error: FloatArray) -> FloatArray:
+    """How far (N,) the mode of a field moves where data are predicted larger by `error` (n,), in their units."""
+    point, spectrum = here.mode.point, here.found.spectrum
+    over = point.root * point.posterior.whitening(point.posterior.weights * error)
+    return np.asarray(-(spectrum.images @ over / (1 + spectrum.values)) @ here.found.directions)
+
+
+def _gain(here: SolvedField, weights: FloatArray) -> FloatArray:
+    """How far (n,) the mean of a field over the body moves with each of the data, in their units."""
+    point, spectrum = here.mode.point, here.found.spectrum
+    over = spectrum.images.T @ (here.found.directions @ weights / (1 + spectrum.values))
+    return np.asarray(point.posterior.weights * point.posterior.whitening(point.root * over))
+
+
+def _left(gain: FloatArray, mesh: ApproximationError) -> FloatArray:
+    """Standard deviations (k,) by what is uncertain of a mesh, of estimates with derivatives (k, n) by the data."""
+    return np.asarray(np.linalg.norm(np.hstack([gain @ mesh.root.T, gain * mesh.apart]), axis=1))

@@ -1,0 +1,51 @@
+"""A model on two meshes: Richardson's limit, derivatives, and the start that later solves are predicted from."""
+
+import numpy as np
+import pytest
+
+from forward.extrapolated import Extrapolated
+from forward.model import FunctionModel, SolveError
+
+pytestmark = pytest.mark.unit
+
+NAMES = ("a", "b")
+
+
+def on(h):
+    """Outputs whose error is exactly of second order in h."""
+
+    def outputs(p):
+        return np.array([p[0] * p[1] + h**2 * p[0], np.sin(p[1]) - 3 * h**2 * p[1] ** 2])
+
+    def slopes(p):
+        return np.array([[p[1] + h**2, p[0]], [0, np.cos(p[1]) - 6 * h**2 * p[1]]])
+
+    return FunctionModel(outputs, NAMES, ("y", "z"), slopes)
+
+
+MODEL = Extrapolated(on(0.2), on(0.3), 1 / (1.5**2 - 1), np.array([1.0, 1.0]))
+POINT = np.array([0.7, 1.2])
+
+
+def test_outputs_and_derivatives_are_those_of_the_limit():
+    found, limit = MODEL.solve(POINT), on(0.0).solve(POINT)
+    np.testing.assert_allclose(found.outputs[:2], limit.outputs, rtol=1e-13)
+    np.testing.assert_allclose(found.outputs[2:], on(0.2).solve(POINT).outputs - on(0.3).solve(POINT).outputs)
+    np.testing.assert_allclose(found.tangent(np.eye(2))[:, :2], limit.tangent(np.eye(2)), rtol=1e-12)
+    w = np.array([0.3, -1.2, 2.0, 0.4])
+    np.testing.assert_allclose(found.adjoint(w), found.tangent(np.eye(2)) @ w, rtol=1e-12)
+    assert len(MODEL.outputs) == 4
+    assert found.mesh_error() is None
+
+
+def test_a_start_without_an_answer_is_none():
+    def fails(p):
+        if p[0] == 1.0:
+            message = "not there"
+            raise SolveError(message)
+        return on(0.2).function(p)
+
+    model = Extrapolated(FunctionModel(fails, NAMES, ("y", "z")), on(0.3), 0.8, np.array([1.0, 1.0]))
+    np.testing.assert_allclose(model.solve(POINT).outputs, MODEL.solve(POINT).outputs)
+    with pytest.raises(SolveError, match="not there"):
+        model.solve(np.array([1.0, 1.0]))

@@ -1,0 +1,225 @@
+"""Posteriors that are corrected for the error of a mesh: against closed forms of linear models and dense algebra."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from forward.model import FunctionModel, SolveError
+from inverse.criticism.finer import Finer
+from inverse.data.approximation_error import (
+    OF_DATUM,
+    OF_DIFFERENCE,
+    OF_ERROR,
+    ApproximationError,
+    Places,
+    Whitening,
+    uncertain,
+)
+from inverse.data.errors import NORMAL, StudentErrors
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
+from inverse.low_dimensional.evidence import evidence
+from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.posterior import Posterior
+from inverse.methods.mesh_correction import corrected_few, corrected_field
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.inputs.distributions import LogNormal, Normal
+from uq.inputs.random_parameters import Inputs
+
+pytestmark = pytest.mark.unit
+
+RNG = np.random.default_rng(11)
+M = 9
+COARSE, FINE = RNG.standard_normal((2, M, 2))  # slopes on the mesh, and where meshes tend to
+FINE = COARSE + 0.2 * FINE
+SHIFT, BETWEEN = 0.8 * RNG.standard_normal((2, M))
+SIGMA = 0.3 + 0.2 * RNG.uniform(size=M)
+PRIOR_MEAN, PRIOR = np.array([1.0, 0.0]), np.diag([0.25, 4.0])
+DATA = FINE @ [1.3, -0.8] + SHIFT + SIGMA * RNG.standard_normal(M)
+INPUTS = Inputs({"a": Normal(mean=1.0, std=0.5), "b": Normal(mean=0.0, std=2.0)})
+PLACES = Places(np.arange(M) % 2, RNG.uniform(size=(M, 3)))
+APART = OF_DATUM * np.abs(BETWEEN)
+
+
+def covariance_of(error, rows=slice(None)):
+    """Covariance of what is uncertain of an error of the mesh, by its definition."""
+    shapes = [np.ones(M), *(2 * (PLACES.points - PLACES.points.min(0)) / np.ptp(PLACES.points, axis=0) - 1).T]
+    found = np.diag(APART**2)
+    for pattern in (OF_DIFFERENCE * BETWEEN, OF_ERROR * error):
+        for group in (0, 1):
+            for shape in shapes:
+                column = pattern * shape * (PLACES.groups == group)
+                found = found + np.outer(column, column)
+    return found[rows][:, rows]
+
+
+def posterior(**kwargs):
+    model = FunctionModel(lambda p: COARSE @ p, ("a", "b"), tuple("qrstuvwxy"), lambda p: COARSE)
+    return Posterior(INPUTS, SerialEvaluate(model), DATA, SIGMA, **kwargs)
+
+
+def finer(point, tangents):
+    values = np.concatenate([FINE @ point + SHIFT, BETWEEN])
+    return values, np.concatenate([FINE, np.zeros((M, 2))]) if tangents else None
+
+
+def exact(gamma):
+    """Mode, covariance and ln Z of the model that meshes tend to, with errors of a covariance."""
+    precision = np.linalg.inv(PRIOR) + FINE.T @ np.linalg.solve(gamma, FINE)
+    gap = DATA - SHIFT - FINE @ PRIOR_MEAN
+    mode = PRIOR_MEAN + np.linalg.solve(precision, FINE.T @ np.linalg.solve(gamma, gap))
+    log_evidence = multivariate_normal(FINE @ PRIOR_MEAN + SHIFT, gamma + FINE @ PRIOR @ FINE.T).logpdf(DATA)
+    return mode, np.linalg.inv(precision), log_evidence
+
+
+def test_corrected_posterior_and_evidence_are_exact():
+    given = posterior()
+    gaussian = laplace(given, starts=1)
+    there, corrected, found = corrected_few(given, gaussian, Finer(finer), PLACES, "correct")
+    plain = given.physical(gaussian.mode[None])[0]
+    uncertainty = covariance_of((FINE - COARSE) @ plain + SHIFT)
+    gamma = np.diag(SIGMA**2) + uncertainty
+    mode, covariance, log_evidence = exact(gamma)
+    slopes = INPUTS.from_normals(corrected.mode[None])[1][0]
+    np.testing.assert_allclose(there.physical(corrected.mode[None])[0], mode, rtol=1e-8)
+    np.testing.assert_allclose(slopes @ corrected.covariance @ slopes.T, covariance, rtol=1e-6)
+    assert corrected.log_evidence == pytest.approx(log_evidence, rel=1e-9)
+    assert evidence(there, corrected, 64).log_evidence == pytest.approx(log_evidence, rel=1e-6)
+    assert found.corrected
+    assert found.settled
+    assert found.solves == 2
+    np.testing.assert_allclose(found.shift, (mode - plain) / np.sqrt(np.diag(covariance)), rtol=1e-6)
+    # What is uncertain of the correction: its share of the covariance of the estimate.
+    gain = covariance @ FINE.T @ np.linalg.inv(gamma)
+    left = np.sqrt(np.diag(gain @ uncertainty @ gain.T) / np.diag(covariance))
+    np.testing.assert_allclose(found.left, left, rtol=1e-6)
+
+
+def test_without_the_sign_it_would_be_found():
+    """A correction that is subtracted is far from the posterior of the model that meshes tend to."""
+    given = posterior()
+    wrong = ApproximationError(np.zeros(2), -SHIFT, COARSE - FINE, uncertain(SHIFT, BETWEEN, PLACES), APART)
+    mode = posterior(mesh=wrong).physical(laplace(posterior(mesh=wrong), starts=1).mode[None])[0]
+    right = exact(np.diag(SIGMA**2) + covariance_of(SHIFT))
+    assert np.abs((mode - right[0]) / np.sqrt(np.diag(right[1]))).max() > 1
+    assert given.mesh is None
+
+
+def test_what_is_small_is_left():
+    given = posterior()
+    gaussian = laplace(given, starts=1)
+
+    def near(point, tangents):
+        return np.concatenate([COARSE @ point + 1e-3 * SHIFT, BETWEEN]), np.concatenate([COARSE, np.zeros((M, 2))])
+
+    there, same, found = corrected_few(given, gaussian, Finer(near), PLACES, "correct")
+    assert there.mesh is None
+    assert same is gaussian
+    assert not found.corrected
+    assert found.settled
+    np.testing.assert_allclose(found.error, 1e-3 * SHIFT / SIGMA, rtol=1e-9)
+
+
+def test_failures_are_said():
+    given = posterior()
+    calls = []
+
+    def fails(point, tangents):
+        calls.append(point)
+        if len(calls) > 1:
+            message = "no equilibrium"
+            raise SolveError(message)
+        return finer(point, tangents)
+
+    there, _, found = corrected_few(given, laplace(given, starts=1), Finer(fails), PLACES, "correct")
+    assert there.mesh is not None
+    assert found.corrected
+    assert not found.settled  # the mode that it was found at is not where it ended
+
+
+def test_errors_of_unknown_size_and_subsets():
+    """With a size that is all but known to be 1, the evidence is the one without; of some data it is theirs."""
+    plain = posterior()
+    gaussian = laplace(plain, starts=1)
+    _, right, _ = corrected_few(plain, gaussian, Finer(finer), PLACES, "correct")
+    given = posterior(noise=LogNormal(mean=1.0, std=1e-4))
+    there, corrected, _ = corrected_few(given, laplace(given, starts=1), Finer(finer), PLACES, "correct")
+    assert there.mesh is not None
+    assert corrected.log_evidence == pytest.approx(right.log_evidence, abs=1e-3)
+    rows = np.array([0, 3, 4])
+    some = there.mesh.of(rows)
+    whole = there.mesh.root.T @ there.mesh.root
+    np.testing.assert_allclose(some.root.T @ some.root, whole[np.ix_(rows, rows)], atol=1e-14)
+    np.testing.assert_allclose(some.at(np.ones((1, 2)))[0], there.mesh.at(np.ones((1, 2)))[0, rows])
+    np.testing.assert_allclose(some.apart, APART[rows])
+
+
+def test_whitening_is_the_root_of_the_inverse():
+    mesh = ApproximationError(np.zeros(2), SHIFT, np.zeros((M, 0)), uncertain(SHIFT, BETWEEN, PLACES), APART)
+    gamma = np.diag(SIGMA**2) + covariance_of(SHIFT)
+    white = Whitening.of(SIGMA, mesh, NORMAL)
+    W = white(np.eye(M)) / white.sigma
+    np.testing.assert_allclose(W.T @ W, np.linalg.inv(gamma), rtol=1e-9, atol=1e-9)
+    half_log_det = np.linalg.slogdet(gamma)[1] / 2
+    assert white.log_determinant + np.log(white.sigma).sum() == pytest.approx(half_log_det, rel=1e-9)
+    heavy = Whitening.of(SIGMA, mesh, StudentErrors())
+    np.testing.assert_allclose(heavy.sigma**2, np.diag(gamma), rtol=1e-12)
+    assert heavy.log_determinant == 0
+
+
+def test_what_is_uncertain_is_of_each_load_case():
+    """Parts of different groups are independent; patterns are those of the error and of what is between the meshes."""
+    root = uncertain(SHIFT, BETWEEN, PLACES)
+    covariance = root.T @ root
+    np.testing.assert_allclose(covariance, covariance_of(SHIFT) - np.diag(APART**2), atol=1e-15)
+    assert not covariance[np.ix_(PLACES.groups == 0, PLACES.groups == 1)].any()
+    alone = uncertain(SHIFT, BETWEEN, Places(np.arange(M)))
+    squares = (OF_DIFFERENCE * BETWEEN) ** 2 + (OF_ERROR * SHIFT) ** 2
+    np.testing.assert_allclose(alone.T @ alone, np.diag(squares), atol=1e-15)
+    assert len(uncertain(np.zeros(M), np.zeros(M), PLACES)) == 0
+
+
+class Identity:
+    variance = np.ones(6)
+
+    def root(self, noise):
+        return noise
+
+    def root_transposed(self, g):
+        return g
+
+
+def test_a_field_against_dense_algebra():
+    A, b = RNG.standard_normal((M, 6)), 0.5 * RNG.standard_normal(M)
+    names = tuple(f"m{i}" for i in range(6))
+    model = FunctionModel(lambda p: A @ p, names, tuple("qrstuvwxy"), lambda p: A)
+    data = A @ RNG.standard_normal(6) + b + SIGMA * RNG.standard_normal(M)
+    data[4] = np.nan
+    seen = np.flatnonzero(np.isfinite(data))
+
+    def solve(given, start):
+        mode = find_mode(given, start, tolerance=1e-8)
+        return type("Solved", (), {"mode": mode, "found": LowRankPosterior.at(mode.point, cutoff=1e-12)})()
+
+    tends = Finer(lambda point, tangents: (np.concatenate([A @ point + b, BETWEEN]), None))
+    weights = np.full(6, 1 / 6)
+    given = FieldPosterior(model, data, SIGMA, Identity())
+    here, moved, found = corrected_field(given, solve, tends, PLACES, "correct", weights)
+    gamma = np.diag(SIGMA[seen] ** 2) + covariance_of(b, seen)
+    precision = np.eye(6) + A[seen].T @ np.linalg.solve(gamma, A[seen])
+    mode = np.linalg.solve(precision, A[seen].T @ np.linalg.solve(gamma, data[seen] - b[seen]))
+    np.testing.assert_allclose(here.found.mean, mode, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(here.found.std, np.sqrt(np.diag(np.linalg.inv(precision))), rtol=1e-6)
+    exactly = multivariate_normal(b[seen], gamma + A[seen] @ A[seen].T).logpdf(data[seen])
+    assert here.found.log_evidence == pytest.approx(exactly, rel=1e-8)
+    assert found.corrected
+    assert found.settled
+    gain = np.linalg.solve(precision, A[seen].T @ np.linalg.inv(gamma))
+    left = np.sqrt(weights @ gain @ covariance_of(b, seen) @ gain.T @ weights)
+    width = np.sqrt(weights @ np.linalg.inv(precision) @ weights)
+    np.testing.assert_allclose(found.left, left / width, rtol=1e-6)
+    plain = np.linalg.solve(
+        np.eye(6) + A[seen].T @ (A[seen] / SIGMA[seen, None] ** 2), A[seen].T @ (data[seen] / SIGMA[seen] ** 2)
+    )
+    np.testing.assert_allclose(moved, mode - plain, rtol=1e-5, atol=1e-7)
