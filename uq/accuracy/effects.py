@@ -36,7 +36,8 @@ Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
 ENOUGH = 64  # samples that say by themselves how an output depends on the parameters
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
-DOUBT = 0.25  # of an estimate, relative to it: elements of one degree more err too
+DOUBT = 0.25  # of an estimate that is calibrated, relative to it
+UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
 TERMS = 500  # of an expansion, at most, whose indices are looked at with and without the error
 INDICES = ("sobol_first", "sobol_total")
 
@@ -85,10 +86,12 @@ def with_mesh_errors(
     """
     drawn = sketch(dataset, inputs, centre)
     effects = [_Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])]
-    variables = _of_outputs(dataset, inputs, centre, drawn, effects)
+    unknown = np.where(np.isfinite(found.saturation) & found.measured, DOUBT, UNCALIBRATED)
+    variables = _of_outputs(dataset, inputs, centre, drawn, effects, unknown)
     variables |= {
         "mesh_error_points": (("estimate", "parameter"), found.evaluations.points),
         "mesh_error_values": (("estimate", "output"), found.evaluations.mesh_errors),
+        "mesh_error_saturation": (("output",), found.saturation),
     }
     if found.fields is not None and len(found.points) >= FEWEST_ANSWERS:
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
@@ -164,8 +167,14 @@ class _Effect:
 
 
 def _of_outputs(
-    dataset: xr.Dataset, inputs: Inputs, centre: Linearisation, drawn: Sketch, effects: Sequence[_Effect | None]
+    dataset: xr.Dataset,
+    inputs: Inputs,
+    centre: Linearisation,
+    drawn: Sketch,
+    effects: Sequence[_Effect | None],
+    unknown: FloatArray,
 ) -> Variables:
+    """Errors of estimates of the outputs, given what is unknown of each estimate (m,), relative to it."""
     nothing = np.full(len(effects), np.nan)
     nominal, derivatives = nothing.copy(), np.full(centre.tangents.shape, np.nan)
     for i, one in enumerate(effects):
@@ -182,7 +191,7 @@ def _of_outputs(
         for i, one in enumerate(effects):
             if one is not None:
                 error[i], rest[i] = one.mean if estimated == "mean" else one.std(float(dataset["std"][i]))
-        doubt, sampling = np.hypot(DOUBT * error, rest), dataset[f"{estimated}_error"].to_numpy()
+        doubt, sampling = np.hypot(unknown * error, rest), dataset[f"{estimated}_error"].to_numpy()
         variables |= {
             f"{first}mesh_error": (("output",), error),
             f"{first}mesh_error_doubt": (("output",), doubt),

@@ -12,13 +12,13 @@ estimates best that it has not seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Solution
 from uq.estimators.indices import shares
-from uq.evaluation.evaluate import Evaluate, Evaluations, Request
+from uq.evaluation.evaluate import Evaluate, Evaluations, Request, merge
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
@@ -92,7 +92,7 @@ class _StateErrors:
 
 @dataclass(frozen=True)
 class MeshErrors:
-    """Errors of the mesh at some points.
+    """Errors of the mesh at some points, calibrated at the first of them where that is possible.
 
     Attributes
     ----------
@@ -100,10 +100,16 @@ class MeshErrors:
         Solutions at all points, the first of which is the mean, with `Evaluations.mesh_errors`.
     fields
         Errors (n, U) of the displacements at the points that have an answer; None where they were not asked for.
+    saturation
+        Factors (m,) that calibrate errors of outputs, which are multiplied by them; NaN where there are none.
+    measured
+        Whether these were found at the mean; else they are typical ones.
     """
 
     evaluations: Evaluations
     fields: FloatArray | None
+    saturation: FloatArray
+    measured: bool
 
     @property
     def points(self) -> FloatArray:
@@ -119,20 +125,32 @@ class MeshErrors:
     def errors(self) -> FloatArray:
         """Errors (n, m) of the outputs there; NaN in columns of what is not estimated."""
         assert self.evaluations.mesh_errors is not None
-        return self.evaluations.mesh_errors[self.evaluations.ok]
+        return np.asarray(self.evaluations.mesh_errors[self.evaluations.ok] * _factors(self.saturation))
 
 
 def estimate(
     inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int, seed: int, *, fields: bool
 ) -> MeshErrors:
-    """Estimate the error of the mesh at so many points."""
+    """Estimate the error of the mesh at so many points, and calibrate it at the mean."""
     points = design(inputs, centre.output_slopes, count, seed)
-    wanted = _StateErrors(points) if fields and centre.state.size else None
-    found = evaluate(Request(points, fields=wanted, start=centre.prediction, mesh_errors=True))
-    states = None
-    if wanted is not None and found.fields.size:
-        states = found.fields[found.ok][:, : evaluate.displacements]
-    return MeshErrors(found, states)
+    parts, states, some = [], [], fields and centre.state.size > 0
+    for these, calibrated in ((points[:1], True), (points[1:], False)):
+        wanted = _StateErrors(these) if some else None
+        request = Request(these, fields=wanted, start=centre.prediction, mesh_errors=True, saturations=calibrated)
+        found = evaluate(request)
+        if found.fields.size:
+            states.append(found.fields[found.ok][:, : evaluate.displacements])
+        parts.append(replace(found, fields=found.fields[:0], saturations=None))
+        if calibrated:
+            assert found.saturations is not None
+            *of_outputs, of_state, measured = found.saturations[0]
+    displaced = float(_factors(np.array(of_state))) * np.vstack(states) if states else None
+    return MeshErrors(merge(parts), displaced, np.array(of_outputs), bool(measured == 1))
+
+
+def _factors(saturation: FloatArray) -> FloatArray:
+    """Return factors, 1 where there is no calibration."""
+    return np.where(np.isfinite(saturation), saturation, 1.0)
 
 
 # --- between estimates -----------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from forward.model import WORK, ModelError, Stability
 from uq.evaluation.evaluate import Evaluations, Failure
 from uq.evaluation.hdf5 import creation, image, in_memory
 
+OPTIONAL = ("mesh_errors", "saturations")  # arrays that evaluations have on request
 HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
 
 
@@ -184,8 +185,9 @@ def write(group: h5py.Group, block: Evaluations) -> None:
     group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
     if block.tangents is not None:
         group["tangents"] = block.tangents
-    if block.mesh_errors is not None:
-        group["mesh_errors"] = block.mesh_errors
+    for name in OPTIONAL:
+        if getattr(block, name) is not None:
+            group[name] = getattr(block, name)
     if block.fields.size:
         group["fields"] = block.fields
 
@@ -264,7 +266,7 @@ def read(path: Path, name: str = "/") -> Evaluations:
                 np.asarray(file["converged"]),
                 np.asarray(file["stability"]),
                 np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)),
-                mesh_errors=np.asarray(file["mesh_errors"]) if "mesh_errors" in file else None,
+                **{name: np.asarray(file[name]) for name in OPTIONAL if name in file},
             )
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

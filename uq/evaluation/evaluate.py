@@ -81,6 +81,9 @@ class Evaluations:
         What a `CompactSum` keeps of each point that did not fail (n_ok, r, k), once its blocks are merged.
     mesh_errors
         Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
+    saturations
+        Factors (n, m + 2) that calibrate estimated errors of outputs and of the state, and whether they were measured
+        here (1) or are typical ones (0), where they were asked for; NaN where there are none.
     """
 
     points: FloatArray
@@ -95,6 +98,7 @@ class Evaluations:
     fields: FloatArray
     sketches: FloatArray | None = None
     mesh_errors: FloatArray | None = None
+    saturations: FloatArray | None = None
 
     @property
     def ok(self) -> NDArray[np.bool_]:
@@ -206,6 +210,8 @@ class Request:
         Sum over the states of consecutive points, instead of `fields`.
     mesh_errors
         Whether the errors of the mesh in the outputs are estimated (`Solution.mesh_error`).
+    saturations
+        Whether what calibrates these is found too (`Solution.saturation`).
     """
 
     points: FloatArray
@@ -216,6 +222,7 @@ class Request:
     model: str = OWN
     joint: JointSum | None = None
     mesh_errors: bool = False
+    saturations: bool = False
 
     def blocks(self, most: int | None = None) -> list[Request]:
         """Cut into blocks that depend only on the number of points, the size of rows, and `most`."""
@@ -415,6 +422,7 @@ class BlockSolver:
     def __init__(self, model: ForwardModel, request: Request) -> None:
         self._model = model
         self._tangents, self._mesh_errors = request.tangents, request.mesh_errors
+        self._saturations = request.saturations
         self._row = request.fields.on(model) if request.fields is not None else None
         self._compact = isinstance(request.fields, CompactSum)
         self._joint = request.joint.on(model) if request.joint is not None else None
@@ -434,7 +442,7 @@ class BlockSolver:
         m, d = len(model.outputs), len(model.parameters)
         outputs = np.full((n, m), np.nan)
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
-        mesh_errors = np.full((n, m), np.nan) if self._mesh_errors else None
+        of_meshes = _MeshErrors(n, m, saturations=self._saturations) if self._mesh_errors else None
         seconds = np.empty(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
@@ -450,8 +458,8 @@ class BlockSolver:
                 solution = next(solutions)
                 if isinstance(solution, SolveError):
                     raise solution
-                if mesh_errors is not None and (estimated := solution.mesh_error()) is not None:
-                    mesh_errors[i] = estimated.outputs
+                if of_meshes is not None:
+                    of_meshes.take(i, solution)
                 if self._row is not None:
                     row = self._row(solution, point)
                 if tangents is not None:
@@ -492,8 +500,31 @@ class BlockSolver:
             converged,
             stability,
             fields,
-            mesh_errors=mesh_errors,
+            mesh_errors=None if of_meshes is None else of_meshes.errors,
+            saturations=None if of_meshes is None else of_meshes.saturations,
         )
+
+
+class _MeshErrors:
+    """Errors of the mesh (n, m) of solutions, and what calibrates them (n, m + 2) where it is asked for."""
+
+    def __init__(self, n: int, m: int, *, saturations: bool) -> None:
+        self.errors = np.full((n, m), np.nan)
+        self.saturations = np.full((n, m + 2), np.nan) if saturations else None
+
+    def take(self, i: int, solution: Solution) -> None:
+        """Take those of one; collective. Errors that cannot be calibrated remain estimates."""
+        found = solution.mesh_error()
+        if found is not None:
+            self.errors[i] = found.outputs
+        if self.saturations is None:
+            return
+        try:
+            factors = solution.saturation()
+        except SolveError:
+            return
+        if factors is not None:
+            self.saturations[i] = [*factors.outputs, factors.state, factors.measured]
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:
@@ -569,6 +600,7 @@ class Merger:
                     yield part
 
         tangents, mesh_errors = list(joined(lambda b: b.tangents)), list(joined(lambda b: b.mesh_errors))
+        saturations = list(joined(lambda b: b.saturations))
         return Evaluations(
             np.concatenate(list(joined(lambda b: b.points))),
             np.concatenate(list(joined(lambda b: b.outputs))),
@@ -582,4 +614,5 @@ class Merger:
             self._fields,
             np.concatenate(self._sketches) if self._sketches else None,
             np.concatenate(mesh_errors) if mesh_errors else None,
+            np.concatenate(saturations) if saturations else None,
         )

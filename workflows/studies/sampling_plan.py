@@ -101,7 +101,7 @@ def _estimates(study: Study) -> Iterator[Part]:
 
 def _compilation(study: Study) -> float:
     """Seconds of the forms of a body, and of those for the error of its mesh."""
-    return COMPILATION * (2 if study.estimates else 1)
+    return COMPILATION * (3 if study.estimates else 1)  # in elements of one degree more, and once of two
 
 
 def _compiled_before() -> bool:

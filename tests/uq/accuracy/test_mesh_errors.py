@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.model import FunctionModel, FunctionSolution, MeshError, SolveError, Work
+from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
-from uq.accuracy.effects import DOUBT, with_mesh_errors
+from uq.accuracy.effects import DOUBT, UNCALIBRATED, with_mesh_errors
 from uq.accuracy.mesh_errors import design, estimate
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
@@ -34,6 +34,7 @@ class OnMesh(FunctionModel):
     """A function, with that which a mesh without error would give."""
 
     exact: FunctionModel | None = None
+    seen: float = 1.0  # share of the error that an estimate sees
 
     def solve(self, parameters, guess=None):
         found = super().solve(parameters, guess)
@@ -46,7 +47,13 @@ class SolvedOnMesh(FunctionSolution):
 
     def mesh_error(self):
         errors = self.model.exact.function(self.parameters) - self.outputs
-        return MeshError(errors, np.empty(0), 0.0, np.nan, Work())
+        seen = self.model.seen * errors
+        return MeshError(seen, np.empty(0), 0.0, np.nan, Work())
+
+    def saturation(self):
+        if self.model.seen == 1.0:
+            return None
+        return Saturation(np.full(len(self.outputs), 1 / self.model.seen), 1.0, 1.0)
 
 
 def on_mesh(error, names=("a", "b")):
@@ -174,7 +181,7 @@ def test_what_an_expansion_leaves_is_claimed():
     rough = lambda p: [0.01 + 0.02 * np.sin(40 * p[0] + 90 * p[1]), 0.05 * p[0] ** 2 / p[1]]  # noqa: E731
     _, found = studied(Chaos(samples=24), on_mesh(rough), count=8)
     assert 0.005 < found["mesh_error_doubt"][0] < 0.05
-    assert found["mesh_error_doubt"][1] == pytest.approx(DOUBT * found["mesh_error"][1].item(), rel=0.05)
+    assert found["mesh_error_doubt"][1] == pytest.approx(UNCALIBRATED * found["mesh_error"][1].item(), rel=0.05)
     assert any("does not follow" in one.text and "u" in one.text for one in findings(found))
 
 
@@ -259,3 +266,14 @@ def test_results_of_other_shapes_are_left_alone():
     np.testing.assert_allclose(after["nominal_mesh_error"], affine(INPUTS.mean), rtol=1e-3)
     assert "mesh_error" not in after
     assert "quantiles_mesh_error" not in after
+
+
+def test_estimates_are_calibrated_once_at_the_mean():
+    part = replace(on_mesh(affine), seen=0.6)
+    _, plain = studied(Chaos(samples=24), on_mesh(affine))
+    _, found = studied(Chaos(samples=24), part)
+    for name in ("mesh_error", "std_mesh_error", "quantiles_mesh_error", "derivative_mesh_error"):
+        np.testing.assert_allclose(found[name], plain[name], rtol=1e-6)
+    np.testing.assert_allclose(found["mesh_error_saturation"], 1 / 0.6)
+    np.testing.assert_allclose(found["mesh_error_doubt"], DOUBT * abs(found["mesh_error"]), rtol=0.05)
+    np.testing.assert_allclose(plain["mesh_error_doubt"], UNCALIBRATED * abs(plain["mesh_error"]), rtol=0.05)
