@@ -1,8 +1,8 @@
-"""Whether the derivatives that another program's model states are those of its values: one look, at one point.
+"""Whether the stated derivatives of another program's model are those of its values, checked at one point.
 
-Two more evaluations along a direction that moves all parameters; only where these contradict the derivatives, four more
-for each parameter, to name it. An output may have a kink at the point, or be rough: a derivative between the slopes to
-both sides is not objected to, nor one that shorter differences do not contradict in the same way.
+Two more evaluations along a direction that moves all parameters; only if these contradict the derivatives, four more
+for each parameter, to name it. An output may have a kink at the point, or be rough: a derivative between the slopes on
+both sides is accepted, and so is one that shorter differences do not contradict in the same way.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from forward.model import Finding, FloatArray, ForwardModel, SolveError
 
 STEP = 1e-2  # of a difference, in standard deviations
-SHORTER = 4  # times, of the differences that confirm
-SLOPE = 1e-2  # relative error of a derivative that is small enough
-ROUGHNESS = 1e-7  # relative to an output, what its values may be off by
-SAME = 0.1  # of the contradiction, by which differences of both lengths may differ
-MANY = 25  # parameters beyond which they are not looked at one by one
+SHORTER = 4  # ratio of the steps to those of the differences that confirm
+SLOPE = 1e-2  # relative error of a derivative that is accepted
+ROUGHNESS = 1e-7  # error of values of an output, relative to it
+SAME = 0.1  # difference between slopes of both lengths, over the contradiction
+MANY = 25  # number of parameters above which they are not checked one by one
 SHOWN = 3
 
 
@@ -26,14 +26,14 @@ def contradicted(model: ForwardModel, point: FloatArray, scale: FloatArray) -> t
     Parameters
     ----------
     model
-        Any model of outputs; one without derivatives is not looked at.
+        Any model of outputs; one without derivatives is not checked.
     point, scale
-        Where (d,), and how far parameters matter (d,), such as their standard deviations.
+        Parameters (d,), and their scales (d,), such as their standard deviations.
 
     Returns
     -------
     tuple
-        An error that names the worst derivatives, or nothing, as where there is no answer.
+        An error that names the worst derivatives; empty if there is none, or if the model has no answer.
     """
     if not model.differentiable:
         return ()
@@ -93,7 +93,7 @@ def _against(
 def _confirmed(
     model: ForwardModel, point: FloatArray, direction: FloatArray, middle: FloatArray, stated: FloatArray
 ) -> FloatArray:
-    """Slopes (m,) by differences where these contradict the stated ones at both lengths alike; NaN elsewhere."""
+    """Slopes (m,) by differences if these contradict the stated ones equally at both lengths; otherwise NaN."""
     off, closer = (_against(model, point, direction, middle, stated, step) for step in (STEP, STEP / SHORTER))
     sure = (off != 0) & (closer != 0) & (np.abs(off - closer) <= SAME * np.abs(closer))
     return np.where(sure, stated - closer, np.nan)

@@ -1,9 +1,9 @@
-"""Meshes that are refined until they make small errors of outputs: solve, estimate, mark, refine.
+"""Meshes that are refined until the errors of outputs are small: solve, estimate, mark, refine.
 
-The error of an output is the one that elements of one degree more tell (`forward.fem.enriched`), times what the meshes
-before have shown these to miss. Cells are marked by what each adds to it, the fewest that make half of the whole
-(W. Dörfler, SIAM J. Numer. Anal. 33 (1996) 1106–1124), and are bisected (`forward.bodies.bisection`). All of that is on
-arrays of the first rank, in the order of its cells.
+The error of an output is estimated with elements of one degree higher (`forward.fem.enriched`), times a factor for what
+these missed on the previous meshes. Cells are marked by their contributions, the fewest that make half of the total
+(W. Dörfler, SIAM J. Numer. Anal. 33 (1996) 1106–1124), and are bisected (`forward.bodies.bisection`). All of this uses
+arrays on the first rank, in the order of its cells.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ if TYPE_CHECKING:
     from forward.fem.model import FiniteElementSolution
     from forward.hyperelastic import Hyperelastic
 
-BULK = 0.5  # of the sum of all indicators, which the cells that are refined have together
+BULK = 0.5  # share of the refined cells in the sum of all indicators
 TIES = 1e-6  # indicators that differ by less, relative to each other, are equal: symmetric meshes stay so
 # How often a marked cell is bisected. At the corner of an L, quadratic elements, an error of 1 % takes 7 500 unknowns
 # with 1, 9 000 with 2 and 12 000 with 3; but with 1 half as much time again for all meshes together.
 TIMES = 2
-SEEN = 4  # last meshes that tell how much of the error is seen
-MOST = 3.0  # times the estimate: what is missed beyond that is left
+SEEN = 4  # last meshes from which the missed part of the error is estimated
+MOST = 3.0  # largest factor on an estimate
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """What one mesh gave.
+    """The results on one mesh.
 
     Attributes
     ----------
     cells, unknowns
-        How many it has.
+        Their numbers.
     values, errors
-        The outputs (m,), and the errors that the mesh is estimated to make of them: the exact minus these values; NaN
-        where there is no estimate.
+        The outputs (m,), and their estimated errors of the mesh: the exact minus these values; NaN if there is no
+        estimate.
     factors
-        What the errors (m,) were multiplied by, since elements of one degree more do not see all.
+        Factors on the errors (m,), since elements of one degree higher do not capture all.
     seconds
-        Processor time of solve and estimate, on the first rank.
+        Processor time of the solve and the estimate, on the first rank.
     """
 
     cells: int
@@ -64,7 +64,7 @@ class Cycle:
 
     @property
     def sizes(self) -> FloatArray:
-        """What the errors (m,) are relative to: the corrected outputs, or where these are smaller the errors."""
+        """Reference sizes (m,) for relative errors: the corrected outputs, or the errors if these are larger."""
         errors = np.array(self.errors)
         return np.asarray(np.maximum(np.abs(np.array(self.values) + errors), np.abs(errors)))
 
@@ -82,13 +82,13 @@ class Adapted:
     Attributes
     ----------
     mesh, indicators
-        The mesh, and how much each of its cells (c,) adds to the errors, of 1 altogether; on the first rank.
+        The mesh, and the contribution of each of its cells (c,) to the errors, with sum 1; on the first rank.
     contents
-        What the mesh holds.
+        The contents of the mesh.
     cycles
-        What it was before, and at last.
+        All meshes, the last one included.
     stopped
-        Why it is refined no further, if the errors are still above the tolerance.
+        Why it is not refined further, if the errors are still above the tolerance.
     """
 
     mesh: Loaded | None
@@ -114,14 +114,14 @@ def adapt(
     comm
         Communicator of the ranks that share the body.
     parameters, point
-        Paths of the numbers that vary, and their values.
+        Paths of the random parameters, and their values.
     say
-        On the first rank: told a line after each solve.
+        On the first rank: called with a line after each solve.
 
     Raises
     ------
     SolveError
-        If the body has no answer on the mesh that it has.
+        If the body has no answer on its first mesh.
     """
     settings = spec.adapt
     assert settings is not None
@@ -176,10 +176,10 @@ def _cycle(before: tuple[Cycle, ...], spec: Hyperelastic, solution: FiniteElemen
 
 
 def saturation(values: FloatArray, estimates: FloatArray) -> FloatArray:
-    """Return what errors (k, m) that were estimated on k meshes have to be multiplied by, by output (m,).
+    """Return factors (m,) on the errors (k, m) of outputs that were estimated on k meshes.
 
-    If they are the same part 1/s of the right ones on all of the last meshes, ψ_k + s e_k is the same for all, and s is
-    the slope of ψ over −e: between 1 and `MOST`, and 1 as long as there are less than three meshes.
+    If they are the same part 1/s of the true ones on all of the last meshes, ψ_k + s e_k is the same for all, and s is
+    the slope of ψ over −e: between 1 and `MOST`, and 1 if there are fewer than three meshes.
     """
     last, seen = values[-SEEN:], estimates[-SEEN:]
     if len(last) < 3:
@@ -199,7 +199,7 @@ def largest(indicators: FloatArray) -> IntArray:
 
 
 def _too_large(spec: Hyperelastic, most: int) -> str | None:
-    """Say why the mesh is not made, if it is too large."""
+    """Say why the mesh is too large to be made; None if it is not."""
     if spec.unknowns > most:
         return f"the next mesh would have {spec.unknowns:,} unknowns, unknowns = {most:,}"
     needed, left = spec.cost(factors=1).bytes + spec.mesh_error_cost().bytes, headroom()
@@ -211,9 +211,9 @@ def _too_large(spec: Hyperelastic, most: int) -> str | None:
 def _indicators(
     model: HyperelasticModel, solution: FiniteElementSolution, cycle: Cycle, mesh: Loaded | None
 ) -> FloatArray | None:
-    """Return what each cell adds (c,), of 1 altogether, on the first rank; collective.
+    """Return the contributions (c,) of cells, with sum 1, on the first rank; collective.
 
-    Of several outputs, indicators are added with their relative errors; those within the tolerance do not count.
+    Indicators of several outputs are added, weighted by relative errors; outputs within the tolerance do not count.
     """
     spec = model.spec
     assert spec.adapt is not None
