@@ -198,6 +198,9 @@ class MeshError:
         What the estimate has cost.
     seen
         Errors of the outputs (m,) before they were calibrated; None where they are not.
+    nonlinearity
+        How far its linear step was from solving the equations: 0 if they are linear; from 1 on, or NaN, the estimate
+        is worth nothing.
     """
 
     outputs: FloatArray
@@ -206,6 +209,7 @@ class MeshError:
     relative: float
     work: Work
     seen: FloatArray | None = None
+    nonlinearity: float = 0.0
 
     def calibrated(self, saturation: Saturation) -> MeshError:
         """Return the estimate of the whole error, with what elements of one degree more do not see."""

@@ -36,6 +36,7 @@ STEPS = 100  # of conjugate gradients, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 1e-3  # relative tolerance of the same solves
+NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 
 
 class Solved(Protocol):
@@ -68,6 +69,8 @@ class EnrichedState(NamedTuple):
         Half the square of the energy norm of e (J).
     stored
         Energy (J) stored at u_h.
+    nonlinearity
+        |F⁺(u_h + e)·e / F⁺(u_h)·e|: 0 for a linear problem; NaN where u_h + e turns cells inside out.
     work
         Its cost.
     """
@@ -76,6 +79,7 @@ class EnrichedState(NamedTuple):
     change: FloatArray
     energy: float
     stored: float
+    nonlinearity: float
     work: Work
 
     @property
@@ -87,6 +91,23 @@ class EnrichedState(NamedTuple):
 def relative(energy: float, stored: float) -> float:
     """Return the size of an error with an energy (J) relative to a state with a stored energy (J); NaN if that is 0."""
     return float(np.sqrt(max(energy, 0.0) / stored)) if stored > 0 else np.nan
+
+
+def nonlinearity(energy: float, stored: float, after: float) -> float:
+    """Return how far a linear step is from solving the equations: 0 if they are linear, 1 if it is worth nothing.
+
+    The work of the imbalance after the step along it, over that before; ∞ where the stiffness is not positive along it.
+
+    Parameters
+    ----------
+    energy, stored
+        As of `EnrichedState`.
+    after
+        Work (J) of the imbalance after the step along it.
+    """
+    if abs(energy) <= NEGLIGIBLE**2 * stored:
+        return 0.0
+    return abs(after) / (2 * energy) if energy > 0 else np.inf
 
 
 class Enriched:
@@ -173,8 +194,13 @@ class Enriched:
         start = self.up(solution.state)
         # In the mixed form the energy has a saddle point, and the pressures count with the opposite sign.
         energy = 0.5 * equations.curvature(change, forces)
+        equations.set_state(start + change)
+        equations.work.residuals += 1
+        after = equations.curvature(change, equations.imbalance())
         equations.set_state(start)
-        return EnrichedState(start + change, change, energy, float(self._stored()), equations.work)
+        stored = float(self._stored())
+        far = nonlinearity(energy, stored, after)
+        return EnrichedState(start + change, change, energy, stored, far, equations.work)
 
     def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.

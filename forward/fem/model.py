@@ -381,7 +381,9 @@ class FiniteElementSolution:
         found, enriched = self.enriched_state, self._model.enriched
         enriched.visit(self)
         errors = enriched.values(found.state) - self.outputs
-        return MeshError(errors, enriched.down(found.change), found.energy, found.relative, found.work)
+        change = enriched.down(found.change)
+        far = found.nonlinearity
+        return MeshError(errors, change, found.energy, found.relative, found.work, nonlinearity=far)
 
     def saturated(self) -> tuple[Enriched, EnrichedState, float, float] | None:
         """Find the state in elements of two degrees more too, and the factors of state and energy; collective.

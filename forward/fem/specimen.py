@@ -279,7 +279,10 @@ class SpecimenSolution:
         parts = zip(model.models, found, strict=True)
         state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
-        return MeshError(outputs, state, energy, relative(energy, stored), _sum(one.work for one in found))
+        far = max((one.nonlinearity for one in found), key=lambda far: (not np.isfinite(far), far))
+        return MeshError(
+            outputs, state, energy, relative(energy, stored), _sum(one.work for one in found), nonlinearity=far
+        )
 
     def saturation(self) -> Saturation:
         """Calibrate estimates of the error of the mesh by elements of two degrees more; collective.

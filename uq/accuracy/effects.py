@@ -28,12 +28,14 @@ from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion
 from uq.surrogates.linearisation import Linearisation
+from uq.surrogates.regression import NOTHING
 
 if TYPE_CHECKING:
     import xarray as xr
 
 Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
+FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
 ENOUGH = 64  # samples that say by themselves how an output depends on the parameters
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it
@@ -55,17 +57,22 @@ def _has(dataset: xr.Dataset, name: str, *dims: str) -> bool:
 
 
 def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch:
-    """Draw the expansion of a study, or take its samples, or draw the tangents at the mean."""
+    """Draw the expansion of a study, or take its samples, or draw the tangents at the mean.
+
+    The tangents are drawn too of outputs that an expansion does not explain.
+    """
     expanded = "multi_index" in dataset
     if not expanded and _has(dataset, "values", "sample", "output") and _has(dataset, "points", "sample", "parameter"):
         ok = dataset["ok"].to_numpy()
         if ok.sum() >= ENOUGH:
             return Sketch(dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
     points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
-    if expanded:
-        known = Expansion.of(dataset)
-        return Sketch(points, known.basis.values(points) @ known.coefficients)
-    return Sketch(points, centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T)
+    tangents = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
+    if not expanded:
+        return Sketch(points, tangents)
+    known = Expansion.of(dataset)
+    explained = dataset["loo_error"].to_numpy() <= NOTHING if _has(dataset, "loo_error", "output") else True
+    return Sketch(points, np.where(explained, known.basis.values(points) @ known.coefficients, tangents))
 
 
 def with_mesh_errors(
@@ -157,7 +164,7 @@ class _Effect:
         """Error of the standard deviation, which is known, and what its estimates leave open of it."""
         exact = self.outputs + self.errors
         before, after = float(self.outputs.std()), float(exact.std())
-        share = known / before if before else 1.0
+        share = known / before if known < FURTHEST * before else 1.0  # beyond, the sketch says nothing of the spread
         along = covariances(self.functions, exact[:, None])[:, 0] / after if after else np.zeros(len(self.coefficients))
         return share * (after - before), share * max(self._left(along), self.unseen)
 

@@ -22,6 +22,7 @@ from forward.model import (
     ForwardModel,
     Guess,
     InadmissibleError,
+    MeshError,
     ModelError,
     ReferenceSolution,
     Solution,
@@ -513,10 +514,16 @@ class _MeshErrors:
         self.saturations = np.full((n, m + 2), np.nan) if saturations else None
 
     def take(self, i: int, solution: Solution) -> None:
-        """Take those of one; collective. Errors that cannot be calibrated remain estimates."""
+        """Take those of one; collective. Errors that cannot be calibrated remain estimates.
+
+        Raises
+        ------
+        SolveError
+            If the estimate is worth nothing.
+        """
         found = solution.mesh_error()
         if found is not None:
-            self.errors[i] = found.outputs
+            self.errors[i] = _worth(found).outputs
         if self.saturations is None:
             return
         try:
@@ -616,3 +623,17 @@ class Merger:
             np.concatenate(mesh_errors) if mesh_errors else None,
             np.concatenate(saturations) if saturations else None,
         )
+
+
+def _worth(found: MeshError) -> MeshError:
+    """Return an estimate of the error of the mesh.
+
+    Raises
+    ------
+    SolveError
+        If it is worth nothing.
+    """
+    if not found.nonlinearity < 1:
+        message = "richer elements move the body too far for one linear step: the mesh is much too coarse"
+        raise SolveError(message)
+    return found

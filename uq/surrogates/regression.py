@@ -244,6 +244,8 @@ class _Folds:
 def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 
+    Outputs that no choice explains, such as what is zero by symmetry but for rounding, have no say in it if others do.
+
     Raises
     ------
     SolveError
@@ -255,13 +257,41 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     order = np.argsort(held, kind="stable")
     data, held = data.some(order), held[order]
     left, right = data.left(largest), data.right
-    rows, d = right.shape[1], largest.indices.shape[1]
-    scores: list[tuple[float, Candidate, _Folds | None]] = []
+    scores, least = _scores(candidates, left, right, data, held, slice(None))
+    explained = least <= NOTHING
+    if explained.any() and not explained.all():
+        scores, _ = _scores(candidates, left, right, data, held, np.flatnonzero(explained))
+    if not scores:
+        message = f"{n} samples have an answer, too few for an expansion of order 1"
+        raise SolveError(message)
+    best = min(score for score, *_ in scores)
+    # The smallest of those that are equally good.
+    good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
+    fit = _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
+    given = np.argsort(order)
+    return replace(fit, held=fit.held[given], unseen=fit.unseen[given])
+
+
+_Scores = list[tuple[float, Candidate, _Folds | None]]
+
+
+def _scores(
+    candidates: Candidates, left: FloatArray, right: FloatArray, data: Data, held: IntArray, judged: slice | IntArray
+) -> tuple[_Scores, FloatArray]:
+    """Return the largest leave-one-out error of the outputs `judged` by each choice, and the least of each output (m,).
+
+    Choices that the samples do not determine are left out.
+    """
+    n, rows, m = right.shape
+    d = candidates.all.shape[1]
+    scores: _Scores = []
+    least = np.full(m, np.inf)
     for candidate in candidates.sets:
         terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
         if candidate.sparse and (d > FULL or n * rows > d):
             products = _Products.of(left[:, :, candidate.which], held)
-            scores.append(_select(products, right, data, candidate, held, most))
+            score, chosen, folds, relative = _select(products, right, data, candidate, held, most, judged)
+            scores.append((score, chosen, folds))
         elif (
             not candidate.sparse
             and terms <= n * rows
@@ -272,17 +302,14 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
             if size.min() > 1e-10 * size.max():
                 blocks = q.reshape(n, rows, terms)
                 residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
-                scores.append((float(data.relative(_left_out(blocks, residual, held)).max()), candidate, None))
-    scores = [found for found in scores if np.isfinite(found[0])]
-    if not scores:
-        message = f"{n} samples have an answer, too few for an expansion of order 1"
-        raise SolveError(message)
-    best = min(score for score, *_ in scores)
-    # The smallest of those that are equally good.
-    good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]
-    fit = _regress(left, right, data, *min(good, key=lambda found: found[0].which.size))
-    given = np.argsort(order)
-    return replace(fit, held=fit.held[given], unseen=fit.unseen[given])
+                relative = data.relative(_left_out(blocks, residual, held))
+                scores.append((float(relative[judged].max()), candidate, None))
+            else:
+                continue
+        else:
+            continue
+        least = np.fmin(least, relative)
+    return [found for found in scores if np.isfinite(found[0])], least
 
 
 def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatArray:
@@ -350,9 +377,15 @@ class _Products:
 
 
 def _select(
-    products: _Products, right: FloatArray, data: Data, dictionary: Candidate, held: IntArray, most: int
-) -> tuple[float, Candidate, _Folds]:
-    """Select functions one by one, each time the one that explains most of the residuals of all outputs.
+    products: _Products,
+    right: FloatArray,
+    data: Data,
+    dictionary: Candidate,
+    held: IntArray,
+    most: int,
+    judged: slice | IntArray,
+) -> tuple[float, Candidate, _Folds, FloatArray]:
+    """Select functions one by one, each time the one that explains most of the residuals of the outputs `judged`.
 
     Orthogonal least squares, from all samples and, to find when to stop, without those of each number in `held` (n,):
     a selection cannot be judged by the samples that it used. It needs only inner products (the Cholesky factor of the
@@ -360,8 +393,9 @@ def _select(
 
     Returns
     -------
-    float, Candidate, _Folds
-        The relative error at the samples left out, the functions selected from all samples, and those without some.
+    float, Candidate, _Folds, FloatArray
+        The relative error at the samples left out, the functions selected from all samples, and those without some;
+        the least relative error (m,) of each output at any step.
     """
     n, rows, m = right.shape
     columns, parts, folds = products.columns, products.parts, len(products.parts)
@@ -379,13 +413,14 @@ def _select(
     taken: list[IntArray] = []
     scores: list[float] = []
     left_out: list[FloatArray] = []
+    least = np.full(m, np.inf)
     while (step := len(taken)) < limit and (
         not scores or (step - int(np.argmin(scores)) <= PATIENCE and min(scores) > ROUNDING)
     ):
         usable = left_over > 1e-8 * lengths
         if not usable.any(axis=1).all():
             break
-        gains = np.where(usable, (explained**2).sum(axis=2) / np.where(usable, left_over, 1.0), -1.0)
+        gains = np.where(usable, (explained[:, :, judged] ** 2).sum(axis=2) / np.where(usable, left_over, 1.0), -1.0)
         # The constant comes first.
         pick = gains.argmax(axis=1) if taken else np.zeros_like(every)
         likely = np.argsort(-gains.sum(axis=0), kind="stable")[:LIKELY]
@@ -404,11 +439,13 @@ def _select(
             q[part, step] = direction
         taken.append(pick)
         left_out.append(rest.reshape(n, rows, m) * scale)
-        scores.append(float(data.relative(left_out[-1]).max()))
+        relative = data.relative(left_out[-1])
+        least = np.fmin(least, relative)
+        scores.append(float(relative[judged].max()))
     count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
     picks = dictionary.which[np.array(taken[:count])]
     chosen = Candidate(dictionary.order, dictionary.q, picks[:, -1], sparse=True)
-    return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1])
+    return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1]), least
 
 
 def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate, folds: _Folds | None) -> Fit:

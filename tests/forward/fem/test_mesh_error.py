@@ -101,6 +101,23 @@ def test_the_error_of_a_coarse_mesh_is_told(cell):
     assert error.work.factorisations == 1
 
 
+def test_a_mesh_too_coarse_for_one_linear_step_is_told():
+    """Linear tetrahedra that lock: what richer elements add bends far more than a linear step knows."""
+    small, large = (
+        solved(
+            bent(
+                cells=(4, 1, 1),
+                cell="tetrahedron",
+                material={"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": lmbda},
+                loads=({"kind": "traction", "on": "x-max", "direction": (0, 0, -1), "size": size},),
+            )
+        ).mesh_error()
+        for lmbda, size in ((4e4, 4.0), (4e7, 1000.0))
+    )
+    assert small.nonlinearity < 0.1
+    assert not large.nonlinearity < 1
+
+
 QUICK = ("mooney-rivlin", "demiray", "holzapfel-gasser-ogden", *MIXED)
 SLOW = [pytest.param(form, marks=pytest.mark.slow) for form in (*MATERIALS, *MORE_MATERIALS) if form not in QUICK]
 

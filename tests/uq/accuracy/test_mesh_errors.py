@@ -124,6 +124,59 @@ def test_of_every_method_moments_and_quantiles_are_corrected(method):
         np.testing.assert_allclose(found["sobol_first_mesh_error"][1], 0, atol=1e-6)
 
 
+def test_errors_of_what_an_expansion_does_not_explain_are_those_of_its_tangents():
+    """An expansion that is refused has no spread of its own, over which errors would be without bounds."""
+    model = on_mesh(affine)
+    coarse = model.function
+
+    def wild(p):
+        return np.array([coarse(p)[0], coarse(p)[1] + np.sin(1e3 * p[0])])
+
+    exact = replace(model.exact, function=lambda p: wild(p) + np.array(affine(p)))
+    method = Chaos(samples=12, max_order=2, gradients=False)
+    before, found = studied(method, replace(model, function=wild, exact=exact))
+    assert before["loo_error"][1] > 0.8
+    assert (abs(found["std_mesh_error"]) < found["std"]).all()
+    assert (abs(found["mesh_error"]) < 0.5 * abs(found["mean"])).all()
+
+
+def test_shares_beyond_ten_times_are_said_in_words():
+    _, found = studied(MonteCarlo(samples=64), on_mesh(lambda p: [30 * p[0], 0.2 * p[0] ** 2 / p[1]]))
+    (text,) = (one.text for one in findings(found) if "of the mean" in one.text)
+    assert text.endswith("u (more than 10 times it), v 20%.")
+
+
+def test_what_is_zero_by_symmetry_is_not_compared():
+    function = FunctionModel(lambda p: np.array([p[0], 1e-17 * np.sin(1e3 * p[0])]), ("a", "b"), ("u", "v"))
+    exact = replace(function, function=lambda p: np.array([1.2 * p[0], 1e-16]))
+    model = OnMesh(function.function, ("a", "b"), ("u", "v"), lambda p: np.array([[1.0, 0.0], [0.0, 0.0]]), exact)
+    recorder = Recorder(SerialEvaluate(model))
+    dataset = MonteCarlo(samples=64).run(INPUTS, recorder)
+    centre = linearised(INPUTS, recorder, recorder.first)
+    errors = estimate(INPUTS, SerialEvaluate(model), centre, FEWEST, 0, fields=False)
+    found = with_mesh_errors(dataset, INPUTS, centre, errors, {"u": "m", "v": "m"})
+    said = [one.text for one in findings(found) if "mesh" in one.text]
+    assert any("u 20%" in text for text in said)
+    assert not any("v " in text.split(": ", 1)[-1] for text in said)
+
+
+def test_estimates_too_far_for_one_linear_step_are_refused():
+    class Far(SolvedOnMesh):
+        def mesh_error(self):
+            return replace(super().mesh_error(), nonlinearity=np.nan if self.parameters[0] > 1.25 else 2.0)
+
+    class OnCoarse(OnMesh):
+        def solve(self, parameters, guess=None):
+            found = super().solve(parameters, guess)
+            return Far(found.model, found.parameters, found.outputs)
+
+    model = on_mesh(affine)
+    coarse = OnCoarse(model.function, model.parameters, model.outputs, model.jacobian, model.exact)
+    _, found = studied(MonteCarlo(samples=64), coarse)
+    assert np.isnan(found["mesh_error"]).all()
+    assert any("3 of 3 estimates" in one.text and "much too coarse" in one.text for one in findings(found))
+
+
 def test_errors_of_their_own_shape_change_moments_and_indices():
     model = on_mesh(other)
     before, found = studied(Chaos(samples=64, max_order=8), model, count=12)

@@ -69,7 +69,7 @@ def test_selection_by_inner_products_is_that_by_projections():
     held = np.arange(40) // 4
     left = data.left(basis)
     everything = Candidate(3, 0.75, np.arange(left.shape[2]), sparse=True)
-    _, chosen, folds = _select(_Products.of(left, held), data.right, data, everything, held, 12)
+    _, chosen, folds, _ = _select(_Products.of(left, held), data.right, data, everything, held, 12, slice(None))
     scaled = data.right / np.linalg.norm(data.right - data.right.mean(axis=0), axis=(0, 1))
     expected = by_projections(left.reshape(40, -1), scaled, held, chosen.which.size)
     assert chosen.which.tolist() == expected[:, -1].tolist()
@@ -78,6 +78,25 @@ def test_selection_by_inner_products_is_that_by_projections():
         fit = np.linalg.lstsq(left[held != k][:, 0, which], data.right[held != k][:, 0], rcond=None)[0]
         errors = data.right[held == k][:, 0] - left[held == k][:, 0, which] @ fit
         np.testing.assert_allclose(folds.errors[held == k][:, 0], errors, atol=1e-9)
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("d", [2, 6])
+def test_outputs_that_nothing_explains_leave_the_others_theirs(d, gradients):
+    """What is zero by symmetry is rounding that no polynomial follows."""
+    inputs = inputs_of(d)
+    points = inputs.points(sobol_points(3, 0, 0, 24, d))
+    rng = np.random.default_rng(0)
+    smooth = np.exp(points[:, [0]] + points[:, [1]] / 2)
+    slopes = np.zeros((24, 1, d))
+    slopes[:, 0, 0], slopes[:, 0, 1] = smooth[:, 0], smooth[:, 0] / 2
+    noise, its = 1e-17 * rng.standard_normal((24, 2)), 1e-17 * rng.standard_normal((24, 2, d))
+    alone = Regression.of(inputs, points, smooth, slopes if gradients else None, 4)
+    values, tangents = np.hstack([smooth, noise]), np.concatenate([slopes, its], axis=1)
+    both = Regression.of(inputs, points, values, tangents if gradients else None, 4)
+    assert both.fit.chosen.order == alone.fit.chosen.order > 1
+    assert both.fit.relative[0] == pytest.approx(alone.fit.relative[0], rel=1e-6)
+    assert (both.fit.relative[1:] > 0.8).all()
 
 
 def test_few_values_in_ten_parameters():
