@@ -20,6 +20,7 @@ from benchmarks import (
     locking,
     mesh_error,
     meshes,
+    oddities,
     predictions,
     realisation,
     scaling,
@@ -54,11 +55,18 @@ ALL = {
     "skewed": skewed.main,
     "coverage": coverage.main,
     "meshes": meshes.main,
+    "oddities": oddities.main,
     "scaling": scaling.main,
     "startup": startup.main,
     "adaptive": adaptive.main,
 }
-WITH_OPTIONS = {"tails": tails.main, "coverage": coverage.main, "meshes": meshes.main}
+WITH_OPTIONS = {
+    "chaos": chaos.main,
+    "tails": tails.main,
+    "coverage": coverage.main,
+    "meshes": meshes.main,
+    "oddities": oddities.main,
+}
 
 
 def main() -> int:

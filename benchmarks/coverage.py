@@ -13,7 +13,7 @@ import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
 from uq.estimators.moments import half_width
-from uq.evaluation.evaluate import Evaluations, Request
+from uq.evaluation.evaluate import Evaluations, Failure, Request
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -178,15 +178,16 @@ class Vectorised:
             columns = [self.case.function(points + step).imag / 1e-30 for step in steps]
             tangents = np.stack(columns, axis=1)[:, None, :]
         values = np.real(self.case.function(points))[:, None]
+        lost = np.flatnonzero(np.isnan(values[:, 0]))
         return Evaluations(
             points,
             values,
             tangents,
-            (),
+            tuple(Failure(int(i), tuple(points[i].tolist()), "not a number") for i in lost),
             np.full(n, 1e-3),
             np.zeros((n, len(WORK)), dtype=np.int64),
             np.zeros(n),
-            np.ones(n, dtype=bool),
+            ~np.isnan(values[:, 0]),
             np.zeros(n, dtype=np.int8),
             np.zeros((0, 0)),
         )
@@ -200,7 +201,7 @@ def truth(case: Case, probabilities: tuple[float, ...]) -> tuple[FloatArray, Flo
     for scramble in range(16):
         points = case.inputs.points(sobol_points(1, scramble, 0, 2**REFERENCE, d))
         values = np.real(case.function(points))
-        rows.append([values.mean(), values.std(), *np.quantile(values, probabilities)])
+        rows.append([np.nanmean(values), np.nanstd(values), *np.nanquantile(values, probabilities)])
     exact, floor = np.mean(rows, axis=0), np.std(rows, axis=0) / 15**0.5
     if case.exact is not None:
         exact[:2], floor[:2] = case.exact, 0.0
@@ -284,7 +285,8 @@ def measure(case: Case, method: Any, repeats: int) -> Row:
             low, high = (data[f"quantiles_{side}"].to_numpy()[:, 0] for side in ("lower", "upper"))
             within[2:] |= (low <= exact[2:]) & (exact[2:] <= high)
         rows.append((within, claims / half, np.abs(estimates - exact)))
-        warned.append(any(f["severity"] != "note" for f in _findings(data)))
+        # A note says that solves have failed and how these were counted.
+        warned.append("note" in data.attrs or any(f["severity"] != "note" for f in _findings(data)))
     if not rows:
         nothing = np.full(len(exact), np.nan)
         return Row(nothing, nothing, nothing, 1.0, lost)

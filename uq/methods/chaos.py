@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
-from uq.estimators.doubts import of_centre, of_field, of_indices
+from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
 from uq.estimators.indices import coefficient_moments, shares
 from uq.estimators.moments import Quantiles, Z, quantiles, student
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
@@ -28,6 +28,7 @@ from uq.surrogates.basis import gauss, orthonormal
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
+    beyond_of_field,
     errors_of_indices,
     regression_of_field,
     relative_of_field,
@@ -279,7 +280,10 @@ def expansion_dataset(
         dataset = dataset.assign(
             _field_estimates(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
         )
-        add(dataset, *of_field(relative_of_field(field), TRUSTED, NOTHING))
+        left = relative_of_field(field)
+        add(dataset, *of_field(left, TRUSTED, NOTHING))
+        reach = np.array([beyond_of_field(field)])
+        add(dataset, *of_reach(["the displacement field"], reach, np.array([left]), len(data.points)))
     dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:

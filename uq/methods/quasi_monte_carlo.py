@@ -9,7 +9,7 @@ The three controls share the scrambles and their sums, hence one file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import comb
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
-from uq.estimators.doubts import influences, of_control, of_tails
+from forward.model import Finding, FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
+from uq.estimators.doubts import influences, of_control, of_field_tails, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
     Coefficient,
@@ -239,6 +239,7 @@ class QuasiMonteCarlo(MonteCarlo):
         field = samples.field()
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
+            add(dataset, *samples.field_doubts(field))
         amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
         reached = float(scalars.relative_error.max())
         error = f"relative error {reached:.3g}"
@@ -262,7 +263,7 @@ def _products(deviation: FloatArray, controls: tuple[FloatArray, FloatArray] | N
 
 @dataclass(frozen=True)
 class _FieldProducts:
-    """Sum of the products of the state's deviation and of its control."""
+    """Sum of the products of the state's deviation and of its control, and of its third and fourth power."""
 
     state: FloatArray
     control: Control | None
@@ -276,7 +277,8 @@ class _FieldProducts:
             controls = None
             if control is not None and coefficients is not None:
                 controls = control.predict(control.features(parameters), coefficients)
-            return _products(solution.state - state, controls)
+            deviation = solution.state - state
+            return np.concatenate([_products(deviation, controls), [deviation**3, deviation**4]])
 
         return rows
 
@@ -314,6 +316,7 @@ class _Samples:
         self.outputs = np.empty((R, 0, m))
         self.ok = np.empty((R, 0), dtype=bool)
         self._sums: list[FloatArray | None] = [None] * R
+        self._higher: FloatArray | None = None
         self._reasons: set[str] = set()
 
     @property
@@ -344,8 +347,9 @@ class _Samples:
                 found = self._ask(Request(points[r], fields=wanted, start=self._start))
                 outputs[r], ok[r] = found.outputs, found.ok
                 if found.fields.size:
-                    kept = self._sums[r]
-                    self._sums[r] = found.fields if kept is None else kept + found.fields
+                    kept, products, higher = self._sums[r], found.fields[:-2], found.fields[-2:]
+                    self._sums[r] = products if kept is None else kept + products
+                    self._higher = higher if self._higher is None else self._higher + higher
         else:
             found = self._ask(Request(points.reshape(-1, d), start=self._start))
             outputs, ok = found.outputs.reshape(outputs.shape), found.ok.reshape(ok.shape)
@@ -383,24 +387,30 @@ class _Samples:
         tails = counted(found, self._inputs, self.outputs[:, :each][ok])
         if self._method.control not in ("quadratic", "chaos"):
             return tails
-        known = np.hypot(found.std_error, self._unseen(each))
-        return replace(found, std_error=np.where(found.second_coefficient == 0, tails.std_error, known))
+        of_mean, of_std = self._unseen(each)
+        known = np.hypot(found.std_error, of_std)
+        return replace(
+            found,
+            mean_error=np.where(found.coefficient == 0, found.mean_error, np.hypot(found.mean_error, of_mean)),
+            std_error=np.where(found.second_coefficient == 0, tails.std_error, known),
+        )
 
-    def _unseen(self, each: int) -> FloatArray:
-        """Error (m,) of the standard deviation from regions without samples, where a polynomial is the control.
+    def _unseen(self, each: int) -> Pair:
+        """Errors (m,) of mean and standard deviation from regions without samples, where a polynomial is the control.
 
         With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
-        about 2λ√b σ, with λ in proportion to that at the samples, which have 1 − b of the variance. A tangent does not
-        grow faster than what it stands for.
+        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there, with λ in proportion to that
+        at the samples, which have 1 − b of the variance. A tangent does not grow faster than what it stands for.
         """
         control = self._control
         controls = self._controls(each)
         assert control is not None
         assert controls is not None
         ok = self.ok[:, :each]
-        outside = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
+        outside, probability = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
         left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
-        return np.asarray(left.std(axis=0) * np.sqrt(outside) / np.maximum(1 - outside, 1 / ok.sum()))
+        norm = left.std(axis=0) * np.sqrt(outside) / np.maximum(1 - outside, 1 / ok.sum())
+        return norm * np.sqrt(probability), norm
 
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
@@ -420,16 +430,21 @@ class _Samples:
         return controls, control.expected(control.outputs)
 
     def _which_held(self, each: int) -> NDArray[np.bool_]:
-        """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own."""
+        """Of which outputs (m,) the expansion predicts the samples worse than when it is held beyond its own.
+
+        By samples that tell the two apart: one hardly beyond says nothing, and what is held wrongly errs where no
+        sample is.
+        """
         if self._control is None or self._held is None:
             return np.zeros(self.outputs.shape[2], dtype=bool)
         ok = self.ok[:, :each]
         deviations = self.outputs[:, :each][ok] - self._centre.outputs
         whole, held = (
-            ((deviations - control.predict(control.features(self.points[:, :each][ok]), control.outputs)[0]) ** 2)
+            deviations - control.predict(control.features(self.points[:, :each][ok]), control.outputs)[0]
             for control in (self._control, self._held)
         )
-        return np.asarray(whole.sum(axis=0) > held.sum(axis=0))
+        told = 2 * np.abs(whole - held) > np.maximum(np.abs(whole), np.abs(held))
+        return np.asarray(np.where(told, whole**2 - held**2, 0.0).sum(axis=0) > 0)
 
     def influences(self, found: Estimates) -> FloatArray | None:
         """By how much each sample (n, m) that has an answer moves the variance, with controls."""
@@ -440,6 +455,14 @@ class _Samples:
         C, D = (self.in_order(control)[ok] for control in known[0])
         first = self.in_order(self.outputs)[ok] - self._centre.outputs
         return influences(first - found.coefficient * C, first**2 - found.second_coefficient * D)
+
+    def field_doubts(self, found: Estimates) -> Iterator[Finding]:
+        """Find what speaks against the estimates of the displacements."""
+        count, sums = self._evaluate.displacements, [one for one in self._sums if one is not None]
+        assert self._higher is not None
+        powers = np.concatenate([np.sum([one[:2, :count] for one in sums], axis=0), self._higher[:, :count]])
+        volumes = self._evaluate.node_volumes
+        yield from of_field_tails(powers, int(self.ok.sum()), found.relative_std_error[:count], volumes)
 
     def field(self) -> Estimates | None:
         """Estimate the moments of the state, where its sums were kept."""

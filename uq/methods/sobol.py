@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
-from forward.model import FloatArray, ForwardModel, SolveError, scattered
+from forward.model import Finding, FloatArray, ForwardModel, SolveError, scattered
 from forward.settings import nearest
-from uq.estimators.doubts import of_indices, of_tails
+from uq.estimators.doubts import of_field_tails, of_indices, of_tails
 from uq.estimators.indices import (
     Analysis,
     ExchangedVariances,
@@ -428,7 +428,7 @@ def _added(one: FloatArray | None, other: FloatArray | None) -> FloatArray | Non
 
 @dataclass(frozen=True)
 class _FieldProducts:
-    """Sum of the products of the state's deviations in a row."""
+    """Sum of the products of the state's deviations in a row, and of third and fourth powers at the points A and B."""
 
     products: RowProducts
     size: int
@@ -437,13 +437,19 @@ class _FieldProducts:
     def on(self, model: ForwardModel) -> Callable[[FloatArray], FloatArray]:
         state = scattered(model, self.state[None, :])[0]
         used = self.products.size
-        return lambda states: self.products.of(states[:used] - state)
+
+        def rows(states: FloatArray) -> FloatArray:
+            deviations = states[:used] - state
+            higher = [(deviations[:2] ** k).mean(axis=0) for k in (3, 4)]
+            return np.concatenate([self.products.of(deviations), higher])
+
+        return rows
 
 
 class _Rows:
     """All rows, in parts of as many rows each, and the sums of the fields over each part.
 
-    The sums are kept for every part: R (3 (d + groups) + 3) fields on rank 0.
+    The sums are kept for every part: R (3 (d + groups) + 5) fields on rank 0.
 
     Attributes
     ----------
@@ -545,14 +551,14 @@ class _Rows:
             found["sobol_second"] = np.moveaxis(shares(parts.second, parts.variance), (0, 1), (-2, -1))
         return found
 
-    def field(self) -> Variables:
-        """Moments and indices of the displacement field; errors of the generalised ones by leaving a part out."""
+    def field(self) -> tuple[Variables, list[Finding]]:
+        """Moments and indices of the displacement field, errors by leaving a part out, and what speaks against them."""
         rows = self._cut(self.ok, self.each).sum(axis=1)
         kept = [(total, n) for total, n in zip(self._sums, rows, strict=True) if total is not None]
         if not kept:
-            return {}
+            return {}, []
         count, d = self._evaluate.displacements, len(self._inputs.names)
-        sums = [total[:, :count] for total, _ in kept]
+        sums = [total[:-2, :count] for total, _ in kept]
         counts = [n for _, n in kept]
         whole, n = np.sum(sums, axis=0), sum(counts)
         volumes = self._evaluate.node_volumes
@@ -573,7 +579,10 @@ class _Rows:
         square = self._of_fields.size
         means = [[(s[0] + s[1]) / (2 * c), s[square] / c] for s, c in zip(sums, counts, strict=True)]
         moments = estimate_from_replicates(np.swapaxes(np.array(means), 0, 1), self._centre.state[:count])
-        return found | by_node(moments, count)
+        higher = np.sum([total[-2:, :count] for total, _ in kept], axis=0)
+        powers = np.array([whole[0] + whole[1], 2 * whole[square], *(2 * higher)])
+        doubts = of_field_tails(powers, 2 * n, moments.relative_std_error, volumes)
+        return found | by_node(moments, count), list(doubts)
 
     def dataset(self, found: dict[str, FloatArray]) -> xr.Dataset:
         """Return all estimates as labelled arrays."""
@@ -587,6 +596,7 @@ class _Rows:
         rounds = [1 << k for k in range(self.each.bit_length()) if self._usable(1 << k).sum() > 1]
         moments = {each: self._moments(each) for each in rounds}
         running = {each * self._parts * K: self.indices(each) for each in rounds}
+        of_field, doubts = self.field()
         by_output = ("output",)
         dataset = local_dataset(self._inputs, self._evaluate, centre, fields=method.fields)
         dataset = dataset.assign_coords(
@@ -605,9 +615,10 @@ class _Rows:
                     for name in ("mean", "mean_error")
                 },
                 **_running(running),
-                **self.field(),
+                **of_field,
             }
         )
+        add(dataset, *doubts)
         last = moments[self.each].relative_std_error
         add(dataset, *of_tails(self._evaluate.outputs, values[independent], last))
         lost = int((~self.ok).sum())

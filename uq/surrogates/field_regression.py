@@ -251,6 +251,15 @@ def errors_of_indices(regression: Regression) -> dict[str, FloatArray]:
 
 def relative_of_field(regression: Regression) -> float:
     """Return the leave-one-out error of the field over its standard deviation, from all sketches together."""
-    fit = regression.fit
-    variances = shares(fit.loo**2, fit.relative**2)
-    return float(np.sqrt(shares((fit.loo**2).sum(), variances.sum())))
+    return float(np.sqrt(shares((regression.fit.loo**2).sum(), _variances(regression.fit).sum())))
+
+
+def beyond_of_field(regression: Regression) -> float:
+    """Return the share of the variance of the fit to the field from where there are no samples, see `beyond`."""
+    variances = _variances(regression.fit)
+    return float(shares(variances @ regression.beyond, variances.sum()))
+
+
+def _variances(fit: Fit) -> FloatArray:
+    """Variances (k,) of the sketches."""
+    return shares(fit.loo**2, fit.relative**2)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, SolveError
-from uq.estimators.doubts import influences, of_expansion, of_reach, of_tails
+from uq.estimators.doubts import influences, of_constants, of_expansion, of_reach, of_tails
 from uq.estimators.indices import Analysis, coefficient_moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.evaluation.evaluate import Evaluations
@@ -40,6 +40,7 @@ FOLDS = 10  # parts of the samples that are left out in turn to choose the funct
 ROUNDING = 1e-13  # relative error below which no function is added
 LIKELY = 24  # functions whose inner products are computed together
 ROUGH = 0.1  # relative leave-one-out error above which the error of the mean counts that of the samples
+CLOSE = 0.03  # relative leave-one-out error above which the tails of the samples matter
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 NOTHING = 0.8  # the same, above which a fit tells nothing about which parameters matter
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
@@ -511,16 +512,16 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
 
 def beyond(
     inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
-) -> FloatArray:
-    """Share (m,) of the variance of an expansion (P, m) that comes from tails beyond all points (n, d)."""
+) -> tuple[FloatArray, float]:
+    """Share (m,) of the variance of an expansion (P, m) from tails beyond all points (n, d), and their probability."""
     tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
     if not tails.any():
-        return np.zeros(coefficients.shape[1])
+        return np.zeros(coefficients.shape[1]), 0.0
     drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(tails)))
     outside = (((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails).any(axis=1)
     values = functions(drawn) @ coefficients
     squares = (values - values.mean(axis=0)) ** 2
-    return shares(squares[outside].sum(axis=0), squares.sum(axis=0))
+    return shares(squares[outside].sum(axis=0), squares.sum(axis=0)), float(outside.mean())
 
 
 @dataclass(frozen=True)
@@ -600,7 +601,7 @@ class Regression:
     @property
     def beyond(self) -> FloatArray:
         """Share (m,) of the variance of the fit that comes from where there are no samples."""
-        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)
+        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
 
     @property
     def controlled(self) -> BoolArray:
@@ -610,10 +611,11 @@ class Regression:
     def doubts(self, names: Sequence[str]) -> Iterator[Finding]:
         """Find reasons to doubt the estimates of these outputs."""
         n = len(self.data.points)
+        yield from of_constants(names, self.data.values)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
         yield from of_reach(names, self.beyond, self.fit.relative, n)
         if np.ptp(self.data.weights) == 0:
-            which = np.flatnonzero(self.controlled)
+            which = np.flatnonzero(self.fit.relative > CLOSE)
             first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
             yield from of_tails(
                 [names[i] for i in which],
@@ -657,13 +659,14 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
     bias = shares(fit.loo**2, 2 * central["std"])
     whole: FloatArray = np.where(trusted, central["std"], seen["std"])
     share = shares(fit.loo**2, whole**2)
+    unsure = _unsure(fit)
     further = {
         "mean": np.sqrt(
-            tails**2 / n
+            np.maximum(tails, unsure) ** 2 / n
             + (seen["mean"] - central["mean"]) ** 2 / 4
             + np.where(fit.relative > ROUGH, seen["mean_error"], 0.0) ** 2
         ),
-        "std": np.sqrt(tails**2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
+        "std": np.sqrt(np.maximum(tails, unsure) ** 2 + bias**2 + (seen["std"] - central["std"]) ** 2 / 4),
     }
     for name, values in left_out.items():
         spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
@@ -681,6 +684,16 @@ def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None,
             central[f"{name}_error"] = np.where(something, np.hypot(spread, share.reshape(by_index)), np.nan)
             central[name] = np.where(something, central[name], np.nan)
     return central
+
+
+def _unsure(fit: Fit) -> FloatArray:
+    """Norm (m,) of what a fit may leave beyond its leave-one-out error λ, which n samples know to λ√(κ/n).
+
+    κ is the kurtosis of the errors at samples that are left out: few of them decide λ where a function grows towards
+    an end of a range, and there it is larger still where none of few samples is.
+    """
+    squares = fit.unseen**2
+    return np.asarray(np.sqrt(shares((squares**2).mean(axis=0), squares.sum(axis=0))))
 
 
 def _unseen(fit: Fit, largest: IntArray, data: Data) -> dict[str, FloatArray]:

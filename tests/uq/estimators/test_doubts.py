@@ -7,6 +7,7 @@ import xarray as xr
 from benchmarks import tails
 from benchmarks.coverage import CASES, Vectorised, measure
 from forward.model import FunctionModel
+from tests.states import WithState
 from uq.estimators.doubts import of_indices
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.findings import findings
@@ -227,3 +228,75 @@ def test_intervals_cover_what_is_not_smooth(name):
         # 88 % of 24 are 21, three standard errors below that 16.
         assert (row.covered >= 16 / 24).all(), (method.kind, row.covered)
         assert (row.claimed[:2] < 6).all(), (method.kind, row.claimed)
+
+
+# --- fields, and samples that are all equal ------------------------------------------------------------------------
+
+STANDARD = Normal(mean=0.0, std=1.0)
+NODES = 10
+
+
+def body(heavy):
+    """Displacements of ten nodes, of which the first ones move by the exponential of a normal parameter."""
+
+    def states(p):
+        moved = np.exp(1.2 * p[0]) * (np.arange(NODES) < heavy) + (p[0] + p[1]) * (np.arange(NODES) >= heavy)
+        return np.stack([moved, 0 * moved, 0.1 * moved], axis=1).ravel()
+
+    def slopes(p):
+        return [[np.imag(states(p + 1e-30j * e)[-3]) / 1e-30 for e in np.eye(2)]]
+
+    inputs = Inputs(dict.fromkeys("ab", STANDARD))
+    return inputs, WithState(lambda p: p[0] + p[1], inputs.names, ("f",), slopes, states)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        MonteCarlo(samples=128),
+        SensitivityMonteCarlo(samples=128),
+        QuasiMonteCarlo(samples=128, control="none"),
+        QuasiMonteCarlo(samples=128, control="quadratic"),
+        Sobol(design="saltelli", samples=128),
+    ],
+    ids=("plain", "tangent", "qmc", "qmc, quadratic", "sobol"),
+)
+def test_a_heavy_tail_in_a_part_of_the_field_is_found_with_its_share(method):
+    """The output itself is normal, and says nothing."""
+    for heavy, share in ((0, None), (3, "30%"), (10, "100%")):
+        inputs, model = body(heavy)
+        texts = [one.text for one in findings(method.run(inputs, SerialEvaluate(model))) if one.severity == "warning"]
+        found = [text for text in texts if "displacements" in text]
+        assert len(found) == (share is not None)
+        assert share is None or f"in {share} of the body" in found[0]
+
+
+def test_a_field_whose_variance_is_beyond_its_samples_is_found():
+    inputs, model = body(10)
+    texts = [one.text for one in findings(Chaos(samples=8).run(inputs, SerialEvaluate(model)))]
+    assert any("of the variance of the displacement field" in text for text in texts)
+    inputs, model = body(0)
+    assert findings(Chaos(samples=8).run(inputs, SerialEvaluate(model))) == []
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        MonteCarlo(samples=64),
+        QuasiMonteCarlo(samples=64),
+        Chaos(samples=16),
+        Sobol(samples=16),
+        Sobol(design="saltelli", samples=16),
+    ],
+    ids=("plain", "qmc", "chaos", "sobol", "sobol, exchanged"),
+)
+def test_samples_that_are_all_equal_do_not_claim_an_error_of_nothing_in_silence(method):
+    """An event of 0.1 % that no sample meets, and a constant: they look the same."""
+    inputs = Inputs(dict.fromkeys("ab", UNIT))
+    for event in (lambda p: float(p[0] > 0.999), lambda p: 3.0):
+        model = FunctionModel(event, inputs.names, ("f",), lambda p: [[0.0, 0.0]])
+        data = method.model_copy(update={"fields": False}).run(inputs, SerialEvaluate(model))
+        assert data["std_error"].item() < 1e-15
+        (found,) = findings(data)
+        assert found.severity == "warning"
+        assert "If it is no constant" in found.text

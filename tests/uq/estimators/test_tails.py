@@ -89,3 +89,23 @@ def test_what_is_smooth_and_ends_is_no_false_alarm():
     for method in (MonteCarlo(samples=64, fields=False), QuasiMonteCarlo(samples=64, fields=False)):
         runs = [method.model_copy(update={"seed": seed}).run(case.inputs, Vectorised(case)) for seed in range(12)]
         assert sum(findings(run) != [] for run in runs) <= 1
+
+
+def test_scrambles_that_agree_by_chance_claim_what_their_samples_do():
+    """An event of 3 %: of 32 points in each of four scrambles one has it, and there is no scatter at all."""
+    case = Case(
+        "event",
+        lambda x: np.where(np.real(x[:, 0] + x[:, 1]) < 0.245, 1.0, 0.0),
+        inputs=Inputs(dict.fromkeys("ab", UNIT)),
+    )
+    agreed = 0
+    for seed in range(12):
+        data = QuasiMonteCarlo(samples=128, scrambles=4, seed=seed, fields=False, control="none").run(
+            case.inputs, Vectorised(case)
+        )
+        shares = data["values"].to_numpy()[:, 0].reshape(32, 4).mean(axis=0)
+        if np.ptp(shares) == 0 and shares[0] > 0:
+            agreed += 1
+            assert data["mean_error"].item() == pytest.approx((shares[0] * (1 - shares[0]) / 127) ** 0.5, rel=1e-3)
+            assert abs(data["std"].item() - (0.03 * 0.97) ** 0.5) < 2 * data["std_error"].item()
+    assert agreed > 1

@@ -14,6 +14,7 @@ from tests.launch import run_script
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Request, SerialEvaluate
+from uq.findings import findings
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods import chaos
@@ -180,7 +181,8 @@ def test_an_output_that_does_not_vary(constant, gradients):
     assert data["mean"].sel(output="c").item() == pytest.approx(constant, rel=1e-13, abs=1e-15)
     assert data["std"].sel(output="c").item() <= 1e-13 * abs(constant)
     assert np.isnan(data["density"].sel(output="c")).all()
-    assert " of c " not in data.attrs.get("findings", "")
+    (found,) = (one for one in findings(data) if " of c " in one.text)
+    assert "If it is no constant" in found.text
     assert data["loo_error"].sel(output="f").item() == pytest.approx(one["loo_error"].item(), rel=1e-6)
 
 

@@ -258,6 +258,22 @@ def test_a_control_that_grows_where_nothing_is_sampled_is_dropped():
         assert "mean and standard deviation are estimated without" in found.text
 
 
+def test_an_expansion_is_held_only_where_samples_tell_that_it_goes_wrong():
+    """The borehole: the expansion is right beyond its samples, and one hardly beyond them misses it by chance."""
+    case = next(case for case in coverage.CASES if case.name == "borehole")
+    data = QuasiMonteCarlo(samples=256, control="chaos", seed=24, fields=False).run(case.inputs, Vectorised(case))
+    # Held, it was off by 0.020 and claimed 0.0026 (95 %).
+    assert abs(data["mean"].item() - 73.7389) < 0.005
+
+
+def test_claims_of_means_count_what_no_sample_has_seen(monkeypatch):
+    monkeypatch.setattr(coverage, "REFERENCE", 8)
+    case = next(case for case in tails.cases() if case.name == "product, cv 0.5")
+    row = measure(case, QuasiMonteCarlo(samples=64, control="chaos", fields=False), 40)
+    assert row.covered[0] >= 0.88  # it was 0.8
+    assert row.claimed[0] < 2
+
+
 def test_claims_of_polynomial_controls_count_what_no_sample_has_seen(monkeypatch):
     monkeypatch.setattr(coverage, "REFERENCE", 8)
     case = next(case for case in tails.cases() if case.name == "sum, cv 0.5")
@@ -274,8 +290,9 @@ def test_an_optimal_coefficient_mends_a_control_that_hurts():
     hurt = repeats(wrong, 12, samples=256, control="tangent")
     mended, right = (repeats(of, 12, samples=256, control="tangent", coefficient="optimal") for of in (wrong, PRODUCT))
     np.testing.assert_allclose(mended, right, rtol=1e-6, atol=1e-12)
-    # It is dropped where it hurts, and what is claimed is what plain samples claim.
-    assert (np.abs(hurt).mean(axis=1)[[1, 3]] > 1.1 * np.abs(mended).mean(axis=1)[[1, 3]]).all()
+    # It is dropped where it hurts, and what is claimed is what plain samples claim: more than with the fitted one,
+    # which counts what its fit to 16 scrambles hides.
+    assert (np.abs(hurt).mean(axis=1)[[1, 3]] > 1.05 * np.abs(mended).mean(axis=1)[[1, 3]]).all()
     none = repeats(PRODUCT, 12, samples=256, control="none")
     assert (np.abs(hurt).mean(axis=1)[[1, 3]] <= 1.01 * np.abs(none).mean(axis=1)[[1, 3]]).all()
     slopes = [
