@@ -22,7 +22,7 @@ Scalars and fields, with and without controls, use the same sums: one file, so t
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ ESTIMATES = ("mean", "mean_error", "std", "std_error")
 ONE_SIDED = 0.975  # probability on one side of a 95 % interval
 Z = 1.96
 MORE = 0.5  # over n − 1: relative increase of the scatter of n samples from which a control is dropped
+FITTED = 3  # samples up to which the error of a fitted coefficient cannot be estimated
 EXPONENTS = tuple((a, total - a) for total in range(1, 5) for a in range(total, -1, -1))
 POWERS = [i for i, (_, b) in enumerate(EXPONENTS) if b == 0]  # of w alone
 
@@ -275,6 +276,29 @@ def estimate(
         variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
         std_variance_ratio=ratio(_scatter_of_variance(plain), n * variance_error**2, empty=1.0),
     )
+
+
+def estimate_from_samples(
+    w: FloatArray,
+    L: FloatArray,
+    offset: FloatArray,
+    control_variance: FloatArray,
+    coefficient: Coefficient = "one",
+    second_moment: SecondMoment = "quadratic",
+) -> Moments:
+    """Estimate mean and standard deviation from the deviations w and controls L (n, …) of all samples, as `estimate`.
+
+    The errors of "optimal" coefficients also count what their fit hides, which the sums over samples do not tell.
+    """
+    n = len(w)
+    found = estimate(monomials(w, L).sum(axis=1), n, offset, control_variance, coefficient, second_moment)
+    if coefficient == "one" or n <= FITTED:
+        return found
+    squares = L**2 if second_moment == "quadratic" else np.zeros_like(L)
+    means = np.array([w, w**2, L, squares])  # every sample is a replicate of one
+    expected = np.zeros_like(control_variance), squares.any() * control_variance
+    fitted = estimate_from_replicates(means, offset, expected, "optimal")
+    return replace(found, mean_error=fitted.mean_error, std_error=fitted.std_error)
 
 
 def estimate_from_replicates(

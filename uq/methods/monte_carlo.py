@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from uq.estimators.moments import (
     Moments,
     SecondMoment,
     estimate,
-    estimate_from_replicates,
+    estimate_from_samples,
     monomials,
     quantiles,
 )
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
 MOST_GROWTH = 4.0  # growth of the number of samples between checks
-FITTED = 3  # samples up to which the error of a fitted coefficient cannot be estimated
 UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
@@ -197,15 +196,7 @@ def _scalar_moments(
     deviations, slopes = values - centre.middle, centre.output_slopes
     predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
     variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
-    found = estimate(monomials(deviations, predictions).sum(axis=1), n, centre.middle, variance, *control)
-    coefficient, second_moment = control
-    if coefficient == "optimal" and n > FITTED:
-        # All samples are at hand, as replicates of one: what the fit of the coefficients hides can be told.
-        squares = predictions**2 if second_moment == "quadratic" else np.zeros_like(predictions)
-        means = np.array([deviations, deviations**2, predictions, squares])
-        expected = np.zeros_like(variance), squares.any() * variance
-        fitted = estimate_from_replicates(means, centre.middle, expected, "optimal")
-        found = replace(found, mean_error=fitted.mean_error, std_error=fitted.std_error)
+    found = estimate_from_samples(deviations, predictions, centre.middle, variance, *control)
     return counted(found, inputs, values)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from uq.estimators.moments import Coefficient, Moments, estimate, half_width, monomials
+from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, count_axis, quantity, text_of
 
 if TYPE_CHECKING:
@@ -44,10 +44,10 @@ def running_estimates(
         sums = monomials(deviations, None).cumsum(axis=1)
         return [estimate(sums[:, n - 1], n, nominal) for n in counts]
     steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
-    sums = monomials(deviations, steps @ dataset["derivative"].sel(output=output).to_numpy()).cumsum(axis=1)
+    controls = steps @ dataset["derivative"].sel(output=output).to_numpy()
     coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
     unused = np.zeros_like(nominal)  # the variance of the control, on which the mean does not depend
-    return [estimate(sums[:, n - 1], n, nominal, unused, coefficient) for n in counts]
+    return [estimate_from_samples(deviations[:n], controls[:n], nominal, unused, coefficient) for n in counts]
 
 
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
