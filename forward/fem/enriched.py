@@ -4,12 +4,14 @@ With u_h the solution on V_h, V⁺ ⊃ V_h the enriched space and F⁺, K⁺ the
 K⁺(u_h) e = −F⁺(u_h) estimates the error of the whole state, and ψ⁺(u_h + e) − ψ(u_h) that of an output ψ. To first
 order this is the dual-weighted residual −F⁺(u_h; z⁺) with the adjoint z⁺ ∈ V⁺ of every output (R. Becker, R. Rannacher,
 An optimal control approach to a posteriori error estimation, Acta Numerica 10 (2001) 1–102), without one adjoint each.
-Prescribed unknowns keep their values on V_h. V⁺ has an error too: the part that e misses is called saturation.
+Where F⁺(u_h + e) is not small, more steps of Newton's method follow: outputs of second order need them. Prescribed
+unknowns keep their values on V_h. V⁺ has an error too: the part that e misses is called saturation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -37,29 +39,60 @@ ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 1e-3  # relative tolerance of the same solves
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
+BENT = 0.05  # nonlinearity above which more steps are made
+MORE = 4  # of these, at most
+AFFORDED = 40_000  # unknowns up to which they have a factor of their own, where the first one does without
+BARELY = 0.3  # nonlinearity up to which a larger body does without them
 
 
 class Solved(Protocol):
-    """A solution of the body.
+    """A solution of the body."""
 
-    Attributes
-    ----------
-    parameters, state
-        Parameters (d,) and this rank's part (U_local,) of the state.
-    reference
-        The nearby solution whose factor was used to find it.
-    """
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters (d,)."""
 
-    parameters: FloatArray
-    state: FloatArray
-    reference: ReferenceSolution | None
+    @property
+    def state(self) -> FloatArray:
+        """This rank's part (U_local,) of the state."""
+
+    @property
+    def reference(self) -> ReferenceSolution | None:
+        """The nearby solution whose factor was used to find it."""
 
     def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
         """Solve with the stiffness of the body at this state, or its transpose, for rows (k, U_local)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """A solution of the body, moved to a state (U⁺_local,) of the enriched space."""
+
+    origin: Solved
+    enriched: FloatArray
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters (d,)."""
+        return self.origin.parameters
+
+    @property
+    def state(self) -> FloatArray:
+        """State (U_local,) of the solution itself."""
+        return self.origin.state
+
+    @property
+    def reference(self) -> ReferenceSolution | None:
+        """As of the solution."""
+        return self.origin.reference
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float | None = None) -> FloatArray:
+        """Solve with the stiffness of the body at the solution itself, for rows (k, U_local)."""
+        return self.origin.solve(right, transpose=transpose, tolerance=tolerance)
+
+
 class EnrichedState(NamedTuple):
-    """A state of the enriched space, by one linear solve from a solution of the body.
+    """A state of the enriched space, by one linear solve from a solution of the body, or a few.
 
     Attributes
     ----------
@@ -70,9 +103,12 @@ class EnrichedState(NamedTuple):
     stored
         Energy (J) stored at u_h.
     nonlinearity
-        |F⁺(u_h + e)·e / F⁺(u_h)·e|: 0 for a linear problem; NaN where u_h + e turns cells inside out.
+        |F⁺(u_h + e)·e / F⁺(u_h)·e| after the last step: 0 for a linear problem; NaN where u_h + e turns cells inside
+        out, ∞ where steps do not help.
     work
         Its cost.
+    before, step
+        The last state (U⁺_local,) of which the equations were linearised, and the step from there to `state`.
     """
 
     state: FloatArray
@@ -81,6 +117,8 @@ class EnrichedState(NamedTuple):
     stored: float
     nonlinearity: float
     work: Work
+    before: FloatArray
+    step: FloatArray
 
     @property
     def relative(self) -> float:
@@ -138,6 +176,7 @@ class Enriched:
             pairs.append((equations.unknowns.pressure, self.equations.unknowns.pressure))
         self._up = [Transfer(coarse, fine) for coarse, fine in pairs]
         self._down = [Transfer(fine, coarse) for coarse, fine in pairs]
+        self._of_forces = [output.of_held for output in spec.outputs]
         self._functionals = [
             output.enriched(functional, self.equations, self.up) if output.estimable else None
             for output, functional in zip(spec.outputs, functionals, strict=True)
@@ -161,13 +200,16 @@ class Enriched:
         parts = np.split(forces, [3 * self.equations.nodes_owned])
         return np.concatenate([up.transposed(part) for up, part in zip(self._up, parts, strict=False)])
 
+    def _state_of(self, solution: Solved) -> FloatArray:
+        return solution.enriched if isinstance(solution, Moved) else self.up(solution.state)
+
     def visit(self, solution: Solved) -> Discretisation:
         """Set parameters, loads and state to those of a solution of the body."""
         equations = self.equations
         if equations.latest.solution is not solution:
             equations.set_parameters(solution.parameters)
             equations.at_load(1.0)
-            equations.set_state(self.up(solution.state))
+            equations.set_state(self._state_of(solution))
             equations.latest.solution = solution
         return equations
 
@@ -194,13 +236,26 @@ class Enriched:
         start = self.up(solution.state)
         # In the mixed form the energy has a saddle point, and the pressures count with the opposite sign.
         energy = 0.5 * equations.curvature(change, forces)
-        equations.set_state(start + change)
-        equations.work.residuals += 1
-        after = equations.curvature(change, equations.imbalance())
         equations.set_state(start)
         stored = float(self._stored())
-        far = nonlinearity(energy, stored, after)
-        return EnrichedState(start + change, change, energy, stored, far, equations.work)
+        before, step, moved = start, change, Moved(solution, start + change)
+        left = self.imbalance(moved)
+        far = nonlinearity(energy, stored, equations.curvature(change, left))
+        for _ in range(MORE):
+            if not BENT < far < 1:
+                break
+            # Outputs of second order need u_h + e to be in equilibrium.
+            if self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
+                far = far if far < BARELY else np.inf
+                break
+            (more,) = self._solve(moved, -left[None])
+            before, step = moved.enriched, more
+            change = change + more
+            moved = Moved(solution, start + change)
+            left = self.imbalance(moved)
+            closer = nonlinearity(energy, stored, equations.curvature(change, left))
+            far = closer if closer < far else np.inf
+        return EnrichedState(start + change, change, energy, stored, far, equations.work, before, step)
 
     def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
@@ -208,7 +263,7 @@ class Enriched:
         To rounding with its own factor, or roughly in one of the other ways.
         """
         found = None
-        if self.way == Way.SMOOTHING:
+        if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
             found = self._solve_by_smoothing(solution, right, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
             found = self._solve_near(solution, solution.reference, right, transpose=transpose)
@@ -263,7 +318,8 @@ class Enriched:
 
     def _inverse_blocks(self, solution: Solved) -> FloatArray | None:
         """Inverses of the stiffness of each node at the reference of a solution, shared by all that have it."""
-        at: ReferenceSolution | Solved = solution.reference or solution
+        origin = solution.origin if isinstance(solution, Moved) else solution
+        at: ReferenceSolution | Solved = origin.reference or origin
         if self._blocks is None or not _same(self._blocks[0], at):
             equations = self.equations
             kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
@@ -285,7 +341,7 @@ class Enriched:
         equations = self.equations
         known = ReferenceSolution(reference.parameters, self.up(reference.state))
         self._reference.prepare(known)
-        R = self._reference.rotation(self.up(solution.state))
+        R = self._reference.rotation(self._state_of(solution))
         self.visit(solution)
         return block_galerkin(
             lambda x: equations.free_stiffness_times(x, transpose=transpose),
@@ -300,13 +356,24 @@ class Enriched:
     def _factorise(self, solution: Solved) -> None:
         equations = self.visit(solution)
         if equations.latest.factorised is not solution:
-            equations.factorise(self.up(solution.state))
+            equations.factorise(self._state_of(solution))
             equations.latest.factorised = equations.latest.solution = solution
 
-    def values(self, state: FloatArray) -> FloatArray:
-        """Return the outputs (m,) at a state (U⁺_local,) and the parameters that are set; NaN where not estimated."""
-        self.equations.set_state(state)
-        return np.array([np.nan if f is None else f.value() for f in self._functionals])
+    def values(self, solution: Solved, found: EnrichedState) -> FloatArray:
+        """Return the outputs (m,) at a state found from a solution; NaN where not estimated.
+
+        Outputs of the balance of forces are linearised along the last step, as the equations that it solves: at the
+        state itself, what is left of second order would count as a force.
+        """
+        equations = self.visit(Moved(solution, found.before))
+        linear = {
+            i: f.value() + equations.dot(f.gradient(), found.step)
+            for i, f in enumerate(self._functionals)
+            if f is not None and self._of_forces[i]
+        }
+        self.visit(Moved(solution, found.state))
+        known = [np.nan if f is None or i in linear else f.value() for i, f in enumerate(self._functionals)]
+        return np.array([linear.get(i, value) for i, value in enumerate(known)])
 
     def adjoints(self, solution: Solved, weights: FloatArray) -> FloatArray:
         """Return z⁺ (k, U⁺_local) with K⁺ᵀz⁺ = ∂ψ/∂u of outputs weighted by `weights` (k, m); collective.

@@ -379,8 +379,7 @@ class FiniteElementSolution:
             If the stiffness in the enriched space is singular.
         """
         found, enriched = self.enriched_state, self._model.enriched
-        enriched.visit(self)
-        errors = enriched.values(found.state) - self.outputs
+        errors = enriched.values(self, found) - self.outputs
         change = enriched.down(found.change)
         far = found.nonlinearity
         return MeshError(errors, change, found.energy, found.relative, found.work, nonlinearity=far)
@@ -419,8 +418,7 @@ class FiniteElementSolution:
         if saturated is None:
             return typical(seen, self._model.spec.body.degree)
         twice, found, of_state, of_energy = saturated
-        twice.visit(self)
-        more = twice.values(found.state) - self.outputs
+        more = twice.values(self, found) - self.outputs
         return Saturation(factors(seen, more, self._model.spec.body.degree), of_state, of_energy)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:

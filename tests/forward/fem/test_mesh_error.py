@@ -98,7 +98,7 @@ def test_the_error_of_a_coarse_mesh_is_told(cell):
     effectivity = error.outputs[:3] / (fine - solution.outputs)[:3]
     assert ((effectivity > 0.85) & (effectivity < 1.1)).all(), effectivity
     assert np.isnan(error.outputs[3])
-    assert error.work.factorisations == 1
+    assert error.work.factorisations == (1 if cell == "hexahedron" else 2)  # which bend by 13 %: a second step
 
 
 def test_a_mesh_too_coarse_for_one_linear_step_is_told():
@@ -161,11 +161,11 @@ def test_the_error_that_is_left_is_calibrated():
 
 
 def test_a_reaction_is_in_balance_with_the_loads():
-    """Whatever the mesh, so that there is no error but for what is not linear in e."""
+    """Whatever the mesh, however far richer elements bend."""
     reaction = {"kind": "reaction", "name": "held", "on": "x-min", "component": "z"}
     solution = solved(bent(outputs=(reaction,)))
     assert solution.outputs[0] == pytest.approx(400.0, rel=1e-8)
-    assert abs(solution.mesh_error().outputs[0]) < 2e-3 * 400
+    assert abs(solution.mesh_error().outputs[0]) < 1e-7 * 400
 
 
 def test_a_weight_on_what_is_not_estimated_is_refused():
