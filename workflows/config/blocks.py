@@ -41,6 +41,10 @@ class Accuracy(Settings):
     mesh_error
         Whether the error that the mesh makes is estimated of all that the study estimates, where the model is a body:
         at a few parameters, in elements of one degree more, for at most a fifth of the solves or three estimates.
+    memory
+        Memory (MiB) of a group of ranks that these estimates may take; where they would take more there are none, and
+        a finding says so.
     """
 
     mesh_error: bool = True
+    memory: Annotated[float, Field(gt=0)] = 4096.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError, model_validator
 
+from forward.machine import MIB
 from forward.model import Finding, ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
@@ -105,8 +106,19 @@ class Study(StudyKind):
 
         Methods on several meshes, and comparisons that are asked to solve on a finer one, estimate it themselves.
         """
+        return 0 if not self._estimating or self._too_large is not None else estimates_for(self.planned)
+
+    @property
+    def _estimating(self) -> bool:
         theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
-        return estimates_for(self.planned) if self.accuracy.mesh_error and self.spec.meshed and not theirs else 0
+        return self.accuracy.mesh_error and self.spec.meshed and not theirs
+
+    @cached_property
+    def _too_large(self) -> float | None:
+        """Memory (MiB) that an estimate of the error of the mesh would take, if that is too much."""
+        cost = self.spec.mesh_error_cost()
+        needed = 0.0 if cost is None else cost.bytes / MIB
+        return needed if needed > self.accuracy.memory else None
 
     @property
     def memory(self) -> float:
@@ -124,7 +136,15 @@ class Study(StudyKind):
         """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
-        return (*self.model.findings_over(ranges(self.parameters)), *of_draws)
+        return (*self.model.findings_over(ranges(self.parameters)), *of_draws, *self._of_estimates())
+
+    def _of_estimates(self) -> Iterator[Finding]:
+        if self._estimating and self._too_large is not None:
+            yield Finding(
+                "warning",
+                f"The error of the mesh is not estimated: that would take about {self._too_large:,.0f} MiB for each "
+                f"group of ranks, more than accuracy.memory = {self.accuracy.memory:,.0f} MiB.",
+            )
 
     @property
     def specs(self) -> tuple[ModelSpec, ...]:

@@ -223,7 +223,7 @@ def judged(posterior, samples=256, **settings):
 
 def test_verdicts_on_few_parameters():
     assert judged(few()).trust == "laplace"
-    assert str(judged(few())).startswith("Laplace's Gaussian can be trusted: the posterior is a Gaussian")
+    assert str(judged(few())).startswith("Laplace's Gaussian can be trusted: the posterior is Gaussian")
     assert judged(quick(ridge(0.1))).trust == "corrected"
     wrong = judged(few(wave=3.0))
     assert wrong.trust == "neither"

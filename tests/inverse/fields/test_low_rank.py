@@ -162,5 +162,5 @@ def test_what_cannot_be_is_refused():
         FieldPosterior(posterior.model, posterior.data[:3], posterior.sigma, posterior.prior)
     with pytest.raises(ValueError, match="expected positive"):
         FieldPosterior(posterior.model, posterior.data, 0 * posterior.sigma, posterior.prior)
-    with pytest.raises(ValueError, match="no data"):
+    with pytest.raises(ValueError, match="all data are NaN"):
         FieldPosterior(posterior.model, np.nan * posterior.data, posterior.sigma, posterior.prior)

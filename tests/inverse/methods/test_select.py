@@ -482,7 +482,7 @@ def test_candidates_with_fibres(small):
     expected = 500 * (x - x**-2) + 400 * (I4 - 1) * np.exp((I4 - 1) ** 2) * x
     np.testing.assert_allclose(tension, expected, rtol=1e-12)
     small.write_text(SMALL.replace(old, fibres.replace("[1, 0, 0]", "[1, 1, 0]"), 1))
-    with pytest.raises(StudyError, match=r"candidates.neo-hookean.material: fibres that a test 'uniaxial' would shear"):
+    with pytest.raises(StudyError, match=r"candidates.neo-hookean.material: fibres that a 'uniaxial' test would shear"):
         load(small)
 
 
