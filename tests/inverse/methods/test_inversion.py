@@ -470,7 +470,7 @@ def test_one_data_set_and_what_others_read_of_it(folder, monkeypatch):
 def test_all_groups_share_one_data_set(folder):
     """The same bytes as of one rank, the solve on the finer mesh among them."""
     assert (folder / "single").exists()  # of the test before
-    changes = ("--set", "data.files=['data/made-1.csv']")
+    changes = ("--set", "data.files=['data/made-1.csv']", "--set", REPORTED)
     done = run_script(2, WITHOUT_REPORT, "run", folder / "few.toml", "--out", folder / "shared", "--quiet", *changes)
     assert done.returncode == 3, done.stderr
     assert (folder / "single/results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
