@@ -21,13 +21,24 @@ def test_predicted_times_grow_with_the_body(cell, form):
     found = []
     for n in (1, 2, 8, 30):
         changes = [f"model.body.cells=[{n}, {n}, {n}]", f"model.body.cell={cell}", f"model.formulation={form}"]
-        study = load(CONFIGS / "tiny.toml", changes)
+        study = load(CONFIGS / "tiny.toml", [*changes, "accuracy.memory=1e6"])
         found.append([part.seconds for part in parts(study)])
     assert np.isfinite(found).all()
     assert (np.array(found) > 0).all()
     grown = np.diff(np.sum(found, axis=1))
     assert (grown > 0).all()
     assert sum(found[0]) < 60  # little but the start of the program
+
+
+def test_estimates_that_take_too_much_memory_are_left_out_and_it_is_said():
+    study = load(CONFIGS / "organ.toml")
+    assert study.estimates == 0
+    assert not any(line.startswith("mesh error") for line in plan(study, 1))
+    (found,) = (one for one in study.findings if "accuracy.memory" in one.text)
+    assert found.severity == "warning"
+    assert load(CONFIGS / "organ.toml", ["accuracy.memory=1e5"]).estimates > 0
+    off = load(CONFIGS / "organ.toml", ["accuracy.mesh_error=false"])
+    assert not any("accuracy.memory" in one.text for one in off.findings)
 
 
 def test_the_plan_is_the_sum_of_its_parts(tmp_path, monkeypatch):
