@@ -11,12 +11,12 @@ from inverse.criticism.chains import FEW, FIELD, walkers
 from inverse.fields.low_rank import CUTOFF
 from inverse.low_dimensional.evidence import LEAST
 from inverse.low_dimensional.posterior import NOISE
-from inverse.methods.mesh_correction import Treatment
+from inverse.methods.mesh_correction import MeshTreatment
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
 
-class Invert(Settings):
+class Invert(MeshTreatment, Settings):
     """Inversion of measured displacements: the most probable interior, its uncertainty, and what the data leave open.
 
     Parameters
@@ -65,16 +65,6 @@ class Invert(Settings):
             message = f"samples = {self.samples}, expected at least {LEAST}"
             raise ValueError(message)
         return self
-
-    @property
-    def treatment(self) -> Treatment | None:
-        """What is done about the error of the mesh; None where it is not asked for."""
-        return (self.mesh_error or None) if self.mesh_check else None
-
-    @property
-    def unchecked(self) -> str:
-        """Why the mesh is not looked at, where it is not."""
-        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
     def solves(self, *, field: bool) -> int:
         """Number of solves for a data set that correct the Gaussian."""

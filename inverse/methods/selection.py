@@ -24,7 +24,7 @@ from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.mesh_correction import Treatment, corrected_few
+from inverse.methods.mesh_correction import MeshTreatment, Treatment, corrected_few
 from uq.evaluation.evaluate import Evaluate
 from uq.inputs.distributions import Distribution
 from uq.surrogates.linearisation import linearise
@@ -229,7 +229,7 @@ class Select(Settings):
         return found.log_evidence, found.error
 
 
-class SelectSpecimens(Select):
+class SelectSpecimens(MeshTreatment, Select):
     """Bayesian model selection among models of a specimen.
 
     Parameters
@@ -245,16 +245,6 @@ class SelectSpecimens(Select):
 
     mesh_error: Literal["correct", "report", False] = "correct"
     mesh_check: bool = True
-
-    @property
-    def treatment(self) -> Treatment | None:
-        """What is done about the error of meshes; None where it is not asked for."""
-        return (self.mesh_error or None) if self.mesh_check else None
-
-    @property
-    def unchecked(self) -> str:
-        """Why meshes are not looked at, where they are not."""
-        return "method.mesh_error = false" if self.mesh_error is False else "method.mesh_check = false"
 
 
 def posterior(candidate: Candidate, data: Data, noise: Noise, evaluate: Evaluate) -> Posterior:
