@@ -40,7 +40,7 @@ ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 1e-3  # relative tolerance of the same solves
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
-MORE = 4  # of these, at most
+MORE = 6  # of these, at most: bodies that lock so that they bend half as far as richer ones take four
 AFFORDED = 40_000  # unknowns up to which they have a factor of their own, where the first one does without
 BARELY = 0.3  # nonlinearity up to which a larger body does without them
 
@@ -242,7 +242,7 @@ class Enriched:
         left = self.imbalance(moved)
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         for _ in range(MORE):
-            if not BENT < far < 1:
+            if not BENT < far < np.inf:
                 break
             # Outputs of second order need u_h + e to be in equilibrium.
             if self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:

@@ -634,6 +634,6 @@ def _worth(found: MeshError) -> MeshError:
         If it is worth nothing.
     """
     if not found.nonlinearity < 1:
-        message = "richer elements move the body too far for one linear step: the mesh is much too coarse"
+        message = "richer elements move the body too far for a few Newton steps: the mesh is much too coarse"
         raise SolveError(message)
     return found
