@@ -169,7 +169,7 @@ class Service:
             return refined.solved_to(options["tolerance"]) if "tolerance" in options else refined
         except ValidationError as error:
             message = f"config: {error.errors()[0]['msg']}"
-        except ModelError as error:  # hexahedra of a file have no finer meshes
+        except ModelError as error:  # meshes that are divided towards boundaries have no finer ones
             message = f"config.level: {error}"
         raise RefusalError("InvalidInput", message)
 

@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from io import StringIO
 from itertools import product
@@ -27,6 +27,7 @@ from annotated_types import Gt
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from forward.bodies import hexahedra
 from forward.bodies.elements import default_quadrature, node_count
 from forward.machine import out_of_memory
 from forward.model import FloatArray, ModelError
@@ -50,11 +51,11 @@ _MESHIO = {"tetra": "tetrahedron", "hexahedron": "hexahedron"}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "CellEntityIds")  # arrays of tags that programs write
 _FACES = {
     "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
-    "hexahedron": [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]],
+    "hexahedron": hexahedra.FACES.tolist(),
 }
 _EDGES = {
     "tetrahedron": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
-    "hexahedron": [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]],
+    "hexahedron": hexahedra.EDGES.tolist(),
 }
 _TETRAHEDRA = {
     "tetrahedron": [[0, 1, 2, 3]],
@@ -159,10 +160,10 @@ class MeshFile(Settings):
     tags
         Name of the array with the numbers, if it is neither a usual name nor the only array.
     levels
-        Divide every tetrahedron into eight this many times. Faces that are plane in the file stay plane: the surface of
+        Divide every cell into eight this many times. Faces that are plane in the file stay plane: the surface of
         a curved body does not become more accurate.
     divide
-        Then divide every tetrahedron into eight once more, with thinner ones at these boundaries (``[]``: uniformly).
+        Then divide every cell into eight once more, with thinner ones at these boundaries (``[]``: uniformly).
     contents
         What the file holds; it need not be given.
     """
@@ -210,15 +211,15 @@ class MeshFile(Settings):
         return loaded if self.divide is None else divided(loaded, self.divide)
 
     def finer(self, times: float, towards: tuple[str, ...], grading: float, beside: float) -> Self:
-        """Return the body with every tetrahedron divided into eight, thinner ones at some boundaries.
+        """Return the body with every cell divided into eight, thinner ones at some boundaries.
 
         Raises
         ------
         ModelError
-            If it has hexahedra, or is divided already.
+            If it is divided already.
         """
-        if self.cell != "tetrahedron" or self.divide is not None:
-            message = "hexahedra of a file are not divided" if self.divide is None else "its mesh is divided already"
+        if self.divide is not None:
+            message = "its mesh is divided already"
             raise ModelError(message)
         return self.model_validate(self.model_dump(exclude={"contents"}) | {"divide": towards})
 
@@ -347,20 +348,19 @@ class MeshFile(Settings):
         return self.model_copy(update={"degree": degree, "quadrature_degree": quadrature})
 
     def refined(self, level: int) -> Self:
-        """Return the same body with every tetrahedron divided into eight `level` times, when it is meshed.
+        """Return the same body with every cell divided into eight `level` times, when it is meshed.
 
         Raises
         ------
         ModelError
-            If it has hexahedra, or is divided towards boundaries.
+            If it is divided towards boundaries.
         ValidationError
             If the mesh is too large.
         """
         if not level:
             return self
-        if self.cell != "tetrahedron" or self.divide is not None:
-            reason = "hexahedra of a file are not divided" if self.divide is None else "its mesh is divided already"
-            message = f"{reason}: expected tetrahedra, or a body of kind 'box' or 'block'"
+        if self.divide is not None:
+            message = "its mesh is divided already, expected a body of kind 'box' or 'block', or one without 'divide'"
             raise ModelError(message)
         found = self.found
         for _ in range(level):
@@ -600,31 +600,34 @@ def _outer(facets: IntArray, groups: dict[str, NDArray[np.bool_]], cells: IntArr
 
 
 def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
-    """Divide every tetrahedron into eight, thinner ones at some boundaries.
+    """Divide every cell into eight, thinner ones at some boundaries.
 
     Edges that leave these boundaries are divided at a quarter, nearer to the boundary, others in the middle (graded
     meshes for singularities: H. Li, A. Mazzucato, V. Nistor, Electron. Trans. Numer. Anal. 37 (2010) 41–69). The
-    octahedron inside is cut along the diagonal that leaves its smallest part largest; of equal ones, as all are where
-    edges are divided in the middle, along the shortest (as J. Bey, Tetrahedral grid refinement, Computing 55 (1995)
-    355–378, keeps the shapes of cells).
+    octahedron inside a tetrahedron is cut along the diagonal that leaves its smallest part largest; of equal ones, as
+    all are where edges are divided in the middle, along the shortest (as J. Bey, Tetrahedral grid refinement,
+    Computing 55 (1995) 355–378, keeps the shapes of cells).
 
     Raises
     ------
     ModelError
-        If the cells are hexahedra, or there is no such boundary.
+        If there is no such boundary.
     """
     unknown = [name for name in towards if name not in mesh.boundaries]
-    if mesh.cell != "tetrahedron" or unknown:
-        message = f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}" if unknown else "divide: expected tetrahedra"
+    if unknown:
+        message = f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}"
         raise ModelError(message)
+    held = np.zeros(len(mesh.points))
+    for name in towards:
+        held[mesh.boundaries[name]] = 0.5 - QUARTER
+    if mesh.cell == "hexahedron":
+        found = hexahedra.divided(mesh.points, mesh.cells, mesh.boundaries, held)
+        return replace(mesh, **found._asdict(), region=np.repeat(mesh.region, 8))
     ends, which = np.unique(
         np.sort(mesh.cells[:, _EDGES["tetrahedron"]].reshape(-1, 2), axis=1), axis=0, return_inverse=True
     )
     number = len(mesh.points) + which.reshape(-1, 6)
-    held = np.zeros(len(mesh.points))
-    for name in towards:
-        held[mesh.boundaries[name]] = 1
-    share = 0.5 + (0.5 - QUARTER) * (held[ends[:, 1]] - held[ends[:, 0]])  # of the second end
+    share = 0.5 + held[ends[:, 1]] - held[ends[:, 0]]  # of the second end
     points = np.concatenate(
         [mesh.points, (1 - share)[:, None] * mesh.points[ends[:, 0]] + share[:, None] * mesh.points[ends[:, 1]]]
     )
@@ -660,11 +663,22 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
 
 
 def _divided_contents(found: Contents) -> Contents:
-    """Say what a mesh holds whose tetrahedra are divided into eight.
+    """Say what a mesh holds whose cells are divided into eight.
 
-    Every edge is halved, a face has three new ones and a cell one: the shortest of the three that join the middles of
-    opposite edges, the squares of which are a quarter of the sum of those of the six edges.
+    Every edge is halved. A triangle has three new ones and a tetrahedron one: the shortest of the three that join the
+    middles of opposite edges, the squares of which are a quarter of the sum of those of the six edges. A quadrilateral
+    has four, a hexahedron six.
     """
+    if found.cell == "hexahedron":
+        return found.model_copy(
+            update={
+                "vertices": found.vertices + found.edges + found.faces + found.cells,
+                "edges": 2 * found.edges + 4 * found.faces + 6 * found.cells,
+                "faces": 4 * found.faces + 12 * found.cells,
+                "cells": 8 * found.cells,
+                "longest_edge": found.longest_edge / 2,
+            }
+        )
     return found.model_copy(
         update={
             "vertices": found.vertices + found.edges,

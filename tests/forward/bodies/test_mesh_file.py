@@ -379,7 +379,6 @@ def text(**changes):
         ({"region": "rigth"}, "model.regions.rigth: unknown region; did you mean 'right'"),
         ({"number": "C2"}, "model.regions.right.C2: not a constant of 'neo-hookean'; did you mean 'C1'"),
         ({"clamp": "x-mid"}, "model.clamp[0]: unknown boundary; did you mean 'x-min'"),
-        ({"method": "multilevel-monte-carlo"}, "method.kind: hexahedra of a file are not divided"),
     ],
 )
 def test_mistakes_in_a_study(file, changes, message):

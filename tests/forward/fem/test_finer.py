@@ -6,6 +6,7 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
+from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile, contents, divided
 from forward.fem.finer import OtherMesh, extrapolated, finer, graded, share
 from forward.model import ModelError
@@ -81,9 +82,55 @@ def test_tetrahedra_are_divided_into_eight(tmp_path):
     assert sum(body.found.areas.values()) == pytest.approx(sum(whole.found.areas.values()))
     with pytest.raises(ModelError, match="divided already"):
         body.finer(1.5, (held,), 8.0, 4.0)
-    meshio.write(tmp_path / "hexahedra.vtu", numbered(box("hexahedron")))
-    with pytest.raises(ModelError, match="hexahedra of a file are not divided"):
-        MeshFile(file=str(tmp_path / "hexahedra.vtu")).finer(1.5, (), 8.0, 4.0)
+
+
+def inside(points, corners):
+    """Volume of hexahedra by Gauss points: ∫ det ∂x/∂ξ of the trilinear map; and the least determinant there."""
+    s = np.array([0.5 - 12**-0.5, 0.5 + 12**-0.5])
+    total, least = np.zeros(len(corners)), np.inf
+    for xi in np.stack(np.meshgrid(s, s, s), axis=-1).reshape(-1, 3):
+        factors = np.where(VTK, xi, 1 - xi)
+        slopes = [np.where(VTK[:, a], 1, -1) * np.delete(factors, a, axis=1).prod(axis=1) for a in range(3)]
+        jacobian = np.linalg.det(np.einsum("ak,nki->nai", slopes, points[corners]))
+        total, least = total + jacobian / 8, min(least, jacobian.min())
+    return total, least
+
+
+VTK = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+
+
+def test_hexahedra_are_divided_into_eight(tmp_path):
+    plain = box("hexahedron")
+    rng = np.random.default_rng(0)
+    plain.points = plain.points + 0.04 * rng.uniform(-1, 1, plain.points.shape)  # curved faces
+    meshio.write(tmp_path / "box.vtu", numbered(plain))
+    whole = MeshFile(file=str(tmp_path / "box.vtu"))
+    mesh = whole.load()
+    held = whole.boundaries[0]
+    before, _ = inside(mesh.points, mesh.cells)
+    for towards in ((), (held,)):
+        fine = divided(mesh, towards)
+        assert len(np.unique(fine.points.round(12), axis=0)) == len(fine.points)
+        parts, least = inside(fine.points, fine.cells)
+        assert least > 0
+        np.testing.assert_allclose(parts.reshape(-1, 8).sum(axis=1), before, rtol=1e-12)
+        faces = np.sort(fine.cells[:, FACES].reshape(-1, 4), axis=1)
+        unique, count = np.unique(faces, axis=0, return_counts=True)
+        assert count.max() == 2  # conforming
+        outer = {tuple(face) for face in unique[count == 1].tolist()}
+        assert len(outer) == 4 * sum(len(facets) for facets in mesh.boundaries.values())
+        for name, facets in fine.boundaries.items():
+            assert len(facets) == 4 * len(mesh.boundaries[name])
+            assert {tuple(sorted(facet)) for facet in facets.tolist()} <= outer
+    thin = [divided(mesh, towards) for towards in ((), (held,))]
+    nearest = [inside(m.points, m.cells)[0][np.isin(m.cells, m.boundaries[held]).any(axis=1)].sum() for m in thin]
+    assert 0.4 < nearest[1] / nearest[0] < 0.6  # of half the thickness
+    twice = whole.refined(2)
+    made = contents(twice.load(), twice.found.digest)
+    left_out = {"longest_edge", "boundaries", "areas", "regions"}
+    assert twice.found.model_dump(exclude=left_out) == made.model_dump(exclude=left_out)
+    assert made.longest_edge <= twice.found.longest_edge * (1 + 1e-12)
+    assert whole.finer(2.0, (held,), 8.0, 4.0).cell_count == 8 * whole.cell_count
 
 
 def quality(mesh):
