@@ -30,10 +30,11 @@ from forward.model import Finding, FloatArray, ModelError
 from forward.observables.observable import Output
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
-from forward.settings import Settings, nearest
+from forward.settings import Settings, nearest, shown
 from forward.solvers.settings import SolverSettings
 from forward.spec import UNREFINED, ModelSpec
 from forward.terms.displacement import Displacement
+from forward.terms.steps import Block, lists
 from forward.terms.term import Load
 
 CONTRAST = "contrast"
@@ -93,6 +94,15 @@ def materials(material: Settings, regions: Mapping[str, Mapping[str, float]], pa
     return Materials(energy, found)
 
 
+def _without_lists(block: Block, given: Any) -> Any:
+    """Return items of a block as they were written, unless one has a list in place of a number."""
+    for item in given if isinstance(given, tuple) else ():
+        for name, values in lists(block, item).items():
+            message = f"{name} = {shown(values)}, expected a number; several steps need model.kind = 'path'"
+            raise ValueError(message)
+    return given
+
+
 class Hyperelastic(ModelSpec):
     """A hyperelastic body under loads, solved by finite elements.
 
@@ -149,6 +159,16 @@ class Hyperelastic(ModelSpec):
     @classmethod
     def _kind_alone(cls, given: Any) -> Any:
         return {"kind": given} if isinstance(given, str) else given
+
+    @field_validator("loads", mode="before")
+    @classmethod
+    def _no_lists_in_loads(cls, given: Any) -> Any:
+        return _without_lists("loads", given)
+
+    @field_validator("displacements", mode="before")
+    @classmethod
+    def _no_lists_in_displacements(cls, given: Any) -> Any:
+        return _without_lists("displacements", given)
 
     @property
     def scalars(self) -> dict[str, Scalar]:

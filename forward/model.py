@@ -8,7 +8,7 @@ The module is longer than others because the whole contract, most of it document
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from itertools import repeat
@@ -34,6 +34,11 @@ class Work:
         """Return the counts in the order of `WORK`."""
         return np.array([getattr(self, name) for name in WORK], dtype=np.int64)
 
+    @classmethod
+    def sum_of(cls, works: Iterable[Work]) -> Work:
+        """Return the work of several solutions together."""
+        return cls(*np.sum([work.as_array() for work in works], axis=0).tolist())
+
 
 WORK = tuple(field.name for field in fields(Work))
 
@@ -46,6 +51,11 @@ class Stability(IntEnum):
     COUNTED = 2  # the stiffness at the state has no negative eigenvalue
     REFUSED = 3  # the stiffness has negative eigenvalues, and no stable equilibrium was found
     MISSED = 4  # as REFUSED, but the screen had shown none, or another equilibrium was found afterwards
+
+    @classmethod
+    def of_all(cls, known: Collection[Stability]) -> Stability:
+        """Return that of several equilibria: of the one of which least is known; one that was missed counts more."""
+        return max(known) if cls.MISSED in known else min(known)
 
 
 class SolveError(Exception):
@@ -61,6 +71,8 @@ class SolveError(Exception):
         What was spent on the attempt.
     stability
         Whether an equilibrium was found and refused.
+    reached
+        Outputs (m,) that are known all the same, as of the first steps of a path; NaN for the others.
     """
 
     def __init__(
@@ -69,12 +81,14 @@ class SolveError(Exception):
         history: Sequence[str] = (),
         work: Work | None = None,
         stability: Stability = Stability.NOT_TESTED,
+        reached: FloatArray | None = None,
     ) -> None:
         super().__init__(reason)
         self.reason = reason
         self.history = tuple(history)
         self.work = work or Work()
         self.stability = stability
+        self.reached = reached
 
 
 class InadmissibleError(SolveError):

@@ -58,6 +58,16 @@ class ModelSpec(Settings):
             """What is computed: names and units."""
 
     @property
+    def returned(self) -> Sequence[NamedOutput]:
+        """What the model returns: its outputs, unless there are several of each."""
+        return self.outputs
+
+    @property
+    def axes_of_outputs(self) -> Mapping[str, Sequence[Any]]:
+        """What else is known of what the model returns, by the names of further coordinates of results."""
+        return {}
+
+    @property
     @abstractmethod
     def scalars(self) -> Mapping[str, Scalar]:
         """Every number that can be made a parameter, by its path."""
@@ -203,6 +213,7 @@ MODELS = Kinds(
     "model",
     {
         "hyperelastic": "forward.hyperelastic:Hyperelastic",
+        "path": "forward.path:Path",
         "specimen": "forward.specimen:Specimen",
         "python": "forward.external.models:PythonModel",
         "um-bridge": "forward.external.models:UmBridgeModel",

@@ -49,7 +49,7 @@ class Model:
         names = tuple(spec.scalars if parameters is None else parameters)
         self._model = spec.build(comm, names)
         self.parameters = {name: spec.scalars[name].value for name in names}
-        self.units = {output.name: output.unit for output in spec.outputs}
+        self.units = {output.name: output.unit for output in spec.returned}
         self.nodes = None if self._model.space is None else self._model.space.coordinates
 
     def solve(self, values: Mapping[str, float] | None = None, near: Solution | None = None) -> Solution:

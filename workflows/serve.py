@@ -56,7 +56,7 @@ class Service:
         self._inputs, self._spec = sampled
         self._made: dict[str, _Solver] = {}
         self.parameters = sampled.inputs.names
-        self.outputs = tuple(output.name for output in sampled.spec.outputs)
+        self.outputs = tuple(output.name for output in sampled.spec.returned)
         self._differentiable = self._solver({}).model.differentiable
 
     def answer(self, what: str, question: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
 from typing import Any
 
@@ -30,6 +31,7 @@ from forward.model import (
     Stability,
     Work,
 )
+from forward.observables.observable import Functional
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
@@ -74,23 +76,28 @@ class HyperelasticModel(OneByOne):
         self.space = BodySpace(self.equations)
         self.differentiable = True
         self._functionals = [output.functional(self.equations) for output in spec.outputs]
+        self._enrichments = _Enrichments(spec, self.equations, self._functionals)
 
     @cached_property
     def reference(self) -> ReferenceFactor:
         """The factor at the last reference given."""
         return ReferenceFactor(self.equations)
 
-    @cached_property
+    def with_own_reference(self) -> HyperelasticModel:
+        """Return the same model with a reference factor of its own, which shares everything else with this one."""
+        other = copy.copy(self)
+        vars(other).pop("reference", None)
+        return other
+
+    @property
     def enriched(self) -> Enriched:
         """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used."""
-        return Enriched(self.equations, self.spec.enriched(), self._functionals)
+        return self._enrichments.once
 
-    @cached_property
+    @property
     def enriched_twice(self) -> Enriched | None:
         """The same in elements of two degrees more, which calibrate that; None where they take too much memory."""
-        spec = self.spec.enriched().enriched()
-        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
-        return Enriched(self.equations, spec, self._functionals) if cost.bytes <= MOST_BYTES else None
+        return self._enrichments.twice
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FiniteElementSolution:
         """Find the equilibrium at `parameters` (d,); collective.
@@ -172,6 +179,23 @@ class HyperelasticModel(OneByOne):
         """Return the factor at a reference; this may change parameters and state."""
         self.reference.prepare(reference)
         return self.reference
+
+
+class _Enrichments:
+    """A body in elements of higher degrees, made when they are first asked for."""
+
+    def __init__(self, spec: Hyperelastic, equations: Discretisation, functionals: list[Functional]) -> None:
+        self._spec, self._equations, self._functionals = spec, equations, functionals
+
+    @cached_property
+    def once(self) -> Enriched:
+        return Enriched(self._equations, self._spec.enriched(), self._functionals)
+
+    @cached_property
+    def twice(self) -> Enriched | None:
+        spec = self._spec.enriched().enriched()
+        cost = estimate(self._spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        return Enriched(self._equations, spec, self._functionals) if cost.bytes <= MOST_BYTES else None
 
 
 class _Way:

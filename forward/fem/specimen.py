@@ -7,7 +7,7 @@ are Bu with a sparse B.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -232,13 +232,12 @@ class SpecimenSolution:
     @property
     def stability(self) -> Stability:
         """That of the case of which least is known; an instability that was missed counts more."""
-        known = [solution.stability for solution in self.solutions]
-        return max(known) if Stability.MISSED in known else min(known)
+        return Stability.of_all([solution.stability for solution in self.solutions])
 
     @property
     def work(self) -> Work:
         """Cost of the solutions of all cases so far."""
-        return _sum(solution.work for solution in self.solutions)
+        return Work.sum_of(solution.work for solution in self.solutions)
 
     def _observe(self, states: list[FloatArray], observations: list[csr_matrix]) -> FloatArray:
         parts = zip(self._model.models, observations, states, strict=True)
@@ -281,7 +280,7 @@ class SpecimenSolution:
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
         far = max((one.nonlinearity for one in found), key=lambda far: (not np.isfinite(far), far))
         return MeshError(
-            outputs, state, energy, relative(energy, stored), _sum(one.work for one in found), nonlinearity=far
+            outputs, state, energy, relative(energy, stored), Work.sum_of(one.work for one in found), nonlinearity=far
         )
 
     def saturation(self) -> Saturation:
@@ -305,10 +304,6 @@ class SpecimenSolution:
         small = np.abs(seen) < SMALL * np.abs(seen).max(initial=0.0)
         outputs = np.where(small, of_states, factors(seen, more, degree, of_states))
         return Saturation(outputs, of_states, float(np.mean([factor for *_, factor in known])))
-
-
-def _sum(works: Iterable[Work]) -> Work:
-    return Work(*sum(work.as_array() for work in works).tolist())  # type: ignore[union-attr]
 
 
 def _places(model: HyperelasticModel, item: Observed) -> FloatArray:

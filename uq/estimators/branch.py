@@ -55,6 +55,16 @@ def findings(inputs: Inputs, evaluations: Evaluations, *, continued: bool) -> It
         else:
             text += "They are missing from the estimates, or are assumed to follow the control."
         yield Finding("warning", text)
+    partly = ~ok & np.isfinite(evaluations.outputs).any(axis=1)
+    count = int(partly.sum())
+    if count:
+        known_outputs = np.isfinite(evaluations.outputs[partly])
+        least, outputs = int(known_outputs.sum(axis=1).min()), known_outputs.shape[1]
+        text = (
+            f"{count} of {total} samples stop on their way: at least the first {least} of {outputs} outputs of each "
+            "are known and kept (`values`), but no estimate of any step counts these samples."
+        )
+        yield Finding("warning", text)
     missed = int((known == Stability.MISSED).sum())
     if missed:
         screened = int((known == Stability.SCREENED).sum())

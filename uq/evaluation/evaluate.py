@@ -60,7 +60,7 @@ class Evaluations:
     points
         Parameters (n, d).
     outputs
-        Outputs (n, m); NaN in the rows that failed.
+        Outputs (n, m); NaN in the rows that failed, but for what was known before they did (`SolveError.reached`).
     tangents
         dψ/dω (n, m, d) if requested, NaN where a solve failed.
     failures
@@ -437,6 +437,14 @@ class BlockSolver:
             return self._plain
         return replace(self._guess(point), iterations=self._plain.iterations)
 
+    def _keep(self, rows: list[FloatArray], row: FloatArray) -> None:
+        """Add a row (k, U_local) to the sum, or to the rows of a compact one."""
+        if self._compact or not rows:
+            rows.append(row.copy())
+        else:
+            # In place: these are the largest arrays, and a new one for each sample takes longer.
+            rows[0] += row
+
     def __call__(self, points: FloatArray, progress: Callable[[int, int], None]) -> Evaluations:
         """Solve at points (n, d); the fields are complete on the group's first rank only."""
         model, n = self._model, len(points)
@@ -471,6 +479,7 @@ class BlockSolver:
                 lost = isinstance(error, InadmissibleError)
                 failures.append(Failure(i, tuple(map(float, point)), error.reason, error.history, lost))
                 work[i], stability[i] = error.work.as_array(), error.stability
+                outputs[i] = np.nan if error.reached is None else error.reached
             else:
                 outputs[i] = solution.outputs
                 work[i] = solution.work.as_array()
@@ -480,11 +489,8 @@ class BlockSolver:
             if self._joint is not None and (i + 1) % self._together == 0:
                 row = self._joint(np.array(states)) if len(states) == self._together else None
                 states = []
-            if row is not None and (self._compact or not rows):
-                rows.append(row.copy())
-            elif row is not None:
-                # In place: these are the largest arrays, and a new one for each sample takes longer.
-                rows[0] += row
+            if row is not None:
+                self._keep(rows, row)
             seconds[i] = time.process_time() - begin
             progress(1, int(bool(failures) and failures[-1].index == i))
         fields = gathered(model, np.concatenate(rows)) if rows else np.zeros((0, 0))

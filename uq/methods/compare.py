@@ -73,7 +73,7 @@ class Given(Method):
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
         """Find outputs whose moments are not given, and moments of unknown outputs."""
-        outputs = [output.name for output in spec.outputs]
+        outputs = [output.name for output in spec.returned]
         if set(self.values) != set(outputs):
             yield ("method", "values"), f"expected values of every output: {', '.join(outputs)}", list(self.values)
 

@@ -53,6 +53,14 @@ class Results:
         return [str(name) for name in self.dataset["output"].values]
 
     @property
+    def drawn(self) -> list[str]:
+        """Names of the outputs with pictures of their own: along a path, those of the last step."""
+        dataset = self.dataset
+        if "step" not in dataset.coords:
+            return self.outputs
+        return [str(name) for name in dataset["output"].values[dataset["step"] == dataset["step"].max()]]
+
+    @property
     def parameters(self) -> list[str]:
         """Names of the parameters."""
         return [str(name) for name in self.dataset["parameter"].values]
@@ -115,6 +123,7 @@ SECTIONS = Kinds(
         "model": f"{_HERE}.model:Model",
         "adapted-mesh": f"{_HERE}.adapted_mesh:AdaptedMesh",
         "nominal": f"{_HERE}.nominal:Nominal",
+        "path": f"{_HERE}.path:Curve",
         "error-against-cost": f"{_HERE}.error_against_cost:ErrorAgainstCost",
         "moments": f"{_HERE}.moments:Moments",
         "control-variate": f"{_HERE}.control_variate:ControlVariate",

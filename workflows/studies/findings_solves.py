@@ -32,7 +32,7 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
         right = better.build(model.equations.comm, model.parameters).solve(mean).outputs
     except SolveError:
         return []
-    units = {output.name: output.unit for output in spec.outputs}
+    units = {output.name: output.unit for output in spec.returned}
     said = [
         f"{name} = {with_unit(number(float(value)), units[name])}, there {with_unit(number(float(other)), units[name])}"
         for name, value, other in zip(model.outputs, found, right, strict=True)

@@ -138,7 +138,7 @@ class OutputInversion(InversionStudy):
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs of the model."""
-        return tuple(output.name for output in self.model.outputs)
+        return tuple(output.name for output in self.model.returned)
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -64,7 +64,7 @@ class OutputFile(Settings):
         StudyError
             If the file cannot be used.
         """
-        outputs = tuple(output.name for output in spec.outputs)
+        outputs = tuple(output.name for output in spec.returned)
         try:
             found = stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs)
         except DataError as error:
@@ -201,7 +201,7 @@ class OutputSelection(ModelSelection):
 
     def unobserved(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find outputs of the data that a candidate does not have."""
-        known = tuple(output.name for output in spec.outputs)
+        known = tuple(output.name for output in spec.returned)
         strange = next((output for output in self.data.names if output not in known), None)
         if strange is not None:
             yield ("outputs",), f"no output '{strange}', of which there are data", list(known)

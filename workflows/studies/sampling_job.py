@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
+    from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.sampling import Study
@@ -36,7 +37,7 @@ REALISATIONS = 3  # of random fields, to look at
 
 def job(study: Study, ensemble: Ensemble) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
-    inputs, units = study.inputs, {output.name: output.unit for output in study.model.outputs}
+    inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
     recorders: dict[str, Recorder] = {}
     estimates: list[Evaluations] = []
 
@@ -69,7 +70,7 @@ def job(study: Study, ensemble: Ensemble) -> Job:
     locking = measured(study, model) if ensemble.index == 0 else []
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = label(found, units, model.space.coordinates, cells, kind)
+        found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         add(found, *locking)
         found = with_regions(found, model.spec.body.regions, regions)
         return with_random_fields(found, factors, model.space.variance_kept)
@@ -103,7 +104,16 @@ def _with_mesh_errors(
     count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
     estimates.append(errors.evaluations)
-    return with_mesh_errors(found, inputs, centre, errors, {one.name: one.unit for one in study.model.outputs})
+    return with_mesh_errors(found, inputs, centre, errors, {one.name: one.unit for one in study.model.returned})
+
+
+def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
+    """Add what else is known of the outputs, as at which step of a path they are."""
+    places = {output.name: i for i, output in enumerate(spec.returned)}
+    at = [places[str(name)] for name in found["output"].values]
+    return found.assign_coords(
+        {name: ("output", np.array(values)[at]) for name, values in spec.axes_of_outputs.items()}
+    )
 
 
 def _without_nodes(found: xr.Dataset) -> xr.Dataset:

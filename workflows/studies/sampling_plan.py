@@ -31,7 +31,7 @@ def plan(study: Study, rank_groups: int) -> list[str]:
         lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
     lines += [
         f"parameters  {', '.join([*study.parameters, *_in_series(spec.coefficients)])}",
-        f"outputs     {', '.join(output.name for output in spec.outputs)}",
+        f"outputs     {', '.join(output.name for output in spec.returned)}",
         f"solves      {up_to}{planned:,}{later}",
     ]
     if spec.cost() is None:  # the time of a solve is unknown

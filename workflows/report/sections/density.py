@@ -19,7 +19,7 @@ class Density(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """A picture of each output."""
         yield Heading("Distribution and convergence")
-        for output in results.outputs:
+        for output in results.drawn:
             yield Heading(output, level=3)
             caption = f"Density of {output} by the expansion, mean and quantiles."
             yield Pictures([Picture.drawn(plots.histogram(results.dataset, output), caption)], small=True)

@@ -26,7 +26,7 @@ class DerivativeBased(Section):
             "distribution over the variance of the output. The active subspace is spanned by the directions along "
             "which the output changes most, in parameters over their standard deviations."
         )
-        for output in results.outputs:
+        for output in results.drawn:
             yield Heading(output, level=3)
             yield bounds(results, output)
             yield active_subspace(results, output)

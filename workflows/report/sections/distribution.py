@@ -20,7 +20,7 @@ class Distribution(Section):
         """Pictures of each output."""
         dataset = results.dataset
         yield Heading("Distribution and convergence")
-        for output in results.outputs:
+        for output in results.drawn:
             yield Heading(output, level=3)
             samples = f"Samples of {output}: density, mean and quantiles."
             running = f"Running mean of {output} with its 95 % confidence band."

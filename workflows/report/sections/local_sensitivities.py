@@ -26,10 +26,10 @@ class LocalSensitivities(Section):
         dataset = results.dataset
         yield Heading("Local sensitivities")
         yield Text("Derivatives at the mean parameters: the effect of a parameter to first order.")
-        for output in results.outputs:
+        for output in results.drawn:
             yield Heading(output, level=3)
             yield sensitivities(results, output)
-        captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.outputs}
+        captions = {output: f"Change of {output}, to first order{largest_of(dataset)}." for output in results.drawn}
         yield Pictures([Picture.drawn(plots.tornado(dataset, o), caption) for o, caption in captions.items()])
 
 

@@ -23,7 +23,7 @@ class SobolIndices(Section):
         dataset = results.dataset
         yield Heading("Sobol' indices")
         yield Text("The share of the variance due to a parameter alone, and with all its interactions.")
-        for output in results.outputs:
+        for output in results.drawn:
             yield Heading(output, level=3)
             yield sobol(results, output)
             if "sobol_second" in dataset:

@@ -1,0 +1,81 @@
+"""Studies of a body in several steps."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.launch import TISSUQ, assert_same_bits, run
+
+STUDY = """
+[model]
+kind = "path"
+body = { kind = "box", size = [1.0, 0.7, 0.8], cells = [2, 1, 1], cell = "hexahedron", degree = 1 }
+formulation = "displacement"
+material = { kind = "neo-hookean-coupled", mu = 2e4, lmbda = 4e4 }
+clamp = ["x-min"]
+displacements = [{ name = "grip", on = "x-max", x = [0.1, 0.2, -0.3], y = 0, z = 0 }]
+outputs = [
+  { name = "force", kind = "reaction", on = "x-max", component = "x" },
+  { name = "narrow", kind = "max-displacement", component = "y" },
+]
+
+[parameters]
+"material.mu" = { kind = "uniform", lower = 1.8e4, upper = 2.2e4 }
+
+[method]
+kind = "sensitivity-monte-carlo"
+samples = 6
+"""
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_curves_are_the_same_on_any_number_of_ranks(tmp_path):
+    study = tmp_path / "curve.toml"
+    study.write_text(STUDY)
+    for ranks in (None, 2):
+        done = run(ranks, TISSUQ, "run", study, "--out", tmp_path / str(ranks))
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "None", tmp_path / "2")
+    found = xr.load_dataset(tmp_path / "2" / "results.nc")
+    assert found["output_of"].values.tolist() == ["force", "narrow"] * 3
+    assert found["step"].values.tolist() == [1, 1, 2, 2, 3, 3]
+    assert found["displacements.grip.x"].values.tolist() == [0.1, 0.1, 0.2, 0.2, -0.3, -0.3]
+    forces = found["mean"].values[::2]
+    assert 0 < forces[0] < forces[1]
+    assert forces[2] < 0
+    np.testing.assert_allclose(np.abs(found["field_mean"].values).max(), 0.3, rtol=1e-12)  # fields are of the last step
+    summary = json.loads((tmp_path / "2" / "summary.json").read_text())
+    assert list(summary["outputs"])[-1] == "narrow.3"
+    assert summary["outputs"]["force.1"]["mesh_error"] is not None
+    page = (tmp_path / "2" / "report.html").read_text()
+    assert "Over the path" in page
+    assert "displacements.grip.x = 0.1, 0.2, -0.3 m in 3 steps" in page
+
+
+@pytest.mark.fem
+def test_paths_that_stop_are_said(tmp_path):
+    study = tmp_path / "curve.toml"
+    # Beyond a certain squeeze a Saint Venant–Kirchhoff body has no equilibrium: the softer, the earlier.
+    study.write_text(
+        STUDY.replace("neo-hookean-coupled", "saint-venant-kirchhoff")
+        .replace('displacements = [{ name = "grip", on = "x-max", x = [0.1, 0.2, -0.3], y = 0, z = 0 }]', LOADS)
+        .replace('kind = "reaction", on = "x-max"', 'kind = "mean-displacement", on = "x-max"')
+        .replace("lower = 1.8e4, upper = 2.2e4", "lower = 1e4, upper = 3e4")
+        .replace("sensitivity-monte-carlo", "monte-carlo")
+    )
+    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "out", "--set", "accuracy.mesh_error=false")
+    assert done.returncode == 3, done.stderr
+    found = xr.load_dataset(tmp_path / "out" / "results.nc")
+    lost = ~found["ok"].values
+    assert 0 < lost.sum() < 6
+    assert np.isfinite(found["values"].values[lost, :2]).all()
+    assert np.isnan(found["values"].values[lost, -1]).all()
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert all("of 3 (loads.push.size = " in failure["reason"] for failure in summary["failures"])
+    assert any("stop on their way" in finding["text"] for finding in summary["findings"])
+
+
+LOADS = 'loads = [{ kind = "traction", name = "push", on = "x-max", direction = [-1, 0, 0], size = [500, 1000, 4500] }]'
