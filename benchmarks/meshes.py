@@ -1,43 +1,55 @@
 """Whether intervals hold the truth of data that have no mesh in common with the inversion.
 
-Specimens are drawn from the prior; their data are those of graded hexahedra of degree 2, 12 along an edge, thinner at
-the held face than any mesh that the inversion looks at. Of posteriors on 4 cells along an edge that are linear at the
-truth it is known in closed form how often intervals hold it, over all noise; some are inverted as studies do.
+Specimens are drawn from the prior: a ball in a cube, or a random stiffness at its vertices. Their data are those of
+another code (`benchmarks.other_code`), on tetrahedra of degree 3, 16 times thinner at the held face; inversions are on
+4 quadratic hexahedra along an edge, by the defaults of studies. Of posteriors that are linear at the truth it is known
+in closed form how often intervals hold it, over all noise.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
+from benchmarks.other_code import Cube
 from forward.fem.finer import extrapolated
 from forward.fem.specimen import SpecimenModel
 from forward.model import FloatArray, SolveError
 from forward.specimen import Specimen
+from inverse.criticism.doubts import mesh_corrected, mesh_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Places, Whitening
 from inverse.data.errors import NORMAL
 from inverse.data.observations import Components
+from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
-from inverse.methods.invert_few import Nearby, invert_by_group
+from inverse.methods.invert_few import invert_by_group
+from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.mesh_correction import Treatment, error_of
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
+from workflows.studies.findings_inversion import NEITHER
 from workflows.studies.finer import solved_on
 
-CELLS, OVERKILL = 4, 12
+if TYPE_CHECKING:
+    import xarray as xr
+
+Factor = Callable[[FloatArray], FloatArray]  # places (n, 3) → (n,)
+
+CELLS, OVERKILL = 4, 7  # along an edge, of the inversion and of the data
 WIDE = 1.959964  # deviations of an interval of 95 %
-TRUTHS = 24
+TRUTHS, FIELDS, SEED = 24, 12, 17
+DIRECTIONS = 4  # of a field, of which the data say most
 NOISES = (0.01, 0.03)  # of the root mean square of the displacements of each load case
-INVERTED = 2  # of the truths that are inverted too
-FILE = Path("results/meshes.npz")
+LMBDA, WIDTH = 4e4, 0.15
+FOLDER = Path("results")
 WORDS: dict[Treatment, str] = {"correct": "corrected", "report": "left as it is"}
 HEAD = (
     "noise",
@@ -47,6 +59,26 @@ HEAD = (
     "of each parameter (%)",
     "their shift over deviation (rms)",
 )
+INVERTED = (
+    "noise",
+    "error of the mesh",
+    "95 % intervals hold",
+    "mean less truth over deviation (rms)",
+    "can be trusted",
+    "of these, hold",
+    "CPU time of each (s)",
+)
+OF_FIELDS = (
+    "noise",
+    "error of the mesh",
+    "that error over the noise",
+    "95 % intervals hold: vertices",
+    f"the {DIRECTIONS} directions of which the data say most",
+    "the mean over the body",
+    "mean less truth over deviation (rms) of these",
+    "can be trusted",
+    "CPU time of each (s)",
+)
 PRIORS: dict[str, Distribution] = {
     "inclusions.lump.x": Uniform(lower=0.3, upper=0.7),
     "inclusions.lump.z": Uniform(lower=0.35, upper=0.75),
@@ -55,85 +87,147 @@ PRIORS: dict[str, Distribution] = {
     "material.mu": LogNormal(mean=1e4, std=2e3),
 }
 PARAMETERS = tuple(PRIORS)
+BALL = {"name": "lump", "x": 0.5, "y": 0.5, "z": 0.55, "radius": 0.28, "contrast": 4.0, "width": WIDTH}
+FIELD = {"of": "stiffness", "length": 0.5, "std": 0.6, "basis": "nodes"}
+CASES = {"shear": (1500.0, 0.0, 0.0), "compression": (0.0, 0.0, -2000.0)}  # tractions (Pa)
 
 
-def specimen(cells: int, grading: dict[str, float]) -> Specimen:
-    """Return a cube with a ball inside, sheared and pressed, observed at points of four faces."""
+def specimen(cells: int = CELLS, *, field: bool = False) -> Specimen:
+    """Return a cube with a ball or a random stiffness inside, sheared and pressed, observed at points of four faces."""
     lines = np.linspace(0.06, 0.94, 5).tolist()
     faces = [((0.0, a, b), (1.0, a, b), (a, 1.0, b), (a, b, 1.0)) for a, b in product(lines, lines)]
-    acting = (("shear", (1.0, 0.0, 0.0), 1500.0), ("compression", (0.0, 0.0, -1.0), 2000.0))
     cases = [
-        {
-            "name": name,
-            "clamp": ("z-min",),
-            "loads": ({"kind": "traction", "on": "z-max", "direction": direction, "size": size},),
-        }
-        for name, direction, size in acting
+        {"name": name, "clamp": ("z-min",), "loads": ({"kind": "traction", "on": "z-max", **_acting(traction)},)}
+        for name, traction in CASES.items()
     ]
-    ball = {"name": "lump", "x": 0.5, "y": 0.5, "z": 0.55, "radius": 0.28, "contrast": 4.0, "width": 0.15}
     return Specimen.model_validate(
         {
-            "body": {"size": (1.0, 1.0, 1.0), "cells": (cells,) * 3, "degree": 2, "grading": grading},
-            "material": {"kind": "neo-hookean-coupled", "mu": 1e4, "lmbda": 4e4},
-            "inclusions": (ball,),
+            "body": {"size": (1.0, 1.0, 1.0), "cells": (cells,) * 3, "degree": 2},
+            "material": {"kind": "neo-hookean-coupled", "mu": 1e4, "lmbda": LMBDA},
+            **({"fields": (FIELD,)} if field else {"inclusions": (BALL,)}),
             "cases": cases,
             "observed": ({"at": tuple(sorted({point for four in faces for point in four}))},),
         }
     )
 
 
-def made(inputs: Inputs, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return truths (n, d) and their data (n, m) without noise; kept in a file, since they take minutes."""
-    truths = inputs.from_normals(np.random.default_rng(16).standard_normal((count, len(PARAMETERS))))[0]
-    if FILE.exists():
-        kept = np.load(FILE)
-        if len(kept["truths"]) >= count and np.allclose(kept["truths"][:count], truths):
-            return truths, kept["data"][:count]
-    sides = {f"{axis}-{end}": 8.0 for axis in "xy" for end in ("min", "max")}
-    model: SpecimenModel = specimen(OVERKILL, {"z-min": 16.0} | sides).build(MPI.COMM_SELF, PARAMETERS)
-    near = Nearby.at(model, inputs.mean, inputs.std).on(model)
-    data = np.array([model.solve(truth, near(truth)).outputs for truth in truths])
-    FILE.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(FILE, truths=truths, data=data)
-    return truths, data
+def _acting(traction: tuple[float, ...]) -> dict[str, Any]:
+    size = float(np.linalg.norm(traction))
+    return {"direction": tuple(float(t / size) for t in traction), "size": size}
+
+
+def ball(truth: FloatArray) -> Factor:
+    """Return the factor on the stiffness of a ball, at places."""
+    x, z, radius, contrast, _ = truth
+    centre = np.array([x, BALL["y"], z])
+
+    def factor(places: FloatArray) -> FloatArray:
+        inside = (1 - np.tanh((np.linalg.norm(places - centre, axis=1) - radius) / WIDTH)) / 2
+        return np.asarray(contrast**inside)
+
+    return factor
+
+
+def lattice(log: FloatArray, vertices: FloatArray) -> Factor:
+    """Return the factor on the stiffness whose logarithm (N,) is linear between vertices (N, 3) of a regular grid."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    n = round(len(vertices) ** (1 / 3))
+    order = np.lexsort(vertices.round(9).T[::-1])
+    grid = RegularGridInterpolator((np.linspace(0, 1, n),) * 3, log[order].reshape(n, n, n))
+    return lambda places: np.asarray(np.exp(grid(places.clip(0, 1))))
+
+
+def made(model: SpecimenModel, name: str, truths: FloatArray, factors: Sequence[Factor], mus: FloatArray) -> FloatArray:
+    """Return data (n, m) of truths (n, d) without noise; kept in a file as they are made, since they take minutes."""
+    file = FOLDER / f"meshes-{name}.npz"
+    found: list[FloatArray] = []
+    if file.exists():
+        kept = np.load(file)
+        same = min(len(kept["truths"]), len(truths))
+        if np.allclose(kept["truths"][:same], truths[:same]):
+            found = list(kept["data"][:same])
+    cube, states = Cube(OVERKILL, 1.0), dict[str, FloatArray]()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for k in range(len(found), len(truths)):
+        moved = []
+        for case, traction in CASES.items():
+            states[case] = cube.solve(mus[k], LMBDA, factors[k], np.array(traction), states.get(case))
+            moved.append(cube.observed(states[case], model.places))
+        found.append(np.array(moved)[model.cases, np.arange(len(model.axes)), model.axes])
+        np.savez(file, truths=truths[: k + 1], data=found)
+    return np.array(found)
+
+
+def balls(model: SpecimenModel, inputs: Inputs, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return truths (n, d) drawn from the prior, and their data (n, m)."""
+    truths = inputs.from_normals(np.random.default_rng(seed).standard_normal((count, len(PARAMETERS))))[0]
+    return truths, made(model, f"balls-{seed}", truths, [ball(truth) for truth in truths], truths[:, -1])
 
 
 def main(options: Sequence[str] = ()) -> None:
-    """Print how often intervals hold the truth, expected of posteriors that are linear there; and some inversions."""
+    """Print how often intervals hold the truth: expected of linear posteriors, and counted in inversions."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks meshes")
     parser.add_argument("--truths", type=int, default=TRUTHS)
-    parser.add_argument("--inverted", type=int, default=INVERTED)
+    parser.add_argument("--inverted", type=int, default=TRUTHS)
+    parser.add_argument("--fields", type=int, default=FIELDS)
+    parser.add_argument("--seed", type=int, default=SEED, help="of the truths; what is uncertain was chosen on 16")
     given = parser.parse_args(list(options))
     inputs = Inputs(PRIORS)
-    truths, clean = made(inputs, given.truths)
-    model: SpecimenModel = specimen(CELLS, {}).build(MPI.COMM_SELF, PARAMETERS)
+    model: SpecimenModel = specimen().build(MPI.COMM_SELF, PARAMETERS)
     case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).observing(model)))
+    truths, clean = balls(model, inputs, given.truths, given.seed)
+    if given.truths:
+        _expect(case, truths, clean)
+    if given.inverted:
+        _invert(case, truths[: given.inverted], clean[: given.inverted])
+    if given.fields:
+        _invert_fields(given.fields, given.seed)
+
+
+def _expect(case: Case, truths: FloatArray, clean: FloatArray) -> None:
     known = [_known(case, truth) for truth in truths]
-    print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}")
+    _row(HEAD, first=True)
     for noise in NOISES:
         for treatment, words in WORDS.items():
             rows = [_expected(case, *both, noise, treatment) for both in zip(known, clean, strict=True)]
             size, held, shift = (np.array([row[k] for row in rows]) for k in range(3))
-            cells = (
-                f"{100 * noise:g} %",
-                words,
-                f"{np.sqrt((size**2).mean()):.2f}",
-                f"{100 * held.mean():.0f} %",
-                ", ".join(f"{100 * one:.0f}" for one in held.mean(axis=0)),
-                f"{np.sqrt((shift**2).mean()):.2f}",
+            _row(
+                (
+                    f"{100 * noise:g} %",
+                    words,
+                    f"{np.sqrt((size**2).mean()):.2f}",
+                    f"{100 * held.mean():.0f} %",
+                    ", ".join(f"{100 * one:.0f}" for one in held.mean(axis=0)),
+                    f"{np.sqrt((shift**2).mean()):.2f}",
+                )
             )
-            print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def _invert(case: Case, truths: FloatArray, clean: FloatArray) -> None:
+    _row(INVERTED, first=True)
     for noise in NOISES:
         for treatment, words in WORDS.items():
-            some = list(zip(truths, clean, strict=True))[: given.inverted]
-            rows = [_inverted(case, *both, noise, treatment, seed) for seed, both in enumerate(some)]
-            held, gaps = (np.array([row[name] for row in rows]) for name in ("held", "gaps"))
-            print(
-                f"\n{100 * noise:g} % noise, {words}: {held.sum()} of {held.size} truths in 95 % intervals of "
-                f"inversions; mean less truth over deviation {np.sqrt((gaps**2).mean()):.1f} (rms), "
-                f"{rows[0]['solves']:.0f} solves on finer meshes, {rows[0]['seconds']:.0f} s of CPU.",
-                flush=True,
+            pairs = enumerate(zip(truths, clean, strict=True))
+            rows = [_inverted(case, *both, noise, treatment, seed) for seed, both in pairs]
+            held, gaps, seconds, trust = (np.array([row[name] for row in rows]) for name in rows[0])
+            _row(
+                (
+                    f"{100 * noise:g} %",
+                    words,
+                    f"{held.sum()} of {held.size} ({', '.join(str(one) for one in held.sum(axis=0))})",
+                    ", ".join(f"{one:.1f}" for one in np.sqrt((gaps**2).mean(axis=0))),
+                    f"{trust.sum()} of {trust.size}",
+                    f"{held[trust].sum()} of {held[trust].size}",
+                    f"{seconds.mean():.0f}",
+                )
             )
+
+
+def _row(cells: Sequence[str], *, first: bool = False) -> None:
+    print(f"{chr(10) if first else ''}| {' | '.join(cells)} |", flush=True)
+    if first:
+        print(f"|{'---|' * len(cells)}", flush=True)
 
 
 class Case(NamedTuple):
@@ -182,7 +276,7 @@ def _expected(
     """
     from scipy.special import ndtr
 
-    sigma = _sigma(case, clean, noise)
+    sigma = _sigma(case.model, clean, noise)
     mesh = known.error if treatment == "correct" else None
     white = Whitening.of(sigma, mesh, NORMAL)
     A = white((known.slopes / white.sigma[:, None]).T).T
@@ -196,10 +290,10 @@ def _expected(
     return float(np.sqrt((((clean - known.outputs) / sigma) ** 2).mean())), held, shift
 
 
-def _sigma(case: Case, clean: FloatArray, noise: float) -> FloatArray:
+def _sigma(model: SpecimenModel, clean: FloatArray, noise: float) -> FloatArray:
     """Standard deviations (m,) of the errors: a share of the root mean square of each load case."""
-    sizes = np.array([np.sqrt((part**2).mean()) for part in case.model.values(clean)])
-    return noise * sizes[case.model.cases]
+    sizes = np.array([np.sqrt((part**2).mean()) for part in model.values(clean)])
+    return noise * sizes[model.cases]
 
 
 def _inverted(
@@ -208,15 +302,88 @@ def _inverted(
     """Invert one data set."""
     begin = time.process_time()
     inputs, model, finer = case
-    sigma = _sigma(case, clean, noise)
-    values = clean + sigma * np.random.default_rng([seed, 7]).standard_normal(len(clean))
-    data = Components(model.places, model.axes, model.cases, values, sigma)
-    method = Invert(samples=32, starts=1, draws=50, mesh_error=treatment)
-    found = invert_by_group(inputs, model, data, method, None, finer=finer)
+    data = _measured(case.model, clean, noise, seed)
+    found = invert_by_group(inputs, model, data, Invert(starts=1, mesh_error=treatment), None, finer=finer)
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),
         "gaps": (mean - truth) / std,
-        "solves": float(found["mesh_solves"]),
         "seconds": time.process_time() - begin,
+        "trust": _trusted(found),
+    }
+
+
+def _measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -> Components:
+    sigma = _sigma(model, clean, noise)
+    values = clean + sigma * np.random.default_rng([seed, 7]).standard_normal(len(clean))
+    return Components(model.places, model.axes, model.cases, values, sigma)
+
+
+def _trusted(found: xr.Dataset) -> bool:
+    """Whether a study would say that the posterior can be trusted, as far as its weights and the mesh are concerned."""
+    error, shift, left = (found[name].to_numpy() for name in ("mesh_error", "mesh_shift", "mesh_left"))
+    nodes = found["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in found else np.zeros(0)
+    shifts, lefts = (dict(enumerate_as_names(values)) for values in (shift, left))
+    if found["mesh_corrected"]:
+        doubts = mesh_corrected(error, shifts, lefts, nodes, settled=bool(found["mesh_settled"]))
+    else:
+        doubts = mesh_too_coarse(bool(found["mesh_checked"]), str(found["mesh_why"].item()), error, shifts, nodes)
+    return int(found["trust"]) < NEITHER and all(doubt.severity == "note" for doubt in doubts)
+
+
+def enumerate_as_names(values: FloatArray) -> Iterator[tuple[str, float]]:
+    """Give values (d,) names."""
+    return ((str(k), value) for k, value in enumerate(values.tolist()))
+
+
+def _invert_fields(count: int, seed: int) -> None:
+    """Count in inversions for the stiffness at all vertices: vertices, the mean, and what the data say most about."""
+    spec = specimen(field=True)
+    model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
+    prior = spec.fields[0].prior(spec.body)
+    root = prior.root(np.eye(len(prior.variance))).T
+    coordinates = np.random.default_rng([seed, 1]).standard_normal((count, len(root)))
+    offset = model.log_fields(np.zeros((1, len(root))))[0]
+    truths = offset + coordinates @ root.T
+    factors = [lattice(truth, model.vertices.coordinates) for truth in truths]
+    clean = made(model, f"fields-{seed}", truths, factors, np.full(count, 1e4))
+    finer = solved_on(extrapolated(model, np.zeros(len(root))).observing(model))
+    vertices = Vertices(offset, prior.matern.mass)
+    _row(OF_FIELDS, first=True)
+    for noise in NOISES:
+        for treatment, words in WORDS.items():
+            rows = []
+            for k, truth in enumerate(truths):
+                begin, data = time.process_time(), _measured(model, clean[k], noise, k)
+                posterior = FieldPosterior(model, data.values, data.sigma, prior)
+                found = invert_field(posterior, data, Invert(mesh_error=treatment), vertices, finer)
+                rows.append(_of_field(found, truth, prior.matern.mass, root) | {"s": time.process_time() - begin})
+            size, nodes, mean, modes, trust, seconds = (np.array([row[name] for row in rows]) for name in rows[0])
+            within = [f"{100 * (np.abs(gaps) < WIDE).mean():.0f} %" for gaps in (nodes, modes)]
+            _row(
+                (
+                    f"{100 * noise:g} %",
+                    words,
+                    f"{np.sqrt((size**2).mean()):.2f}",
+                    *within,
+                    f"{(np.abs(mean) < WIDE).sum()} of {count}",
+                    ", ".join(f"{np.sqrt((gaps**2).mean()):.2f}" for gaps in (nodes, modes, mean)),
+                    f"{trust.sum()} of {count}",
+                    f"{seconds.mean():.0f}",
+                )
+            )
+
+
+def _of_field(found: xr.Dataset, truth: FloatArray, mass: FloatArray, root: FloatArray) -> dict[str, Any]:
+    """Mean less truth, over deviations: at the vertices, in the first directions, and of the mean over the body."""
+    gap = found["stiffness_mean"].to_numpy() - truth
+    values = found["eigenvalue"].to_numpy()[:DIRECTIONS]
+    along = np.linalg.solve(root, found["direction_stiffness"].to_numpy()[:DIRECTIONS].T)
+    whitened = np.linalg.solve(root, gap) @ (along / np.linalg.norm(along, axis=0))
+    return {
+        "size": float(np.sqrt((found["mesh_error"].to_numpy() ** 2).mean())),
+        "nodes": gap / found["stiffness_std"].to_numpy(),
+        "mean": float(mass @ gap / mass.sum() / found["std"].to_numpy()[0]),
+        "modes": whitened * np.sqrt(1 + values),
+        "trust": _trusted(found),
     }
