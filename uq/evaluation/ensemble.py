@@ -7,6 +7,7 @@ in order.
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -112,6 +113,7 @@ class Ensemble:
         task: Callable[[EnsembleEvaluate], T],
         *,
         others: Mapping[str, Callable[[], ForwardModel]] | None = None,
+        passing: frozenset[str] = frozenset(),
         checkpoint: Checkpoint | None = None,
         progress: Progress = lambda done, failed: None,
         blocks: int = BLOCKS,
@@ -127,6 +129,8 @@ class Ensemble:
             Called on rank 0 only, with the evaluation.
         others
             Make this group's other models by name (`Evaluate.on`), each when first needed.
+        passing
+            Names of models of which only the last one is kept, for memory.
         checkpoint
             Where finished blocks are kept and found.
         progress
@@ -142,7 +146,7 @@ class Ensemble:
             What the task returned, on rank 0; None on the other ranks.
         """
         with self.turns(progress) as turns:
-            worker = _Worker(self, _Models(model, others or {}), checkpoint, turns)
+            worker = _Worker(self, _Models(model, others or {}, passing), checkpoint, turns)
             if self.world.rank > 0:
                 with abort_all(self.world):
                     while (order := self.world.bcast(None)) is not None:
@@ -165,14 +169,22 @@ class _Order:
 
 
 class _Models:
-    """The models of this group, each made when first needed; making one is collective over the group."""
+    """The models of this group, each made when first needed; making one is collective over the group.
 
-    def __init__(self, first: ForwardModel, others: Mapping[str, Callable[[], ForwardModel]]) -> None:
-        self._makers = others
+    Of those that are passing only the last one is kept; one that is needed again is made again.
+    """
+
+    def __init__(
+        self, first: ForwardModel, others: Mapping[str, Callable[[], ForwardModel]], passing: frozenset[str]
+    ) -> None:
+        self._makers, self._passing = others, passing
         self._made = {OWN: first}
 
     def __getitem__(self, name: str) -> ForwardModel:
         if name not in self._made:
+            if name in self._passing:
+                self._made = {other: model for other, model in self._made.items() if other not in self._passing}
+                gc.collect()  # on all ranks of the group at once: freeing a factor is collective
             self._made[name] = self._makers[name]()
         return self._made[name]
 

@@ -70,6 +70,8 @@ class MethodJob:
         Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
     estimates
         Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
+    passing
+        Names of other models of which only the last one is kept in memory.
     """
 
     model: ForwardModel
@@ -82,6 +84,7 @@ class MethodJob:
     texts: Texts = field(default=lambda _: {})
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
     estimates: Sequence[Evaluations] = ()
+    passing: frozenset[str] = frozenset()
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
@@ -107,6 +110,7 @@ class MethodJob:
             self.model,
             self.task,
             others=self.others,
+            passing=self.passing,
             checkpoint=checkpoint if self.costly else None,
             progress=progress,
             blocks=blocks,

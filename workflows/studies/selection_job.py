@@ -53,8 +53,15 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         return trusted_on_meshes(found)
 
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
-    others |= {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}
+    finer_ones = {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}
     first = makers[study.pairs[0]]()
     return MethodJob(
-        first, others, task, recorders, labelled, arviz_groups=partial(arviz_groups, study), costly=study.costly
+        first,
+        others | finer_ones,
+        task,
+        recorders,
+        labelled,
+        arviz_groups=partial(arviz_groups, study),
+        costly=study.costly,
+        passing=frozenset(finer_ones),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
@@ -164,6 +164,13 @@ class SpecimenSelection(ModelSelection):
         checked = [specimen for name, specimen in self.of_candidates.items() if not self.unchecked[name]]
         return *self.of_candidates.values(), *(fine for one in checked for fine in meshes_of(one))
 
+    @property
+    def memory(self) -> float:
+        """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
+        own = list(self.of_candidates.values())
+        checked = [one for name, one in self.of_candidates.items() if not self.unchecked[name]]
+        return _bytes(own) + max((_bytes(meshes_of(one)) for one in checked), default=0.0)
+
     @cached_property
     def unchecked(self) -> dict[str, str]:
         """Why each candidate is not checked on a finer mesh; empty if it is."""
@@ -242,3 +249,7 @@ class SpecimenSelection(ModelSelection):
         strange = next((case for case in self.data.cases if case not in known), None)
         if strange is not None:
             yield ("cases",), f"no load case '{strange}', of which there are data", known
+
+
+def _bytes(specs: Sequence[Specimen]) -> float:
+    return sum(cost.bytes for cost in (one.cost() for one in specs) if cost is not None)

@@ -11,6 +11,7 @@ pytestmark = pytest.mark.mpi
 STUDY = """
 import sys
 import time
+import weakref
 import numpy as np
 from mpi4py import MPI
 from forward.model import FunctionModel, SolveError
@@ -58,6 +59,14 @@ elif case == "models":
         assert (two(Request(points)).outputs == 2 * one).all()
         assert (evaluate(Request(points)).outputs == one).all()
         return MonteCarlo(samples=2).run(inputs, evaluate)
+elif case == "passing":
+    def task(evaluate):
+        for name in ("first", "second", "first"):
+            there = evaluate.on(name)
+            assert there.outputs == (name,)
+            there(Request(np.random.default_rng(0).random((9, 2))))
+            assert [one.outputs for one in made] == [(name,)], "another one is still in memory"
+        return MonteCarlo(samples=2).run(inputs, evaluate)
 elif case == "method":
     def task(evaluate):
         raise SolveError("the method gave up")
@@ -65,9 +74,19 @@ else:
     def task(evaluate):
         return SensitivityMonteCarlo(samples=300, seed=3).run(inputs, evaluate)
 
+made = weakref.WeakSet()
+
+def passing(name):
+    def make():
+        found = FunctionModel(function, ("a", "b"), (name,))
+        made.add(found)
+        return found
+    return make
+
 try:
     other = FunctionModel(lambda p: 2 * function(p), ("a", "b"), ("g",))
-    data = ensemble.run(model, task, others={"other": lambda: other}, progress=count)
+    others = {"other": lambda: other, "first": passing("first"), "second": passing("second")}
+    data = ensemble.run(model, task, others=others, passing=frozenset({"first", "second"}), progress=count)
 except SolveError as error:
     print("caught", error)
     sys.exit(1)
@@ -77,6 +96,8 @@ if data is not None and case == "many":
 elif data is not None and case == "models":
     assert counts == [153, 0], counts
     print("same", counts)
+elif data is not None and case == "passing":
+    print("same", counts)
 elif data is not None:
     assert data.identical(SensitivityMonteCarlo(samples=300, seed=3).run(inputs, SerialEvaluate(model)))
     assert counts == [301, int((~data.ok).sum())], counts
@@ -84,7 +105,7 @@ elif data is not None:
 """
 
 
-@pytest.mark.parametrize("case", ["plain", "fails", "uneven", "many", "models"])
+@pytest.mark.parametrize("case", ["plain", "fails", "uneven", "many", "models", "passing"])
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 def test_same_numbers_as_in_one_process(ranks, case):
     done = run_script(ranks, STUDY, case)
