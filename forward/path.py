@@ -131,14 +131,16 @@ class Path(Hyperelastic):
         )
 
     @property
-    def axes_of_outputs(self) -> dict[str, list[Any]]:
+    def axes_of_outputs(self) -> dict[str, tuple[str, list[Any]]]:
         """Which output and which step each of these is, and the numbers that have steps there."""
         returned = self.returned
-        found: dict[str, list[Any]] = {
-            "output_of": [one.of for one in returned],
-            "step": [one.step for one in returned],
+        found: dict[str, tuple[str, list[Any]]] = {
+            "output_of": ("", [one.of for one in returned]),
+            "step": ("1", [one.step for one in returned]),
         }
-        return found | {path: [values[one.step - 1] for one in returned] for path, values in self.steps.items()}
+        for path, values in self.steps.items():
+            found[path] = self.unit_of(path), [values[one.step - 1] for one in returned]
+        return found
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -63,8 +63,8 @@ class ModelSpec(Settings):
         return self.outputs
 
     @property
-    def axes_of_outputs(self) -> Mapping[str, Sequence[Any]]:
-        """What else is known of what the model returns, by the names of further coordinates of results."""
+    def axes_of_outputs(self) -> Mapping[str, tuple[str, Sequence[Any]]]:
+        """What else is known of what the model returns: units and values by the names of coordinates of results."""
         return {}
 
     @property

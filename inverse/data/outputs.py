@@ -2,7 +2,8 @@
 
 A table of comma-separated values has the columns `output` and `value`, in the unit of the output, and may have `sigma`,
 the standard deviation of the error. An output may be measured several times. Lines that begin with # state the source
-of the data; ``# truth.PATH = number`` gives the true value of a number of the model.
+of the data; ``# truth.PATH = number`` gives the true value of a number of the model. Curves have tables of
+their own kind (`inverse.data.curves`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.approximation_error import Places
+from inverse.data.curves import Steps, as_rows
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.data.observations import TRUTH, DataError, read_table
 
@@ -119,7 +121,7 @@ class OutputData:
         return [f"{label}, {name}" for label, name in zip(self.labels, self.names, strict=True)]
 
 
-def read_outputs(path: Path, outputs: Sequence[str]) -> OutputData:
+def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None) -> OutputData:
     """Read a table of measured outputs.
 
     Parameters
@@ -128,6 +130,8 @@ def read_outputs(path: Path, outputs: Sequence[str]) -> OutputData:
         The table.
     outputs
         Names of the outputs of the model.
+    steps
+        Of a path, where the table may be a curve.
 
     Raises
     ------
@@ -136,6 +140,8 @@ def read_outputs(path: Path, outputs: Sequence[str]) -> OutputData:
     """
     table = read_table(path)
     name = path.name
+    if steps is not None and "output" not in table.columns:
+        table = as_rows(table, name, steps)
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}"
         for column in table.columns

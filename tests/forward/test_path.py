@@ -39,7 +39,7 @@ def test_lists_of_loads_and_displacements_are_steps():
     assert [output.name for output in spec.returned][:2] == ["largest.1", "largest-z.1"]
     assert spec.returned[-1].name == "stress.2"
     assert spec.returned[-1].unit == "Pa"
-    assert spec.axes_of_outputs["loads.pull.size"] == [10.0] * 9 + [20.0] * 9
+    assert spec.axes_of_outputs["loads.pull.size"] == ("Pa", [10.0] * 9 + [20.0] * 9)
     assert spec.whole.scalars["loads.pull.size"].value == 20.0
     assert spec.refined(1).steps == spec.steps
 

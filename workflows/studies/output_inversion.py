@@ -14,6 +14,7 @@ from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import MODELS, ModelSpec
+from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.observations import DataError
 from inverse.data.outputs import OutputData, read_outputs, stated
@@ -161,7 +162,7 @@ class OutputInversion(InversionStudy):
 
     def read(self, path: Path) -> OutputData:
         """Read a table of outputs; errors as in every inversion."""
-        return self._with_errors(read_outputs(path, self.outputs))
+        return self._with_errors(read_outputs(path, self.outputs, steps_of(self.model)))
 
     def _with_errors(self, found: OutputData) -> OutputData:
         noise = self.data.noise

@@ -17,6 +17,7 @@ from forward.settings import Settings, one_line
 from forward.spec import MODELS, ModelSpec
 from forward.words import named
 from inverse.criticism.comparison import Data
+from inverse.data.curves import steps_of
 from inverse.data.measured_model import MeasuredModel
 from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs, stated
@@ -66,7 +67,9 @@ class OutputFile(Settings):
         """
         outputs = tuple(output.name for output in spec.returned)
         try:
-            found = stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs)
+            found = (
+                stated(self.outputs) if self.file is None else read_outputs(folder / self.file, outputs, steps_of(spec))
+            )
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         given = np.array([self.sigma.get(name, np.nan) for name in found.names])
@@ -178,7 +181,7 @@ class OutputSelection(ModelSelection):
 
     def measured_in(self, test: str) -> str:
         """Name an output with its unit, which is that of the first candidate."""
-        outputs = next(iter(self.of_candidates.values())).outputs
+        outputs = next(iter(self.of_candidates.values())).returned
         return next(named(output.name, output.unit) for output in outputs if output.name == test)
 
     def described(self, name: str) -> str:

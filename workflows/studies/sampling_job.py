@@ -111,8 +111,9 @@ def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
     """Add what else is known of the outputs, as at which step of a path they are."""
     places = {output.name: i for i, output in enumerate(spec.returned)}
     at = [places[str(name)] for name in found["output"].values]
+    axes = spec.axes_of_outputs.items()
     return found.assign_coords(
-        {name: ("output", np.array(values)[at]) for name, values in spec.axes_of_outputs.items()}
+        {name: ("output", np.array(values)[at], {"units": unit} if unit else {}) for name, (unit, values) in axes}
     )
 
 

@@ -1,0 +1,166 @@
+"""Tables of measured curves over the steps of a path.
+
+A column says where on the path each row is: a number that has steps (``depth``, or its whole path), or ``step``. The
+others are measured outputs (``force``), with ``sigma_force`` or ``sigma`` for the standard deviations of their errors.
+Heads may state units: ``depth [mm]``. A cell may be empty where nothing was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from forward.model import FloatArray
+from forward.settings import nearest
+from inverse.data.observations import DataError, Table
+from inverse.data.units import factor, split_head
+
+CLOSE = 1e-6  # of the largest number: rows this near to a step are at it
+
+
+class Steps(NamedTuple):
+    """What is computed along a path.
+
+    Attributes
+    ----------
+    units
+        Units of the outputs, by their names without a step.
+    numbers
+        By path: the unit of a number that has steps, and its values.
+    """
+
+    units: Mapping[str, str]
+    numbers: Mapping[str, tuple[str, Sequence[float]]]
+
+    @property
+    def places(self) -> dict[str, tuple[str, FloatArray]]:
+        """Units and values of what a column can say about the place of a row, by its possible names."""
+        count = len(next(iter(self.numbers.values()))[1])
+        found = {"step": ("1", np.arange(1.0, count + 1))}
+        for path, (unit, values) in self.numbers.items():
+            found[path] = found[path.rpartition(".")[2]] = unit, np.array(values)
+        return found
+
+
+def steps_of(spec: Any) -> Steps | None:
+    """Return the steps of a model (`ModelSpec`); None if it has none."""
+    axes = dict(spec.axes_of_outputs)
+    if "output_of" not in axes:
+        return None
+    of, at = axes.pop("output_of")[1], axes.pop("step")[1]
+    first = [at.index(step) for step in sorted(set(at))]
+    units = {one: output.unit for one, output in zip(of, spec.returned, strict=True)}
+    return Steps(units, {path: (unit, [values[i] for i in first]) for path, (unit, values) in axes.items()})
+
+
+def as_rows(table: Table, name: str, steps: Steps) -> Table:
+    """Return the table of a curve as one with a row for each datum, in SI units.
+
+    Raises
+    ------
+    DataError
+        With every kind of mistake in the heads, or in the places of the rows.
+    """
+    scales = _scales(table, name, steps)
+    places = steps.places
+    heads = {split_head(head)[0]: head for head in table.columns}
+    where = [column for column in heads if column in places]
+    rows, lines, wrong = [], [], []
+    for row, line in zip(table.rows, table.lines, strict=True):
+        at = _step(row, f"{name}: line {line}", {column: heads[column] for column in where}, places, scales)
+        if isinstance(at, str):
+            wrong.append(at)
+            continue
+        for output in (one for one in steps.units if one in heads and row[heads[one]]):
+            sigma = next((heads[one] for one in (f"sigma_{output}", "sigma") if one in heads), None)
+            rows.append(
+                {
+                    "output": f"{output}.{at}",
+                    "value": _scaled(row[heads[output]], scales[heads[output]]),
+                    "sigma": "" if sigma is None else _scaled(row[sigma], scales[sigma]),
+                }
+            )
+            lines.append(line)
+    if wrong:
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        raise DataError(f"{wrong[0]}{more}")
+    return replace(table, columns=("output", "value", "sigma"), rows=rows, lines=lines)
+
+
+def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
+    """Return how many SI units a number in each column is, by its head."""
+    scales, wrong, places = {}, [], steps.places
+    columns = [split_head(head) for head in table.columns]
+    for head, (column, unit) in zip(table.columns, columns, strict=True):
+        of = column.removeprefix("sigma_")
+        if column in places:
+            si = places[column][0]
+        elif of in steps.units:
+            si = steps.units[of]
+        elif column == "sigma":
+            found = {steps.units[other] for other, _ in columns if other in steps.units}
+            if len(found) != 1:
+                wrong.append(f"{name}: sigma of several units, expected columns sigma_OUTPUT")
+                continue
+            (si,) = found
+        else:
+            known = [*places, *steps.units, *(f"sigma_{one}" for one in steps.units), "sigma"]
+            wrong.append(f"{name}: unknown column '{column}'; {nearest(column, known)}")
+            continue
+        try:
+            scales[head] = 1.0 if unit is None else factor(unit, si)
+        except ValueError as error:
+            wrong.append(f"{name}: column '{column}' has {error}")
+    named = [column for column, _ in columns]
+    if not set(named) & set(places):
+        wrong.append(f"{name}: no column says where on the path a row is, expected one of: {', '.join(places)}")
+    if not set(named) & set(steps.units):
+        wrong.append(f"{name}: no column is a measured output, expected one of: {', '.join(steps.units)}")
+    lengths = [(column, unit) for column, unit in columns if column in {**places, **steps.units} and column != "step"]
+    if len({unit is None for _, unit in lengths}) > 1:
+        stated = next(column for column, unit in lengths if unit is not None)
+        silent = next(column for column, unit in lengths if unit is None)
+        wrong.append(
+            f"{name}: '{stated}' states a unit and '{silent}' does not, expected units of all columns or of none"
+        )
+    if wrong:
+        raise DataError(*wrong)
+    return scales
+
+
+def _step(
+    row: Mapping[str, str],
+    label: str,
+    where: Mapping[str, str],
+    places: Mapping[str, tuple[str, FloatArray]],
+    scales: Mapping[str, float],
+) -> int | str:
+    """Return the step of a row, from 1, or what is wrong with its place."""
+    near = np.ones(len(places["step"][1]), dtype=bool)
+    told = []
+    for column, head in where.items():
+        try:
+            value = float(row[head]) * scales[head]
+        except ValueError:
+            return f"{label}: {column} is {row[head]!r}, expected a number"
+        values = places[column][1]
+        near &= np.abs(values - value) <= CLOSE * np.abs(values).max()
+        told.append(f"{column} = {value:g}")
+    if near.sum() == 1:
+        return int(near.argmax()) + 1
+    known = ", ".join(f"{value:g}" for value in places[next(iter(where))][1])
+    ways = "no step of the model" if not near.any() else "more than one step of the model"
+    return f"{label}: {', '.join(told)} is {ways}; its steps are {next(iter(where))} = {known}"
+
+
+def _scaled(text: str, scale: float) -> str:
+    """A number in SI units; what is not a number stays as it is, for the message that says so."""
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    return text if scale == 1 or not math.isfinite(number) else repr(number * scale)
