@@ -11,21 +11,20 @@ one. Like σ itself they are to be doubled for 95 %.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from forward.model import FloatArray
-from uq.accuracy.doubts import doubts
+from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
+from uq.accuracy.doubts import Told, doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
-from uq.estimators.indices import coefficient_moments
 from uq.estimators.moments import ESTIMATES
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.regression import NOTHING
@@ -36,12 +35,10 @@ if TYPE_CHECKING:
 Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
-ENOUGH = 64  # samples that say by themselves how an output depends on the parameters
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
-TERMS = 500  # of an expansion, at most, whose indices are looked at with and without the error
-INDICES = ("sobol_first", "sobol_total")
+DIRECTIONS = 12  # of what the estimates leave open, at most, along which its consequences are looked at
 
 
 class Sketch(NamedTuple):
@@ -51,18 +48,13 @@ class Sketch(NamedTuple):
     outputs: FloatArray
 
 
-def _has(dataset: xr.Dataset, name: str, *dims: str) -> bool:
-    """Whether there is such a variable: methods from outside may give others, or none."""
-    return name in dataset and dataset[name].dims == dims
-
-
 def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch:
     """Draw the expansion of a study, or take its samples, or draw the tangents at the mean.
 
     The tangents are drawn too of outputs that an expansion does not explain.
     """
     expanded = "multi_index" in dataset
-    if not expanded and _has(dataset, "values", "sample", "output") and _has(dataset, "points", "sample", "parameter"):
+    if not expanded and has(dataset, "values", "sample", "output") and has(dataset, "points", "sample", "parameter"):
         ok = dataset["ok"].to_numpy()
         if ok.sum() >= ENOUGH:
             return Sketch(dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
@@ -71,12 +63,12 @@ def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch
     if not expanded:
         return Sketch(points, tangents)
     known = Expansion.of(dataset)
-    explained = dataset["loo_error"].to_numpy() <= NOTHING if _has(dataset, "loo_error", "output") else True
+    explained = dataset["loo_error"].to_numpy() <= NOTHING if has(dataset, "loo_error", "output") else True
     return Sketch(points, np.where(explained, known.basis.values(points) @ known.coefficients, tangents))
 
 
 def with_mesh_errors(
-    dataset: xr.Dataset, inputs: Inputs, centre: Linearisation, found: MeshErrors, units: Mapping[str, str]
+    dataset: xr.Dataset, inputs: Inputs, centre: Linearisation, found: MeshErrors, told: Told
 ) -> xr.Dataset:
     """Add to the results of a method what the error of the mesh does to them, and what is to be said of it.
 
@@ -88,8 +80,8 @@ def with_mesh_errors(
         The outputs at the mean parameters with their derivatives.
     found
         Estimates at some points.
-    units
-        Of the outputs, for what is said.
+    told
+        What is known of the model, for what is said.
     """
     drawn = sketch(dataset, inputs, centre)
     effects = [_Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])]
@@ -103,7 +95,7 @@ def with_mesh_errors(
     if found.fields is not None and len(found.points) >= FEWEST_ANSWERS:
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
     dataset = dataset.assign(variables)
-    add(dataset, *doubts(dataset, found.evaluations, units))
+    add(dataset, *doubts(dataset, found.evaluations, told))
     return dataset
 
 
@@ -158,7 +150,7 @@ class _Effect:
     def mean(self) -> tuple[float, float]:
         """Error of the mean, and what its estimates leave open of it."""
         means = self.functions.mean(axis=0)
-        return float(means @ self.coefficients), max(self._left(means), self.unseen)
+        return float(means @ self.coefficients), max(self.left(means), self.unseen)
 
     def std(self, known: float) -> tuple[float, float]:
         """Error of the standard deviation, which is known, and what its estimates leave open of it."""
@@ -166,9 +158,23 @@ class _Effect:
         before, after = float(self.outputs.std()), float(exact.std())
         share = known / before if known < FURTHEST * before else 1.0  # beyond, the sketch says nothing of the spread
         along = covariances(self.functions, exact[:, None])[:, 0] / after if after else np.zeros(len(self.coefficients))
-        return share * (after - before), share * max(self._left(along), self.unseen)
+        return share * (after - before), share * max(self.left(along), self.unseen)
 
-    def _left(self, weights: FloatArray) -> float:
+    def along(self, of: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Error of what follows from values of the output (n, c) → (c, …), and what its estimates leave open of it.
+
+        Open is how it changes along the principal directions of what is open of the coefficients.
+        """
+        sizes, directions = np.linalg.eigh(self.covariance)
+        leading = np.argsort(-sizes)[:DIRECTIONS]
+        kept = np.maximum(sizes[leading], 0.0)
+        scale = np.sqrt(max(float(np.trace(self.covariance)) / float(kept.sum()), 1.0)) if kept.sum() > 0 else 0.0
+        exact = self.outputs + self.errors
+        others = exact[:, None] + self.functions @ (directions[:, leading] * np.sqrt(kept) * scale)
+        before, after, *moved = of(np.column_stack([self.outputs, exact, others]))
+        return after - before, np.sqrt(((np.array(moved) - after) ** 2).sum(axis=0))
+
+    def left(self, weights: FloatArray) -> float:
         """Standard deviation of a sum of the coefficients with weights (q,)."""
         return float(np.sqrt(max(float(weights @ self.covariance @ weights), 0.0)))
 
@@ -182,19 +188,11 @@ def _of_outputs(
     unknown: FloatArray,
 ) -> Variables:
     """Errors of estimates of the outputs, given what is unknown of each estimate (m,), relative to it."""
-    nothing = np.full(len(effects), np.nan)
-    nominal, derivatives = nothing.copy(), np.full(centre.tangents.shape, np.nan)
-    for i, one in enumerate(effects):
-        if one is not None:
-            nominal[i] = (one.way.functions(centre.point[None, :], centre.outputs[None, :]) @ one.coefficients)[0]
-            derivatives[i] = one.way.slopes(centre.point, centre.outputs, centre.tangents) @ one.coefficients
-    variables: Variables = {"nominal_mesh_error": (("output",), nominal)}
-    if _has(dataset, "derivative", "output", "parameter"):
-        variables["derivative_mesh_error"] = (("output", "parameter"), derivatives)
-    if not all(_has(dataset, name, "output") for name in ESTIMATES):
+    variables = _at_centre(dataset, centre, effects, unknown)
+    if not all(has(dataset, name, "output") for name in ESTIMATES):
         return variables
     for estimated, first in (("mean", ""), ("std", "std_")):
-        error, rest = nothing.copy(), nothing.copy()
+        error, rest = np.full((2, len(effects)), np.nan)
         for i, one in enumerate(effects):
             if one is not None:
                 error[i], rest[i] = one.mean if estimated == "mean" else one.std(float(dataset["std"][i]))
@@ -206,41 +204,64 @@ def _of_outputs(
             f"{estimated}_corrected": (("output",), dataset[estimated].to_numpy() + error),
             f"{estimated}_corrected_error": (("output",), np.hypot(sampling, doubt)),
         }
-    if _has(dataset, "quantiles", "quantile", "output"):
-        probabilities = dataset["quantile"].to_numpy()
-        moved = np.full((len(probabilities), len(effects)), np.nan)
-        for i, one in enumerate(effects):
-            if one is not None:
-                exact = one.outputs + one.errors
-                moved[:, i] = np.quantile(exact, probabilities) - np.quantile(one.outputs, probabilities)
-        variables["quantiles_mesh_error"] = (("quantile", "output"), moved)
-    if all(_has(dataset, name, "output", "parameter") for name in INDICES) and inputs.independent:
-        variables |= _indices(dataset, inputs, drawn, effects)
+    for consequence in consequences(dataset, inputs, drawn.points):
+        variables |= _of_consequence(dataset, consequence, effects, unknown)
     return variables
 
 
-def _indices(dataset: xr.Dataset, inputs: Inputs, drawn: Sketch, effects: Sequence[_Effect | None]) -> Variables:
-    """Errors of Sobol' indices: of outputs with and without the error, in the polynomials that the study has."""
-    basis = _polynomials(dataset, inputs)
-    rows = basis.values(drawn.points)
-    found = {name: np.full(dataset[name].shape, np.nan) for name in INDICES}
+def _at_centre(
+    dataset: xr.Dataset, centre: Linearisation, effects: Sequence[_Effect | None], unknown: FloatArray
+) -> Variables:
+    """Errors of outputs and of their derivatives at the mean parameters."""
+    nominal, doubt = np.full((2, len(effects)), np.nan)
+    slopes, open_slopes = np.full((2, *centre.tangents.shape), np.nan)
     for i, one in enumerate(effects):
         if one is None:
             continue
-        both = np.column_stack([one.outputs, one.outputs + one.errors])
-        of = coefficient_moments(np.linalg.lstsq(rows, both, rcond=None)[0].T, basis.indices)
-        for name in INDICES:
-            found[name][i] = of[name][1] - of[name][0]
-    return {f"{name}_mesh_error": (("output", "parameter"), values) for name, values in found.items()}
+        at = one.way.functions(centre.point[None, :], centre.outputs[None, :])[0]
+        nominal[i] = at @ one.coefficients
+        doubt[i] = np.hypot(unknown[i] * nominal[i], max(one.left(at), one.unseen))
+        along = one.way.slopes(centre.point, centre.outputs, centre.tangents)
+        slopes[i] = along @ one.coefficients
+        open_slopes[i] = np.hypot(unknown[i] * slopes[i], [one.left(row) for row in along])
+    variables: Variables = {
+        "nominal_mesh_error": (("output",), nominal),
+        "nominal_mesh_error_doubt": (("output",), doubt),
+        "nominal_corrected": (("output",), centre.outputs + nominal),
+    }
+    if has(dataset, "derivative", "output", "parameter"):
+        variables |= _corrected(dataset, "derivative", slopes, open_slopes)
+    return variables
 
 
-def _polynomials(dataset: xr.Dataset, inputs: Inputs) -> Basis:
-    """Those of an expansion, or as many of a low order as the points can tell."""
-    if "multi_index" in dataset and dataset.sizes["term"] <= TERMS:
-        return Expansion.of(dataset).basis
-    d = len(inputs.names)
-    order = next((order for order in (3, 2) if len(hyperbolic(d, order, 1.0)) <= ENOUGH // 2), 1) if d <= ENOUGH else 1
-    return orthonormal(inputs, hyperbolic(d, order, 1.0))
+def _of_consequence(
+    dataset: xr.Dataset, of: Consequence, effects: Sequence[_Effect | None], unknown: FloatArray
+) -> Variables:
+    """Errors of a variable that follows from the outputs over the distribution."""
+    stated = np.moveaxis(dataset[of.name].to_numpy(), of.by_output, 0)
+    error, doubt = np.full((2, *stated.shape), np.nan)
+    for i, one in enumerate(effects):
+        if one is not None:
+            error[i], rest = one.along(lambda values, i=i: of.of(values, i))  # type: ignore[misc]
+            std = float(one.outputs.std())
+            missed = of.missed(stated[i], one.unseen / std if std else 0.0, std)
+            doubt[i] = np.hypot(unknown[i] * error[i], np.maximum(rest, missed))
+    known = np.isfinite(stated)  # an expansion that explains nothing has no indices
+    error, doubt = (np.moveaxis(np.where(known, values, np.nan), 0, of.by_output) for values in (error, doubt))
+    return _corrected(dataset, of.name, error, doubt)
+
+
+def _corrected(dataset: xr.Dataset, name: str, error: FloatArray, doubt: FloatArray) -> Variables:
+    """Name errors of a variable, and its corrected values."""
+    stated, dims = dataset[name], tuple(map(str, dataset[name].dims))
+    sampling = dataset[f"{name}_error"].to_numpy() if f"{name}_error" in dataset else 0.0
+    values = {
+        f"{name}_mesh_error": error,
+        f"{name}_mesh_error_doubt": doubt,
+        f"{name}_corrected": stated.to_numpy() + error,
+        f"{name}_corrected_error": np.hypot(sampling, doubt),
+    }
+    return {key: (dims, found) for key, found in values.items()}
 
 
 # --- fields ----------------------------------------------------------------------------------------------------------
@@ -259,12 +280,18 @@ def _of_fields(
     way = best([between(inputs, centre.output_slopes, found.points, found.outputs, i) for i in followed], fields)
     at_centre = way.functions(centre.point[None, :], centre.outputs[None, :])[0] @ way.weights
     variables: Variables = {"field_nominal_mesh_error": (by_node, (at_centre @ fields).reshape(-1, 3))}
-    if not _has(dataset, "field_mean", *by_node):
+    if has(dataset, "field_derivative", "parameter", *by_node):
+        along = way.slopes(centre.point, centre.outputs, centre.tangents) @ way.weights
+        variables["field_derivative_mesh_error"] = (
+            ("parameter", *by_node),
+            (along @ fields).reshape(dataset["field_derivative"].shape),
+        )
+    if not has(dataset, "field_mean", *by_node):
         return variables
     shares = way.functions(drawn.points, drawn.outputs) @ way.weights
     variables["field_mean_mesh_error"] = (by_node, (shares.mean(axis=0) @ fields).reshape(-1, 3))
     shared = _with_displacements(dataset, centre, drawn, shares)
-    if _has(dataset, "field_std", *by_node) and shared is not None:
+    if has(dataset, "field_std", *by_node) and shared is not None:
         std = dataset["field_std"].to_numpy().ravel()
         more = (fields * (2 * shared + covariances(shares, shares) @ fields)).sum(axis=0)
         moved = np.sqrt(np.maximum(std**2 + more, 0.0)) - std

@@ -202,6 +202,7 @@ class Sobol(Amount):
         )
         if self.groups:
             dataset = dataset.assign_coords(group=list(self.groups))
+            dataset["group_members"] = (("group", "parameter"), self._members(inputs))
         if self.second_order:
             dataset = dataset.assign_coords(partner=list(inputs.names))
         return dataset

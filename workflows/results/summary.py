@@ -83,36 +83,100 @@ def _moments(dataset: xr.Dataset) -> Part:
     }
 
 
+def _quantiles(dataset: xr.Dataset) -> Part:
+    probabilities = [f"{p:g}" for p in dataset["quantile"].to_numpy()]
+    names = _with_errors(dataset, "quantiles", "value")
+    return {
+        "quantiles": {
+            str(output): {
+                p: {short: _number(dataset[name].sel(output=output)[i]) for short, name in names.items()}
+                for i, p in enumerate(probabilities)
+            }
+            for output in dataset.output.values
+        }
+    }
+
+
 def _sobol(dataset: xr.Dataset) -> Part:
-    shares = {"first": "sobol_first", "total": "sobol_total"}
-    names = {f"{short}{end}": f"{name}{end}" for short, name in shares.items() for end in ("", "_error")}
-    return {"sobol": _by_parameter(dataset, names)}
+    def both(kind: str) -> dict[str, str]:
+        return _with_errors(dataset, f"{kind}_first", "first") | _with_errors(dataset, f"{kind}_total", "total")
+
+    found = {"sobol": _by(dataset, "parameter", both("sobol"))}
+    if "sobol_group_first" in dataset:
+        found["sobol_groups"] = _by(dataset, "group", both("sobol_group"))
+    return found
+
+
+def _second(dataset: xr.Dataset) -> Part:
+    names = _with_errors(dataset, "sobol_second", "second")
+    pairs = {
+        str(parameter): _by(dataset.sel(parameter=parameter), "partner", names)
+        for parameter in dataset.parameter.values
+    }
+    return {
+        "sobol_second": {
+            str(output): {
+                parameter: {other: of for other, of in found[str(output)].items() if other != parameter}
+                for parameter, found in pairs.items()
+            }
+            for output in dataset.output.values
+        }
+    }
 
 
 def _bounds(dataset: xr.Dataset) -> Part:
-    return {"bounds": _by_parameter(dataset, {"total": "total_bound", "total_error": "total_bound_error"})}
+    return {"bounds": _by(dataset, "parameter", _with_errors(dataset, "total_bound", "total"))}
+
+
+def _with_errors(dataset: xr.Dataset, name: str, short: str) -> dict[str, str]:
+    """Return the variables that say how exact one is, which there are, by shorter names."""
+    ends = ("", "_error", "_mesh_error", "_mesh_error_doubt", "_corrected", "_corrected_error")
+    first = "" if short == "value" else f"{short}_"
+    return {(f"{first}{end[1:]}" if end else short): f"{name}{end}" for end in ends if f"{name}{end}" in dataset}
 
 
 def _local(dataset: xr.Dataset) -> Part:
-    names = {"local": "derivative", "local_per_std": "derivative_per_std", "local_per_range": "derivative_per_range"}
+    names = {
+        "local": "derivative",
+        "local_per_std": "derivative_per_std",
+        "local_per_range": "derivative_per_range",
+    } | {
+        f"local{end}": f"derivative{end}"
+        for end in ("_mesh_error", "_mesh_error_doubt", "_corrected", "_corrected_error")
+    }
     return {
         key: {
             output: {parameter: numbers[""] for parameter, numbers in of_output.items()}
-            for output, of_output in _by_parameter(dataset, {"": variable}).items()
+            for output, of_output in _by(dataset, "parameter", {"": variable}).items()
         }
         for key, variable in names.items()
         if variable in dataset
     }
 
 
-def _by_parameter(dataset: xr.Dataset, names: Mapping[str, str]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Return some variables (output, parameter) under shorter names, by output and parameter."""
+def _nominal(dataset: xr.Dataset) -> Part:
+    """What is known of outputs at the mean parameters, where nothing is sampled."""
+    names = {"value": "nominal"} | {
+        name: f"nominal_{name}"
+        for name in ("mesh_error", "mesh_error_doubt", "corrected")
+        if f"nominal_{name}" in dataset
+    }
+    return {
+        "nominal": {
+            str(output): {short: _number(dataset[name].sel(output=output)) for short, name in names.items()}
+            for output in dataset.output.values
+        }
+    }
+
+
+def _by(dataset: xr.Dataset, what: str, names: Mapping[str, str]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return some variables (output, what) under shorter names, by output and parameter, say."""
     return {
         str(output): {
-            str(parameter): {
-                short: _number(dataset[name].sel(output=output, parameter=parameter)) for short, name in names.items()
+            str(one): {
+                short: _number(dataset[name].sel({"output": output, what: one})) for short, name in names.items()
             }
-            for parameter in dataset.parameter.values
+            for one in dataset[what].values
         }
         for output in dataset.output.values
     }
@@ -166,8 +230,11 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"clean"}, _synthetic),
     ({"probability"}, _comparison),
     ({"nominal", "mean"}, _moments),
+    ({"quantiles", "mean"}, _quantiles),
     ({"sobol_first"}, _sobol),
+    ({"sobol_second"}, _second),
     ({"total_bound"}, _bounds),
     ({"derivative"}, _local),
+    ({"derivative", "nominal_corrected"}, _nominal),
     ({"row_method"}, _methods),
 )

@@ -30,9 +30,10 @@ from workflows.results.directory import (
     write_text,
 )
 from workflows.run import own_code
+from workflows.run.closing import closing_words
 from workflows.run.plan import of_program, shortage
 from workflows.run.progress import Progress
-from workflows.run.summary import closing_words, summarised
+from workflows.run.summary import summarised
 from workflows.run.version import version
 from workflows.studies.adapted_mesh import FILES as REFINED
 from workflows.studies.findings_solves import findings_of_solves

@@ -1,17 +1,15 @@
-"""What a run writes to summary.json, and prints at its end."""
+"""What a run writes to summary.json."""
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uq.estimators import branch
 from uq.findings import findings
-from workflows.report import words
-from workflows.results.summary import inverted, summarise
+from workflows.results.summary import summarise
 from workflows.run import own_code
 from workflows.run.version import commit, versions
 
@@ -109,51 +107,3 @@ def _of_tasks(outcomes: Sequence[Outcome], evaluations: Iterable[Evaluations]) -
 def _unlikely(evaluations: Iterable[Evaluations]) -> int:
     """Number of solves at parameters for which there is no model."""
     return sum(failure.inadmissible for found in evaluations for failure in found.failures)
-
-
-def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    """Summarise the results at the end of a run."""
-    lines = [
-        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
-        f"probability {found['probability']:.3g}"
-        for model, found in summary.get("models", {}).items()
-    ]
-    lines += inverted(summary)
-    for output, values in summary.get("outputs", {}).items():
-        unit = dataset.unit.sel(output=output).item()
-        lines.append(
-            f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
-            f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
-        )
-        if "bias_error" in values:
-            lines[-1] += (
-                f"; error of the mesh about {values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
-            )
-        elif values.get("mean_corrected") is not None:
-            lines.append(
-                f"{' ' * len(output)}  error of the mesh {values['mesh_error']:+.2g} {unit}, in all ± "
-                f"{values['total_error']:.2g} {unit}; corrected mean {values['mean_corrected']:.6g} ± "
-                f"{values['mean_corrected_error']:.2g} {unit}, standard deviation {values['std_corrected']:.4g} ± "
-                f"{values['std_corrected_error']:.2g} {unit}"
-            )
-    first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
-    for name, rows in summary.get("methods", {}).items():
-        last = rows[-1]
-        lines.append(
-            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
-            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
-        )
-    if not lines:
-        for output, slopes in summary.get("local_per_range", {}).items():
-            shown = ", ".join(f"{p} {v:.4g}" for p, v in slopes.items() if v is not None)
-            lines.append(f"{output}: derivative × range of the parameter: {shown}")
-    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
-    lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
-    if "stability" in summary:
-        lines.append(words.stability(summary["stability"]))
-    if "note" in summary:
-        lines.append(summary["note"])
-    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
-    if (directory / "report.html").exists():
-        lines.append(f"report: {directory / 'report.html'}")
-    return "\n".join(lines) + "\n"

@@ -88,6 +88,7 @@ def _with_mesh_errors(
     estimates: list[Evaluations],
 ) -> xr.Dataset:
     """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
+    from uq.accuracy.doubts import Told
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
@@ -104,7 +105,11 @@ def _with_mesh_errors(
     count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
     estimates.append(errors.evaluations)
-    return with_mesh_errors(found, inputs, centre, errors, {one.name: one.unit for one in study.model.returned})
+    outputs = study.model.returned
+    never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
+    tolerance = getattr(getattr(study.model, "solver", None), "tolerance", 0.0)
+    told = Told({one.name: one.unit for one in outputs}, never, tolerance)
+    return with_mesh_errors(found, inputs, centre, errors, told)
 
 
 def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:

@@ -8,6 +8,7 @@ import xarray as xr
 
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
+from uq.accuracy.doubts import Told
 from uq.accuracy.effects import DOUBT, UNCALIBRATED, with_mesh_errors
 from uq.accuracy.mesh_errors import design, estimate
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
@@ -26,7 +27,7 @@ from uq.surrogates.linearisation import linearised
 pytestmark = pytest.mark.unit
 
 INPUTS = Inputs({"a": Beta(a=2, b=2, lower=1.0, upper=1.5), "b": Uniform(lower=1.0, upper=2.0)})
-UNITS = {"u": "m", "v": "Pa"}
+TOLD = Told({"u": "m", "v": "Pa"})
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,12 @@ def on_mesh(error, names=("a", "b")):
     return OnMesh(coarse, names, ("u", "v"), slopes, exact)
 
 
-def studied(method, model, count=FEWEST, inputs=INPUTS):
+def studied(method, model, count=FEWEST, inputs=INPUTS, told=TOLD):
     recorder = Recorder(SerialEvaluate(model))
     dataset = method.run(inputs, recorder)
     centre = linearised(inputs, recorder, recorder.first)
     found = estimate(inputs, SerialEvaluate(model), centre, count, 0, fields=True)
-    return dataset, with_mesh_errors(dataset, inputs, centre, found, UNITS)
+    return dataset, with_mesh_errors(dataset, inputs, centre, found, told)
 
 
 def exact_moments(model, inputs=INPUTS):
@@ -124,6 +125,50 @@ def test_of_every_method_moments_and_quantiles_are_corrected(method):
         np.testing.assert_allclose(found["sobol_first_mesh_error"][1], 0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "method",
+    [
+        Sobol(samples=24, groups={"both": ("a", "b"), "first": ("a",)}, second_order=True),
+        Sobol(design="saltelli", samples=1024, groups={"both": ("a", "b")}, second_order=True),
+        DerivativeBased(samples=256),
+        LocalSensitivity(),
+        Chaos(samples=24),
+    ],
+    ids=lambda m: f"{m.kind}-{getattr(m, 'design', '')}",
+)
+def test_what_follows_from_outputs_is_corrected_as_the_same_study_without_a_mesh_says(method):
+    """Indices of groups and pairs, bounds, derivatives, quantiles, ends of the parts of a density."""
+    model = on_mesh(other)
+    _, found = studied(method, model, count=8)
+    exact = FunctionModel(model.exact.function, model.parameters, model.outputs, slopes_of(model.exact.function))
+    right = method.run(INPUTS, SerialEvaluate(exact))
+    shown = ("sobol_first", "sobol_total", "sobol_group_first", "sobol_group_total", "sobol_second")
+    names = [name for name in (*shown, "dgsm", "total_bound", "derivative", "quantiles") if name in found]
+    assert names
+    for name in names:
+        moved, left = right[name] - found[name], right[name] - found[f"{name}_corrected"]
+        sampling = right.get(f"{name}_error", 0 * moved)
+        assert (abs(left) < 0.2 * abs(moved).max() + sampling + 1e-9).all(), name
+        assert (abs(left) < 2 * np.hypot(found[f"{name}_mesh_error_doubt"], sampling) + 1e-9).all(), name
+    if "density" in found:
+        for output in ("u", "v"):
+            one, true = found.sel(output=output), right.sel(output=output)
+            moved, ends = below(true)(one["density_edge_corrected"]), below(one)(one["density_edge"])
+            assert abs(moved - ends).max() < 0.3 * abs(below(true)(one["density_edge"]) - ends).max()
+
+
+def below(found):
+    """Probability up to a value, by the density of an output."""
+    edges = found["density_edge"].values
+    parts = np.cumsum(found["density"].values * np.diff(edges))
+    return lambda x: np.interp(x, edges, [0.0, *parts])
+
+
+def slopes_of(function, h=1e-6):
+    """Central differences."""
+    return lambda p: np.column_stack([(function(p + e) - function(p - e)) / (2 * h) for e in h * np.eye(len(p))])
+
+
 def test_errors_of_what_an_expansion_does_not_explain_are_those_of_its_tangents():
     """An expansion that is refused has no spread of its own, over which errors would be without bounds."""
     model = on_mesh(affine)
@@ -154,7 +199,7 @@ def test_what_is_zero_by_symmetry_is_not_compared():
     dataset = MonteCarlo(samples=64).run(INPUTS, recorder)
     centre = linearised(INPUTS, recorder, recorder.first)
     errors = estimate(INPUTS, SerialEvaluate(model), centre, FEWEST, 0, fields=False)
-    found = with_mesh_errors(dataset, INPUTS, centre, errors, {"u": "m", "v": "m"})
+    found = with_mesh_errors(dataset, INPUTS, centre, errors, Told({"u": "m", "v": "m"}))
     said = [one.text for one in findings(found) if "mesh" in one.text]
     assert any("u 20%" in text for text in said)
     assert not any("v " in text.split(": ", 1)[-1] for text in said)
@@ -263,8 +308,39 @@ def test_failed_estimates_are_said_and_left_out():
 
 def test_what_is_not_estimated_is_said_by_name():
     _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.0, np.nan]))
-    assert any("not estimated of v" in one.text for one in findings(found))
+    assert any("no estimate" in one.text and "of v (3 of 3)" in one.text for one in findings(found))
     np.testing.assert_array_equal(np.isnan(found["total_error"]), [False, True])
+    told = Told(TOLD.units, frozenset({"v"}))
+    _, found = studied(Chaos(samples=24), on_mesh(lambda p: [0.0, np.nan]), told=told)
+    said = [one for one in findings(found) if "estimate" in one.text]
+    assert [one.severity for one in said] == ["note"]
+    assert "not estimated of v: such outputs need not converge" in said[0].text
+
+
+def test_what_is_zero_by_symmetry_is_of_no_interest():
+    """Its errors are many times it, and of no meaning."""
+    model = on_mesh(lambda p: [0.01 * p[0], 1e-17 * p[1]])
+    coarse = model.function
+    small = np.array([1.0, 1e-16])
+    exact = replace(model.exact, function=lambda p: small * (coarse(p) + np.array([0.2 * p[0], 3 * p[1]])))
+    zero = replace(model, function=lambda p: small * coarse(p), jacobian=None, exact=exact)
+    _, found = studied(MonteCarlo(samples=64), zero, told=Told({"u": "m", "v": "m"}))
+    assert abs(found["mesh_error"][1]) > 0.1 * abs(found["mean"][1])
+    said = [one.text for one in findings(found) if "mesh" in one.text]
+    assert said
+    assert not any(" v " in text or " v," in text for text in said)
+
+
+def test_a_tolerance_that_hides_the_mesh_is_told():
+    model = on_mesh(lambda p: [1e-6 * p[0], 0.01 * p[1]])
+    for tolerance, hidden in ((1e-4, True), (1e-10, False)):
+        _, found = studied(MonteCarlo(samples=64), model, told=Told(TOLD.units, tolerance=tolerance))
+        said = [one for one in findings(found) if "The solver's tolerance" in one.text]
+        assert bool(said) == hidden
+    _, found = studied(MonteCarlo(samples=64), model, told=Told(TOLD.units, tolerance=1e-4))
+    (said,) = (one for one in findings(found) if "The solver's tolerance" in one.text)
+    assert said.severity == "warning"
+    assert "mesh in u:" in said.text
 
 
 def test_where_the_mesh_decides_and_where_it_is_coarse():
@@ -315,7 +391,7 @@ def test_results_of_other_shapes_are_left_alone():
         },
         coords={"output": ["u", "v"]},
     )
-    after = with_mesh_errors(strange, INPUTS, centre, found, UNITS)
+    after = with_mesh_errors(strange, INPUTS, centre, found, TOLD)
     np.testing.assert_allclose(after["nominal_mesh_error"], affine(INPUTS.mean), rtol=1e-3)
     assert "mesh_error" not in after
     assert "quantiles_mesh_error" not in after

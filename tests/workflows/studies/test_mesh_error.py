@@ -151,8 +151,18 @@ def test_the_summary_and_the_terminal_say_it(tmp_path):
         np.hypot(of["mean_error"], abs(of["mesh_error"]) + of["mesh_error_doubt"])
     )
     assert of["std_corrected_error"] == pytest.approx(np.hypot(of["std_error"], of["std_mesh_error_doubt"]), rel=1e-6)
-    assert f"error of the mesh {of['mesh_error']:+.2g} m" in done.stdout
-    assert f"corrected mean {of['mean_corrected']:.6g}" in done.stdout
+    lines = done.stdout.splitlines()
+    first = lines.index("uy_max (m)")
+    assert lines[first - 1].split() == ["value", "sampling", "mesh", "in", "all", "corrected"]
+    name, value, sampling, mesh, whole, corrected, sign, its = lines[first + 1].split()
+    assert (name, sign) == ("mean", "±")
+    printed = [float(x) for x in (value, sampling, mesh, whole, corrected, its)]
+    keys = ("mean", "mean_error", "mesh_error", "total_error", "mean_corrected", "mean_corrected_error")
+    np.testing.assert_allclose(printed, [of[key] for key in keys], rtol=0.05)
+    assert max(map(len, lines[first - 1 : first + 6])) <= 80
+    of_first = summary["quantiles"]["uy_max"]["0.05"]
+    assert of_first["corrected"] == pytest.approx(of_first["value"] + of_first["mesh_error"])
+    assert summary["local_corrected"]["uy_max"].keys() == summary["local"]["uy_max"].keys()
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Error budget" in page
     assert page.index("Error budget") < page.index("What was computed")

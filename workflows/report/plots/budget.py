@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PART_COLOURS = {"sampling": CONTROLLED, "mesh": HIGH, "solver": PLAIN, "total": DARK}
 SHOWN = 12  # outputs that have bars
-SPAN = 1e-9  # of the largest error: smaller ones have no bar, so that the others can be distinguished
+SPAN = 1e-5  # of the largest error: smaller ones have a number, but no bar, so that the others can be distinguished
 
 
 def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax: Axes | None = None) -> Axes:
@@ -27,7 +27,7 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
     names
         Of the outputs.
     parts
-        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN if unknown.
+        Relative errors by their source (`PART_COLOURS`), an array over the outputs each; NaN where not estimated.
     of
         The estimate, in words.
     ax
@@ -37,18 +37,25 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
     ax = ax or axes(height=1.5 + (0.2 * len(parts) + 0.15) * len(names), width=7.6)
     places = np.arange(len(names))[::-1]
     height = 0.8 / len(parts)
-    largest = max((float(v) for values in parts.values() for v in values if np.isfinite(v)), default=0.0) or 1.0
-    floor = max(min((float(v) for values in parts.values() for v in values if v > 0), default=1.0), SPAN * largest)
+    positive = [float(v) for values in parts.values() for v in values if np.isfinite(v) and v > 0]
+    largest = max(positive, default=1.0)
+    floor = max(min(positive, default=1.0), SPAN * largest)
     left = floor / 3
     for row, (name, values) in enumerate(parts.items()):
-        drawn = np.where(values >= floor, values, np.nan)
         at = places + 0.4 - (row + 0.5) * height
+        drawn = np.where(values >= floor, values, left)
         ax.barh(at, drawn - left, left=left, height=0.9 * height, color=PART_COLOURS[name], label=name)
-        for y, value in zip(at, drawn, strict=True):
-            if np.isfinite(value):
-                ax.annotate(
-                    f"{value:.1e}", (value, y), xytext=(3, 0), textcoords="offset points", va="center", fontsize=7
-                )
+        for y, value, end in zip(at, values, drawn, strict=True):
+            text = f"{value:.1e}" if np.isfinite(value) else "not estimated"
+            ax.annotate(
+                text if end > left else f"{name} {text}",
+                (end, y),
+                xytext=(3, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=7,
+                color=DARK if end > left else PART_COLOURS[name],
+            )
     ax.set_xscale("log")
     ax.set_xlim(left, 8 * largest)
     ax.set_yticks(places, [text_of(name) for name in names])

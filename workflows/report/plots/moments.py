@@ -91,6 +91,7 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     if "density" in dataset:
         density, edges = (dataset[name].sel(output=output).to_numpy() for name in ("density", "density_edge"))
         ax.stairs(density, edges, fill=True, color=CONTROLLED, alpha=0.4)
+        _corrected_density(dataset, output, ax)
     else:
         values = dataset["values"].sel(output=output).to_numpy()[dataset["ok"].to_numpy()]
         spread = np.ptp(values) > 1e-12 * np.abs(values).max()
@@ -98,6 +99,10 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
             values, bins=_bins(values) if spread else 1, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white"
         )
     ax.axvline(float(dataset["mean"].sel(output=output)), color=DARK, label="mean")
+    corrected = dataset.get("mean_corrected")
+    if corrected is not None and np.isfinite(corrected.sel(output=output)):
+        place = float(corrected.sel(output=output))
+        ax.axvline(place, color=DARK, linestyle=":", label="corrected mean")
     for i, probability in enumerate(dataset["quantile"].to_numpy()):
         place = float(dataset["quantiles"].isel(quantile=i).sel(output=output))
         ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
@@ -114,8 +119,20 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     ax.set_xlabel(quantity(dataset, output))
     unit = str(dataset["unit"].sel(output=output).item())
     ax.set_ylabel("density" if unit == "1" else f"density (1/{unit})")
-    ax.legend()
+    ax.legend(fontsize="small", framealpha=0.7)
     return ax
+
+
+def _corrected_density(dataset: xr.Dataset, output: str, ax: Axes) -> None:
+    """Draw the density without the error of the mesh: as much of it between ends that have moved."""
+    if "density_edge_corrected" not in dataset:
+        return
+    of_output = dataset.sel(output=output)
+    before, after = (of_output[name].to_numpy() for name in ("density_edge", "density_edge_corrected"))
+    widths = np.diff(after)
+    if np.isfinite(after).all() and (widths > 0).all():
+        density = of_output["density"].to_numpy() * np.diff(before) / widths
+        ax.stairs(density, after, color=DARK, linewidth=1, label="corrected for the mesh")
 
 
 def _bins(values: NDArray[np.float64]) -> int:

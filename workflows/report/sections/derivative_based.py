@@ -49,7 +49,9 @@ def bounds(results: Results, output: str) -> Table:
         squared = with_error(float(of["dgsm"]), float(of["dgsm_error"]))
         total = with_error(float(of["sobol_total"]), float(of["sobol_total_error"])) if "sobol_total" in of else NONE
         bound = with_error(float(of["total_bound"]), float(of["total_bound_error"]))
-        rows.append((name, number(float(of["local_share"])), squared, number(float(of["poincare"])), total, bound))
+        corrected = results.corrected("total_bound", {"output": output, "parameter": name})
+        share, constant = number(float(of["local_share"])), number(float(of["poincare"]))
+        rows.append((name, share, squared, constant, total, bound, *corrected))
     head = (
         "parameter",
         "share of the local variance",
@@ -57,6 +59,7 @@ def bounds(results: Results, output: str) -> Table:
         "Poincaré constant",
         "total index (expansion)",
         "is at most",
+        *(("is at most, corrected",) if "total_bound_corrected" in results.dataset else ()),
     )
     return Table(head, rows)
 

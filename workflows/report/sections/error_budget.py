@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.words import NONE, number, with_error, with_unit
+from uq.estimators.rounding import only_rounding
 from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
 from workflows.report.section import Results, Section
 
+if TYPE_CHECKING:
+    import xarray as xr
+
+FIRST = {"std": "std_", "nominal": "nominal_"}  # of the names of an estimate's mesh and total error
+MANY = 10.0  # times a value: percentages beyond say nothing
+BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
 ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at the mean parameters"}
 
 
@@ -28,12 +37,14 @@ class ErrorBudget(Section):
         shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
         yield Heading("Error budget")
         yield Text(sentence(results, shown[0]))
+        counts = counting(results)
+        outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
         budgets = {name: found for name in shown if len(found := relative(results, name)) > 1}
-        if budgets:
+        if budgets and outputs:
             yield Pictures(
                 [
                     Picture.drawn(
-                        plots.error_budget(results.outputs, found, ESTIMATES[name]),
+                        plots.error_budget(outputs, {by: e[counts] for by, e in found.items()}, ESTIMATES[name]),
                         f"Errors of the {ESTIMATES[name]} by source.",
                     )
                     for name, found in budgets.items()
@@ -49,8 +60,8 @@ class ErrorBudget(Section):
 
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
-    """Return the errors of an estimate by source, for each output (m,); NaN if unknown."""
-    dataset, first = results.dataset, {"std": "std_", "nominal": "nominal_"}.get(name, "")
+    """Return the errors of an estimate by source, for each output (m,); NaN where they are not estimated."""
+    dataset, first = results.dataset, FIRST.get(name, "")
     found = {}
     if f"{name}_error" in dataset:
         found["sampling"] = dataset[f"{name}_error"].to_numpy()
@@ -62,6 +73,11 @@ def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
     if f"{first}total_error" in dataset:
         found["total"] = dataset[f"{first}total_error"].to_numpy()
     return found
+
+
+def counting(results: Results) -> NDArray[np.bool_]:
+    """Say which outputs (m,) are more than rounding."""
+    return ~only_rounding(results.dataset, {output: results.unit(output) for output in results.outputs})
 
 
 def relative(results: Results, name: str) -> dict[str, FloatArray]:
@@ -82,35 +98,48 @@ def sentence(results: Results, name: str) -> str:
         if not getattr(results.study, "accuracy", None) or not results.study.accuracy.mesh_error:
             why = "was not estimated, as asked (accuracy.mesh_error = false)"
         return f"The error of the mesh {why}: the numbers after ± do not include it."
-    words = []
-    for i, output in enumerate(results.outputs):
+    words, zero = [], []
+    for i, (output, counts) in enumerate(zip(results.outputs, counting(results), strict=True)):
         known = {source: float(errors[i]) for source, errors in found.items() if np.isfinite(errors[i])}
-        if "mesh" not in known:
+        if not counts:
+            zero.append(output)
+        elif "mesh" not in known:
             words.append(f"{output} (the error of its mesh is not estimated)")
-            continue
-        largest = max(known, key=lambda source: known[source])
-        whole = float(total[i]) if total is not None else known[largest]
-        words.append(f"{output} is known to {100 * whole:.2g}\u00a0%, most of it by the {largest}")
-    return f"Of the {ESTIMATES[name]}, {'; '.join(words)}."
+        else:
+            largest = max(known, key=lambda source: known[source])
+            whole = float(total[i]) if total is not None else known[largest]
+            share = f"to {100 * whole:.2g}\u00a0%" if whole < MANY else f"to no better than {MANY:.0f} times its size"
+            words.append(f"{output} is known {share}, most of it by {BY[largest]}")
+    said = [f"Of the {ESTIMATES[name]}, {'; '.join(words)}."] if words else []
+    if zero:
+        said.append(f"Zero but for rounding: {', '.join(zero)}.")
+    return " ".join(said)
 
 
 def table(results: Results, names: list[str]) -> Table:
     """The errors of each estimate, and its corrected value."""
-    rows = []
-    for output in results.outputs:
-        of_output, unit = results.dataset.sel(output=output), results.unit(output)
+    rows, dataset = [], results.dataset
+    for output in np.array(results.outputs)[counting(results)].tolist():
+        of_output, unit = dataset.sel(output=output), results.unit(output)
+
+        def known(name: str, of_output: xr.Dataset = of_output) -> float:
+            return float(of_output[name]) if name in of_output else np.nan
+
         for name in names:
-            first = "std_" if name == "std" else ""
-            error, doubt = (float(of_output[f"{first}mesh_error{end}"]) for end in ("", "_doubt"))
-            corrected = (float(of_output[f"{name}_corrected{end}"]) for end in ("", "_error"))
+            first = FIRST.get(name, "")
+            error, doubt = (known(f"{first}mesh_error{end}") for end in ("", "_doubt"))
+            corrected, its_error = known(f"{name}_corrected"), known(f"{name}_corrected_error")
+            total = known(f"{first}total_error")
+            if name == "nominal":  # where nothing is sampled
+                its_error, total = doubt, abs(error) + doubt
             rows.append(
                 (
                     f"{ESTIMATES[name]} of {output}",
-                    with_unit(number(float(of_output[name]), 6), unit),
-                    with_unit(number(float(of_output[f"{name}_error"]), 2), unit),
+                    with_unit(number(known(name), 6), unit),
+                    with_unit(number(known(f"{name}_error"), 2), unit),
                     NONE if np.isnan(error) else with_unit(with_error(error, doubt), unit),
-                    with_unit(number(float(of_output[f"{first}total_error"]), 2), unit),
-                    NONE if np.isnan(error) else with_unit(with_error(*corrected), unit),
+                    with_unit(number(total, 2), unit),
+                    NONE if np.isnan(error) else with_unit(with_error(corrected, its_error), unit),
                 )
             )
     head = ("estimate", "value", "sampling", "mesh", "total error", "corrected")

@@ -39,10 +39,13 @@ def sensitivities(results: Results, output: str) -> Table:
     rows = []
     for name in results.leading(slopes["derivative_per_std"]):
         of_parameter = slopes.sel(parameter=name)
-        slope = with_unit(number(float(of_parameter["derivative"]), 5), per(unit, results.parameter_unit(name)))
+        by = per(unit, results.parameter_unit(name))
+        slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
+        corrected = results.corrected("derivative", {"output": output, "parameter": name}, by)
         scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
-        rows.append((name, slope, *(with_unit(number(value), unit) for value in scaled)))
-    return Table(("parameter", "derivative", "× standard deviation", "× range"), rows)
+        rows.append((name, slope, *corrected, *(with_unit(number(value), unit) for value in scaled)))
+    known = ("corrected for the mesh",) if "derivative_corrected" in results.dataset else ()
+    return Table(("parameter", "derivative", *known, "× standard deviation", "× range"), rows)
 
 
 def largest_of(dataset: xr.Dataset) -> str:

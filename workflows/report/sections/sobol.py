@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 from forward.words import with_error
 from workflows.report import plots
@@ -39,29 +39,38 @@ class SobolIndices(Section):
 
 
 def sobol(results: Results, output: str) -> Table:
-    """Sobol' indices of an output."""
-    of_output = results.dataset.sel(output=output)
-    rows = []
-    for name in results.leading(of_output["sobol_total"]):
-        of_parameter = of_output.sel(parameter=name)
-        pairs = [(of_parameter[f"sobol_{which}"], of_parameter[f"sobol_{which}_error"]) for which in ("first", "total")]
-        rows.append((name, *(with_error(float(value), float(error)) for value, error in pairs)))
-    for name in map(str, results.dataset["group"].values if "group" in results.dataset.coords else ()):
-        of_group = of_output.sel(group=name)
-        kinds = [f"sobol_group_{which}" for which in ("first", "total")]
-        texts = [with_error(float(of_group[kind]), float(of_group[f"{kind}_error"])) for kind in kinds]
-        rows.append((f"group {name}", *texts))
-    return Table(("parameter", "first order", "total"), rows)
+    """Sobol' indices of an output, and what they are without the error of the mesh."""
+    leading = results.leading(results.dataset.sel(output=output)["sobol_total"])
+    groups = map(str, results.dataset["group"].values if "group" in results.dataset.coords else ())
+    single, grouped = (("sobol_first", "sobol_total"), ("sobol_group_first", "sobol_group_total"))
+    rows = [(name, *_cells(results, single, {"output": output, "parameter": name})) for name in leading]
+    rows += [(f"group {name}", *_cells(results, grouped, {"output": output, "group": name})) for name in groups]
+    head = _head(results, "sobol_first", ("first order", "total"))
+    return Table(("parameter", *head), rows)
 
 
 def second_order(results: Results, output: str) -> Table:
     """Shares of the variance of an output due to interactions of two parameters."""
-    of_output = results.dataset.sel(output=output)
     names = results.parameters
     rows = []
     for i, name in enumerate(names):
         for partner in names[i + 1 :]:
-            of_pair = of_output.sel(parameter=name, partner=partner)
-            share = with_error(float(of_pair["sobol_second"]), float(of_pair["sobol_second_error"]))
-            rows.append((name, partner, share))
-    return Table(("parameter", "with", "second order"), rows, text=frozenset({0, 1}))
+            at = {"output": output, "parameter": name, "partner": partner}
+            rows.append((name, partner, *_cells(results, ("sobol_second",), at)))
+    head = _head(results, "sobol_second", ("second order",))
+    return Table(("parameter", "with", *head), rows, text=frozenset({0, 1}))
+
+
+def _cells(results: Results, names: Sequence[str], at: Mapping[str, str]) -> Iterator[str]:
+    """Indices with their errors, each followed by its corrected value where there is one."""
+    for name in names:
+        value, error = (float(results.dataset[f"{name}{end}"].sel(at)) for end in ("", "_error"))
+        yield with_error(value, error)
+        yield from results.corrected(name, at)
+
+
+def _head(results: Results, name: str, words: Sequence[str]) -> Iterator[str]:
+    for word in words:
+        yield word
+        if f"{name}_corrected" in results.dataset:
+            yield f"{word}, corrected"

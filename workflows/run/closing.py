@@ -1,0 +1,158 @@
+"""What a run prints at its end: numbers with all their errors, in at most 80 columns where names are short."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from forward.words import NONE, named
+from uq.estimators.rounding import only_rounding
+from workflows.report import words
+from workflows.results.summary import inverted
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+DIGITS = 2, 8  # significant digits of errors, and most of values
+PARAMETERS = 12  # of which derivatives are listed
+ESTIMATES = {"mean": "", "std": "std_"}  # first part of the names of their mesh and total errors
+Row = Sequence[str]
+
+
+def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    """Summarise the results at the end of a run."""
+    lines = [
+        f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
+        f"probability {found['probability']:.3g}"
+        for model, found in summary.get("models", {}).items()
+    ]
+    lines += inverted(summary)
+    lines += _outputs(dataset, summary.get("outputs", {}))
+    first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
+    for name, rows in summary.get("methods", {}).items():
+        last = rows[-1]
+        lines.append(
+            f"{name}: {last['cost']} solves, {last['cpu_seconds']:.3g} s, "
+            f"root mean square error of the mean of {first} {last['error'] or float('nan'):.2g}"
+        )
+    if not lines:
+        lines += _derivatives(dataset, summary)
+    failed = f"{summary['failed']}{' data sets' if len(summary.get('data_sets', ())) > 1 else ''} failed"
+    lines.append(f"{words.counted(words.solves(summary))} in {summary['wall_seconds']:.1f} s, {failed}")
+    if "stability" in summary:
+        lines.append(words.stability(summary["stability"]))
+    if "note" in summary:
+        lines.append(summary["note"])
+    lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
+    if (directory / "report.html").exists():
+        lines.append(f"report: {directory / 'report.html'}")
+    return "\n".join(lines) + "\n"
+
+
+def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Moments of the outputs: in a table with the errors of the mesh where there are any, else a line each."""
+    if not any(values.get("mean_corrected") is not None for values in outputs.values()):
+        for output, values in outputs.items():
+            yield _line(output, values, _unit(dataset, output))
+        return
+    rounding = only_rounding(dataset, {output: _unit(dataset, output) for output in outputs})
+    rows: list[Row] = [("", "value", "sampling", "mesh", "in all", "corrected")]
+    for (output, values), nothing in zip(outputs.items(), rounding.tolist(), strict=True):
+        rows.append((named(output, _unit(dataset, output)) + (": zero but for rounding" if nothing else ""),))
+        for name, first in ESTIMATES.items() if not nothing else ():
+            error = values.get(f"{first}mesh_error")
+            of_mesh = [NONE]
+            if error is not None:
+                total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
+                doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
+                of_mesh = [_signed(error, doubt), _error(total), f"{_value(corrected, its)} ± {_error(its)}"]
+            sampling = values[f"{name}_error"]
+            rows.append((f"  {name}", _value(values[name], sampling), _error(sampling), *of_mesh))
+    yield from _table(rows)
+
+
+def _line(output: str, values: Mapping[str, Any], unit: str) -> str:
+    """Moments of an output, with the error of the finest mesh of a multilevel method."""
+    line = (
+        f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
+        f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
+    )
+    if "bias_error" in values:
+        errors = f"{values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
+        line += f";\n{' ' * len(output)}  error of the mesh about {errors}"
+    return line
+
+
+def _derivatives(dataset: xr.Dataset, summary: Mapping[str, Any]) -> Iterator[str]:
+    """Outputs at the mean parameters, and the effects of the parameters to first order."""
+    nominal = summary.get("nominal", {})
+    known = any(values["mesh_error"] is not None for values in nominal.values())
+    rows: list[Row] = [("", "value", *(("mesh", "corrected") if known else ()))]
+    for output, slopes in summary.get("local_per_range", {}).items():
+        rows.append((named(output, _unit(dataset, output)),))
+        at = nominal.get(output, {"value": float(dataset["nominal"].sel(output=output)), "mesh_error": None})
+        rows.append(
+            ("  at the mean parameters", *_with_mesh(at["value"], at["mesh_error"], at.get("mesh_error_doubt")))
+        )
+        spreads = [_spread(dataset, summary, output, name, slope) for name, slope in slopes.items()]
+        spreads.sort(key=lambda one: -abs(one[1]))
+        for name, value, factor in spreads[:PARAMETERS]:
+            errors = [summary.get(f"local_mesh_error{end}", {}).get(output, {}).get(name) for end in ("", "_doubt")]
+            scaled = [None if error is None else error * factor for error in errors]
+            rows.append((f"  {name}", *_with_mesh(value, *scaled)))
+        if len(spreads) > PARAMETERS:
+            rows.append((f"  {len(spreads) - PARAMETERS} smaller ones are in summary.json",))
+    if len(rows) > 1:
+        yield "Derivatives × range of the parameter (× standard deviation where it has no bounds):"
+        yield from _table(rows)
+
+
+def _spread(
+    dataset: xr.Dataset, summary: Mapping[str, Any], output: str, name: str, per_range: float | None
+) -> tuple[str, float, float]:
+    """Return a parameter, its effect to first order, and what derivatives by it are multiplied by."""
+    if per_range is not None:
+        return name, per_range, float(dataset["parameter_range"].sel(parameter=name))
+    effect = summary["local_per_std"][output][name]
+    return name, float("nan") if effect is None else effect, float(dataset["parameter_std"].sel(parameter=name))
+
+
+def _with_mesh(value: float, error: float | None, doubt: float | None) -> list[str]:
+    if error is None or doubt is None:
+        return [f"{value:.4g}"]
+    return [f"{value:.6g}", _signed(error, doubt), f"{_value(value + error, doubt)} ± {_error(doubt)}"]
+
+
+def _unit(dataset: xr.Dataset, output: str) -> str:
+    return str(dataset.unit.sel(output=output).item())
+
+
+def _error(error: float) -> str:
+    return f"{error:.{DIGITS[0]}g}"
+
+
+def _signed(value: float, doubt: float) -> str:
+    return f"{'+' if value >= 0 else ''}{_value(value, doubt)}"
+
+
+def _value(value: float, error: float) -> str:
+    """Write a value with as many digits as its error leaves."""
+    if not (math.isfinite(value) and value and error > 0):
+        return NONE if math.isnan(value) else f"{value:.6g}"
+    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
+    return f"{value:#.{min(max(digits, DIGITS[0]), DIGITS[1])}g}".rstrip(".")
+
+
+def _table(rows: Sequence[Row]) -> Iterator[str]:
+    """Columns side by side, the first to the left, numbers to the right; a row of one cell is as wide as it is."""
+    count = max(map(len, rows))
+    whole = [row for row in rows if len(row) > 1]
+    widths = [max(len(row[i]) for row in whole if len(row) > i) for i in range(count)]
+    for row in rows:
+        cells = [
+            row[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=False)),
+        ]
+        yield ("  ".join(cells) if len(row) > 1 else row[0]).rstrip()
