@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ ROUGH = 0.5  # of the error of the mesh: its doubt, above which its sign is all 
 EXACT = 1e-9  # of a value: errors that are no more than that are rounding
 LOOSE = 1e-8  # tolerance of the solver from which its error may be as large as one of a mesh
 VISIBLE = 1e-3  # of a mean: doubts below do no harm
+LISTED = 8  # outputs that a sentence names
 Names = NDArray[Any]  # of the outputs (m,)
 
 
@@ -63,9 +64,12 @@ def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[
     yield from _of_solver(names, np.where(counts, error, np.nan), size, told)
     decides = (error > DECIDES * sampling) & (error > EXACT * size)
     if decides.any():
-        listed = "; ".join(
-            f"{name} {_number(e, units.get(name, '1'))} against {_number(s, units.get(name, '1'))}"
-            for name, e, s in zip(names[decides], error[decides], sampling[decides], strict=True)
+        listed = _listed(
+            [
+                f"{name} {_number(e, units.get(name, '1'))} against {_number(s, units.get(name, '1'))}"
+                for name, e, s in zip(names[decides], error[decides], sampling[decides], strict=True)
+            ],
+            "; ",
         )
         yield Finding(
             "note", f"The mesh, not the samples, decides how exact the means are: {listed}. A finer mesh helps."
@@ -97,6 +101,12 @@ def _of_solver(names: Names, error: FloatArray, size: FloatArray, told: Told) ->
             "Take a smaller model.solver.tolerance."
         )
         yield Finding("warning", text)
+
+
+def _listed(words: Sequence[str], between: str) -> str:
+    """Join words, the first of many."""
+    rest = [f"and {len(words) - LISTED} more"] if len(words) > LISTED + 1 else []
+    return between.join([*(words[:LISTED] if rest else words), *rest])
 
 
 def _number(value: float, unit: str) -> str:
@@ -136,8 +146,11 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
 def _large(names: Names, word: str, error: FloatArray, size: FloatArray) -> Iterator[Finding]:
     large = error > LARGE * size
     if large.any():
-        listed = ", ".join(
-            f"{name} {e / s:.0%}" if e < MANY * s else f"{name} (more than {MANY:.0f} times it)"
-            for name, e, s in zip(names[large], error[large], size[large], strict=True)
+        listed = _listed(
+            [
+                f"{name} {e / s:.0%}" if e < MANY * s else f"{name} (more than {MANY:.0f} times it)"
+                for name, e, s in zip(names[large], error[large], size[large], strict=True)
+            ],
+            ", ",
         )
         yield Finding("warning", f"The mesh is coarse: by estimate it errs by this much of the {word}: {listed}.")

@@ -130,7 +130,7 @@ def _unit(dataset: xr.Dataset, output: str) -> str:
 
 
 def _error(error: float) -> str:
-    return f"{error:.{DIGITS[0]}g}"
+    return f"{error:#.{DIGITS[0]}g}".rstrip(".") if error else "0"
 
 
 def _signed(value: float, doubt: float) -> str:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 FIRST = {"std": "std_", "nominal": "nominal_"}  # of the names of an estimate's mesh and total error
 MANY = 10.0  # times a value: percentages beyond say nothing
+LISTED = 8  # outputs that the sentence names
 BY = {"sampling": "sampling", "mesh": "the mesh", "solver": "the solver"}
 ESTIMATES = {"mean": "mean", "std": "standard deviation", "nominal": "value at the mean parameters"}
 
@@ -110,6 +111,8 @@ def sentence(results: Results, name: str) -> str:
             whole = float(total[i]) if total is not None else known[largest]
             share = f"to {100 * whole:.2g}\u00a0%" if whole < MANY else f"to no better than {MANY:.0f} times its size"
             words.append(f"{output} is known {share}, most of it by {BY[largest]}")
+    if len(words) > LISTED + 1:
+        words = [*words[:LISTED], f"the other {len(words) - LISTED} are in the table"]
     said = [f"Of the {ESTIMATES[name]}, {'; '.join(words)}."] if words else []
     if zero:
         said.append(f"Zero but for rounding: {', '.join(zero)}.")
