@@ -1,11 +1,14 @@
 """Studies of a body in several steps."""
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
 import xarray as xr
+from mpi4py import MPI
 
+from forward.path import Path
 from tests.launch import TISSUQ, assert_same_bits, run
 
 STUDY = """
@@ -53,6 +56,42 @@ def test_curves_are_the_same_on_any_number_of_ranks(tmp_path):
     page = (tmp_path / "2" / "report.html").read_text()
     assert "Over the path" in page
     assert "displacements.grip.x = 0.1, 0.2, -0.3 m in 3 steps" in page
+
+
+@pytest.mark.fem
+def test_a_measured_curve_is_inverted(tmp_path):
+    study = tmp_path / "curve.toml"
+    measured = STUDY.partition("[parameters]")[0] + INVERSION
+    study.write_text(measured)
+    model = Path.model_validate(tomllib.loads(measured)["model"]).build(MPI.COMM_SELF, ("material.mu",))
+    exact = model.solve(np.array([2.13e4])).outputs[::2]
+    errors = 0.02 * np.abs(exact) * np.array([0.5, -0.7, 0.3])
+    rows = [f"{x},{1e3 * y:.6g}" for x, y in zip((100, 200, -300), exact + errors, strict=True)]
+    (tmp_path / "curve.csv").write_text("x [mm],force [mN]\n" + "\n".join(rows) + "\n")
+    done = run(None, TISSUQ, "run", study, "--out", tmp_path / "out")
+    assert done.returncode == 3, done.stderr  # two cells: the error of the mesh exceeds the noise, and is only reported
+    found = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
+    # The forces are linear in mu at a fixed Poisson's ratio, nearly so at a fixed lmbda: weighted means.
+    slopes = model.solve(np.array([2.13e4])).tangent(np.array([1.0]))[::2] / (0.02 * np.abs(exact + errors))
+    expected = 2.13e4 + slopes @ (errors / (0.02 * np.abs(exact + errors))) / (slopes @ slopes)
+    assert float(found["mean"][0]) == pytest.approx(expected, abs=0.1 * float(found["std"][0]))
+    assert float(found["std"][0]) == pytest.approx((slopes @ slopes) ** -0.5, rel=0.1)
+    assert "force, measured and predicted." in (tmp_path / "out" / "report.html").read_text()
+
+
+INVERSION = """
+[parameters]
+"material.mu" = { kind = "uniform", lower = 1e4, upper = 4e4 }
+
+[data]
+files = ["curve.csv"]
+noise = { relative = 0.02 }
+
+[method]
+kind = "invert"
+samples = 64
+mesh_error = "report"
+"""
 
 
 @pytest.mark.fem

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+    from inverse.data.curves import Steps
+
 NAMED = 8  # parameters that have a colour of their own
 
 
@@ -37,7 +39,7 @@ def curve(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | No
     if "mean_corrected" in there:
         corrected = there["mean_corrected"].to_numpy()
         ax.plot(x, corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added")
-    ax.set_xlabel(_labelled(along, unit))
+    _along(ax, along, unit)
     ax.set_ylabel(_labelled(output, str(there["unit"].to_numpy()[0])))
     ax.legend(frameon=False, fontsize="small")
     return ax
@@ -57,7 +59,7 @@ def shares(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | N
     for i in order[NAMED:]:
         ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
     ax.axhline(0, color=DARK, linewidth=0.8)
-    ax.set_xlabel(_labelled(along, unit))
+    _along(ax, along, unit)
     ax.set_ylabel(f"total Sobol' index of {text_of(output)}")
     ax.legend(frameon=False, fontsize="small")
     return ax
@@ -74,9 +76,33 @@ def slopes(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | N
         name = text_of(str(dataset["parameter"].to_numpy()[i]))
         ax.plot(x, values[i], color=f"C{rank}", marker="o", ms=4, label=name)
     ax.axhline(0, color=DARK, linewidth=0.8)
-    ax.set_xlabel(_labelled(along, unit))
+    _along(ax, along, unit)
     ax.set_ylabel(f"change of {_labelled(output, str(there['unit'].to_numpy()[0]))}")
     ax.legend(title="by one standard deviation of", frameon=False, fontsize="small")
+    return ax
+
+
+def measured(one: xr.Dataset, output: str, steps: Steps, ax: Axes | None = None) -> Axes:
+    """Draw a measured curve of a data set with the prediction of its most probable parameters."""
+    ax = ax or axes()
+    along, (unit, values) = next(iter(steps.numbers.items()))
+    names = {f"{output}.{k}": value for k, value in enumerate(values, 1)}
+    known = np.isfinite(one["measured"].to_numpy())
+    parts = [
+        str(one.case.values[int(part)]) if ok else "" for part, ok in zip(one["datum_case"].values, known, strict=True)
+    ]
+    here = one.isel(datum=[k for k, part in enumerate(parts) if part in names])
+    x = np.array([names[part] for part in parts if part in names])
+    order = np.argsort(x, kind="stable")
+    mean, reach = (here[name].to_numpy()[order] for name in ("predicted", "predicted_std"))
+    ax.fill_between(x[order], mean - 1.96 * reach, mean + 1.96 * reach, color=CONTROLLED, alpha=0.22, linewidth=0)
+    ax.plot(x[order], mean, color=CONTROLLED, label="predicted, 95 % band of the parameters")
+    error = 1.96 * here["sigma"].to_numpy()
+    label = "measured, 95 % of its errors"
+    ax.errorbar(x, here["measured"].to_numpy(), error, color=DARK, fmt="o", ms=4, capsize=3, label=label)
+    _along(ax, along, unit)
+    ax.set_ylabel(_labelled(output, steps.units[output]))
+    ax.legend(frameon=False, fontsize="small")
     return ax
 
 
@@ -84,6 +110,12 @@ def _steps(dataset: xr.Dataset, output: str) -> xr.Dataset:
     """Return the results of an output at every step, in their order."""
     here = dataset.isel(output=np.flatnonzero(dataset["output_of"].to_numpy() == output))
     return here.sortby("step")
+
+
+def _along(ax: Axes, path: str, unit: str) -> None:
+    """Label the axis of the number that has steps."""
+    ax.locator_params(axis="x", nbins=5)
+    ax.set_xlabel(_labelled(path, unit))
 
 
 def _labelled(name: str, unit: str) -> str:
