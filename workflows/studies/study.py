@@ -180,7 +180,7 @@ STUDIES = Kinds(
         SAMPLING: "workflows.studies.sampling:Study",
         "select": "workflows.studies.selection:Comparison",
         "invert": "workflows.studies.inversion:InversionStudy",
-        "synthesize": "workflows.studies.synthesis:Synthesis",
+        "synthesize": "workflows.studies.synthesis:SynthesisStudy",
     },
     objection=_objection,
 )

@@ -7,13 +7,14 @@ import json
 from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.bodies.inclusions import log_factor
+from forward.registry import named
 from forward.scalars import Mistake
 from forward.specimen import Specimen
 from inverse.methods.synthesize import Synthesize
@@ -38,13 +39,11 @@ if TYPE_CHECKING:
     from uq.evaluation.evaluate import Evaluate
 
 
-class Synthesis(StudyKind):
-    """What synthetic data to make.
+class SynthesisStudy(StudyKind):
+    """Synthetic data of a known model.
 
     Parameters
     ----------
-    model
-        The specimen to be measured, with its observations.
     parameters
         Distributions of numbers that are drawn for each data set; coefficients of random fields always are.
     correlations
@@ -60,23 +59,32 @@ class Synthesis(StudyKind):
     stopped: ClassVar[str] = "all data made"
     explains: ClassVar[bool] = False
 
-    model: Specimen
     parameters: dict[str, Distribution] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     method: Synthesize
     parallel: Parallel = Parallel()
     report: Report | None = None
 
-    @cached_property
-    def specimen(self) -> Specimen:
-        """The specimen, in the formulation that suits all values of its parameters."""
-        specimen: Specimen = self.model.over(ranges(self.parameters))
-        return specimen
+    if TYPE_CHECKING:  # a field of every kind
 
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Findings about the specimen before anything is solved."""
-        return (*self.model.findings, *self.model.locking(ranges(self.parameters)))
+        @property
+        def model(self) -> Any:
+            """What is measured."""
+
+    @classmethod
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """Displacements of a specimen, and outputs."""
+        yield Synthesis
+        yield named("workflows.studies.output_synthesis:OutputSynthesis")
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> SynthesisStudy:
+        """Check the blocks of a study that measures displacements of a specimen, or outputs of any model."""
+        model = blocks.get("model")
+        if isinstance(model, Mapping) and model.get("kind", "specimen") != "specimen":
+            other: type[SynthesisStudy] = named("workflows.studies.output_synthesis:OutputSynthesis")
+            return other.model_validate(blocks)
+        return Synthesis.model_validate(blocks)
 
     @cached_property
     def inputs(self) -> Inputs:
@@ -88,6 +96,58 @@ class Synthesis(StudyKind):
     def planned(self) -> int:
         """Number of solves."""
         return len(self.method.fraction) + 1
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of what is drawn."""
+        return self.inputs.names
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refused(type(self).__name__, list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        yield from self.model.mistakes_of_mesh()
+        for i, field in enumerate(getattr(self.model, "fields", ())):
+            if field.basis == "nodes":
+                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
+                yield ("model", "fields", i, "basis"), message, field.basis
+        materials = self.model.materials(self.parameters)
+        yield from mistakes_of_parameters(
+            self.model.scalars, self.parameters, () if materials is None else materials.names
+        )
+        try:
+            inputs = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            if materials is not None:
+                yield from mistakes_of_materials(inputs.within(materials), materials)
+
+
+class Synthesis(SynthesisStudy):
+    """What synthetic displacements to make.
+
+    Parameters
+    ----------
+    model
+        The specimen to be measured, with its observations.
+    parameters, correlations, method, parallel, report
+        As of `SynthesisStudy`.
+    """
+
+    model: Specimen
+
+    @cached_property
+    def specimen(self) -> Specimen:
+        """The specimen, in the formulation that suits all values of its parameters."""
+        specimen: Specimen = self.model.over(ranges(self.parameters))
+        return specimen
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about the specimen before anything is solved."""
+        return (*self.model.findings, *self.model.locking(ranges(self.parameters)))
 
     def stiffness(self, places: FloatArray, points: FloatArray) -> FloatArray:
         """Return ln of the factor (n, k) of the inclusions on the stiffness at places (k, 3) and parameters (n, d)."""
@@ -106,30 +166,20 @@ class Synthesis(StudyKind):
         """Make the specimen; collective."""
         return job(self, ensemble, name)
 
-    def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of what is drawn."""
-        return self.inputs.names
-
-    @model_validator(mode="after")
-    def _check(self) -> Synthesis:
-        refused("Synthesis", list(self._mistakes()))
-        return self
-
     def _mistakes(self) -> Iterator[Mistake]:
         if not self.model.observed:
             yield ("model", "observed"), "nothing is observed, expected boundaries or points", ()
-        for i, field in enumerate(self.model.fields):
-            if field.basis == "nodes":
-                message = "values at the vertices are not independent, expected 'modes' or 'noise'"
-                yield ("model", "fields", i, "basis"), message, field.basis
-        materials = self.model.materials(self.parameters)
-        yield from mistakes_of_parameters(self.model.scalars, self.parameters, materials.names)
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            yield from mistakes_of_materials(inputs.within(materials), materials)
+        yield from super()._mistakes()
+
+
+def head(study: SynthesisStudy) -> str:
+    """Return the first line of a file: of what the data are."""
+    noise = study.method.noise.model_dump(exclude_none=True)
+    errors = f"errors {', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}"
+    body = getattr(study.model, "body", None)
+    if body is None:
+        return f"# Synthetic: {study.model.description}, {errors}.\n"
+    return f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), {errors}.\n"
 
 
 def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
@@ -173,12 +223,7 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
         truth = scalars | dict(zip(map(str, found.parameter.values), one["truth"].values.tolist(), strict=True))
         label = name if count == 1 else f"{name}-{k + 1}"
         file = io.StringIO()
-        noise = study.method.noise.model_dump(exclude_none=True)
-        body = study.model.body
-        file.write(
-            f"# Synthetic: {body.cells_in_words} cells ({body.cell}, degree {body.degree}), errors "
-            f"{', '.join(f'{key} {value:g}' for key, value in noise.items())}, seed {study.method.seed}.\n"
-        )
+        file.write(head(study))
         file.writelines(f"# truth.{path} = {truth[path]!r}\n" for path in varies)
         if study.model.inclusions and not study.model.fields:
             inclusions = [_with_values(inclusion, truth) for inclusion in study.model.inclusions]

@@ -9,6 +9,8 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.path import Path
+from inverse.data.curves import steps_of
+from inverse.data.outputs import read_outputs
 from tests.launch import TISSUQ, assert_same_bits, run
 
 STUDY = """
@@ -77,6 +79,41 @@ def test_a_measured_curve_is_inverted(tmp_path):
     assert float(found["mean"][0]) == pytest.approx(expected, abs=0.1 * float(found["std"][0]))
     assert float(found["std"][0]) == pytest.approx((slopes @ slopes) ** -0.5, rel=0.1)
     assert "force, measured and predicted." in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.fem
+def test_curves_are_made_and_read_again(tmp_path):
+    study = tmp_path / "made.toml"
+    made = STUDY.partition("[method]")[0]
+    study.write_text(made + '[method]\nkind = "synthesize"\nnoise = { relative = 0.01 }\nfraction = [1, 0.7]\n')
+    assert run(None, TISSUQ, "run", study, "--out", tmp_path / "out").returncode == 0
+    spec = Path.model_validate(tomllib.loads(made)["model"])
+    model = spec.build(MPI.COMM_SELF, ("material.mu",))
+    outputs = tuple(output.name for output in spec.returned)
+    one, other = (read_outputs(tmp_path / "out" / "data" / f"made-{k}.csv", outputs, steps_of(spec)) for k in (1, 2))
+    assert set(one.names) == set(outputs)
+    assert len(other.names) == 4  # of two steps
+    for found in (one, other):
+        exact = model.solve(np.array([found.truth["material.mu"]])).outputs[
+            [outputs.index(name) for name in found.names]
+        ]
+        assert (np.abs(found.values - exact) < 4 * found.sigma).all()
+        assert (found.values != exact).all()
+    whole = model.solve(np.array([one.truth["material.mu"]])).outputs
+    forces = one.sigma[[name.startswith("force") for name in one.names]]
+    np.testing.assert_allclose(forces, 0.01 * np.sqrt(np.mean(whole[::2] ** 2)), rtol=1e-3)
+
+
+def test_what_is_measured_of_a_function_is_an_output_in_each_row(tmp_path):
+    (tmp_path / "made.toml").write_text(
+        '[model]\nkind = "python"\nfunction = "line.both"\nparameters = { a = 2.0 }\noutputs = ["one", "two"]\n'
+        '[method]\nkind = "synthesize"\nnoise = { absolute = 1e-3 }\n'
+    )
+    (tmp_path / "line.py").write_text("def both(x):\n    return [x[0], 2 * x[0]]\n")
+    done = run(None, TISSUQ, "run", tmp_path / "made.toml", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    found = read_outputs(tmp_path / "out" / "data" / "made.csv", ("one", "two"))
+    np.testing.assert_allclose(found.values, [2, 4], atol=5e-3)
 
 
 INVERSION = """
