@@ -17,13 +17,13 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward import adapt as adaptive
 from forward.adapt import Adapt
-from forward.bodies.geometry import AXES, Body, Vector, holds, moved_points
+from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_points
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.cost import Estimate, Times, estimate, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
-from forward.materials.admissible import Materials
+from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
 from forward.materials.material import MATERIALS, constants, splits
 from forward.model import Finding, FloatArray, ModelError
@@ -191,8 +191,8 @@ class Hyperelastic(ModelSpec):
                     value = getattr(inclusion, name)
                     found[f"inclusions.{inclusion.label}.{name}"] = Scalar(value, type(inclusion), name, within)
         for load in self.loads:
-            for name, value in load.values.items():
-                found[f"loads.{load.label}.{name}"] = Scalar(value, type(load), name)
+            for name, scalar in load.scalars.items():
+                found[f"loads.{load.label}.{name}"] = scalar
         for displacement in self.displacements:
             for axis, value in displacement.components.items():
                 found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
@@ -216,6 +216,17 @@ class Hyperelastic(ModelSpec):
     def symmetric(self) -> bool:
         """Whether the stiffness is symmetric: no load follows the body."""
         return all(load.symmetric for load in self.loads)
+
+    @property
+    def contact_modulus(self) -> float:
+        """E/(1 − ν²) (Pa) of the stiffest material of the body, with the constants as they are stated."""
+        largest = 0.0
+        for place, values in self.materials().constants.items():
+            shear, bulk = moduli(self.energy, values)
+            contrast = self.regions.get(place.removeprefix("regions."), {}).get(CONTRAST, 1.0)
+            share = 1.0 if np.isinf(bulk) else (3 * bulk + shear) / (3 * bulk + 4 * shear)
+            largest = max(largest, float(contrast * 4 * shear * share))
+        return largest
 
     @property
     def mixed(self) -> bool:
@@ -265,6 +276,7 @@ class Hyperelastic(ModelSpec):
             *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
             *moved_points(self.body, points),
             *self._of_followers(),
+            *(finding for load in self.loads for finding in load.findings(self.body)),
         )
 
     def _of_followers(self) -> Iterator[Finding]:
@@ -448,15 +460,20 @@ class Hyperelastic(ModelSpec):
         yield from self._mistakes_of_formulation()
         yield from self._contradictions()
         yield from adaptive.mistakes(self)
-        moved = {axis for item in self.displacements for axis in item.components}
-        if not self.clamp and moved != {"x", "y", "z"}:
-            free = ", ".join(sorted({"x", "y", "z"} - moved))
-            yield (
-                ("clamp",),
-                f"nothing holds the body along {free}, expected a clamp or prescribed displacements",
-                (),
-            )
-        elif not unknown and not self._held_against_turning():
+        yield from self._mistakes_of_support(any_unknown=bool(unknown))
+
+    def _mistakes_of_support(self, *, any_unknown: bool) -> Iterator[Mistake]:
+        """Loads that cannot act on the body, and a body that can move freely."""
+        moved = any(value for item in self.displacements for value in item.components.values())
+        alone = not moved and len(self.loads) == 1
+        for i, load in enumerate(self.loads):
+            if getattr(load, "on", "") in self.body.boundaries:
+                for field, said, given in load.mistakes(self.body, alone=alone):
+                    yield ("loads", i, field), said, given
+        if free := self._free:
+            message = f"nothing holds the body along {', '.join(free)}, expected a clamp or prescribed displacements"
+            yield ("clamp",), message, ()
+        elif not any_unknown and not self._held_against_turning():
             message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
             yield ("displacements",), message, ()
 
@@ -466,8 +483,12 @@ class Hyperelastic(ModelSpec):
 
     def _mistakes_of_outputs(self) -> Iterator[Mistake]:
         held = set(self.clamp) | {item.on for item in self.displacements}
+        tools = [load.label for load in self.loads if load.contact]
         for i, output in enumerate(self.outputs):
-            on, at = getattr(output, "on", None), getattr(output, "at", None)
+            on, at, tool = (getattr(output, name, None) for name in ("on", "at", "tool"))
+            if tool is not None and tool not in tools:
+                hint = nearest(tool, tools) if tools else "no load is an indenter"
+                yield ("outputs", i, "tool"), f"unknown tool; {hint}", tool
             if output.of_held and on in self.body.boundaries and on not in held:
                 yield ("outputs", i, "on"), "nothing holds this boundary, expected one that is clamped or moved", on
             if at is not None and not holds(self.body, at):
@@ -523,15 +544,36 @@ class Hyperelastic(ModelSpec):
                 message = f"{', '.join(twice)} prescribed more than once on this boundary"
                 yield ("displacements", i, "on"), message, item.on
 
+    @property
+    def _touched(self) -> list[tuple[Vector, Vector]]:
+        """Points (m) of the body and the directions in which tools hold them against what presses them there."""
+        on_body = [load for load in self.loads if getattr(load, "on", "") in self.body.boundaries]
+        found = [one for load in on_body for one in load.holds(self.body)]
+        pressed = any(not load.contact for load in self.loads)
+        return [one for one in found if pressed or any(np.dot(one[1], other) < 0 for _, other in found)]
+
+    @property
+    def _prescribed(self) -> list[tuple[str, Axis]]:
+        """Boundaries with the axes along which they are held or moved."""
+        moved = [(item.on, axis) for item in self.displacements for axis in item.components]
+        return [(on, axis) for on in self.clamp for axis in AXES] + moved
+
+    @property
+    def _free(self) -> list[str]:
+        """Axes along which nothing holds the body."""
+        units = dict(zip(AXES, np.eye(3), strict=True))
+        held = [np.zeros(3), *(units[axis] for _, axis in self._prescribed), *(along for _, along in self._touched)]
+        rank = np.linalg.matrix_rank(held)
+        return [axis for axis in AXES if np.linalg.matrix_rank([*held, units[axis]]) > rank]
+
     def _held_against_turning(self) -> bool:
-        """Whether each of the 6 small rigid motions t + r × x moves something that is clamped or prescribed."""
-        held = [(on, axis) for on in self.clamp for axis in AXES]
-        held += [(item.on, axis) for item in self.displacements for axis in item.components]
+        """Whether each of the 6 small rigid motions t + r × x moves something that is held."""
         extent = np.ptp(self.body.vertices, axis=0).max()
-        rows = [
-            np.concatenate([unit, np.cross(corner, unit) / extent])  # the component of t + r × x: t·e + r·(x × e)
-            for on, axis in held
-            for unit in [np.eye(3)[AXES.index(axis)]]
-            for corner in np.subtract(self.body.corners_of(on), np.mean(self.body.vertices, axis=0))
+        middle = np.mean(self.body.vertices, axis=0)
+        units = np.eye(3)
+        held = [(p, units[AXES.index(axis)]) for on, axis in self._prescribed for p in self.body.corners_of(on)]
+        rows = [  # the part of t + r × x along a direction e: t·e + r·(x × e)
+            np.concatenate([direction, np.cross(np.subtract(place, middle), direction) / extent])
+            for place, direction in [*held, *self._touched]
         ]
         return int(np.linalg.matrix_rank(rows)) == 6

@@ -36,7 +36,7 @@ def in_words(model: Hyperelastic, said: Callable[[str], str], where: str) -> Ite
         for axis in item.components
     ]
     yield "held", held
-    loads = [load.words({name: said(f"loads.{load.label}.{name}") for name in load.values}) for load in model.loads]
+    loads = [load.words({name: said(f"loads.{load.label}.{name}") for name in load.scalars}) for load in model.loads]
     yield "loads", loads or ["none"]
     outputs = []
     for output in model.outputs:

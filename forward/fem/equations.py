@@ -11,7 +11,7 @@ stated volumetric part makes it, and then p g'(J) is the pressure. K is symmetri
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -72,13 +72,24 @@ class Discretisation(Linearisation):
             field.set(parameters)
 
     def _forces_at_rest(self) -> FloatArray:
-        """Forces (U_local,) on the undeformed body due to the complete loads."""
+        """Forces (U_local,) on the undeformed body due to the complete loads, without tools."""
         kept = self._load.value.copy()
-        self._load.value = 1.0
+        self._load.value, self._touched.value = 1.0, 0.0
         forces = self._imbalance(np.zeros(self.size))
         forces[self.fixed] = 0
-        self._load.value = kept
+        self._load.value, self._touched.value = kept, 1.0
         return forces
+
+    @property
+    def contact(self) -> bool:
+        """Whether tools touch the body."""
+        return bool(self._tools)
+
+    @cached_property
+    def _contact_forces(self) -> Callable[[], FloatArray] | None:
+        """Forces (U_local,) of all tools, at the state that is set; None without tools."""
+        works = [work for work, _, _ in self._tools]
+        return self.vector(sum(works[1:], works[0])) if works else None
 
     @cached_property
     def _unit_loads(self) -> dict[str, FloatArray]:
@@ -86,7 +97,8 @@ class Discretisation(Linearisation):
 
         All energies are free of stress there.
         """
-        paths = [path for path in self._constants if path.startswith("loads.")]
+        tools = tuple(f"loads.{load.label}." for load in self.spec.loads if load.contact)
+        paths = [path for path in self._constants if path.startswith("loads.") and not path.startswith(tools)]
         forces: dict[str, FloatArray] = {}
         work, self.work = self.work, Work()  # the first solution is charged no more than the others
         for path in ("", *paths):
@@ -141,6 +153,8 @@ class Discretisation(Linearisation):
         scale = float(self._load.value) * self._external
         if self._moves:
             scale = max(scale, fixed)
+        if self._contact_forces is not None:
+            scale = max(scale, self.norm(self._contact_forces()))
         return Residual(r, free, scale, apart, self._force_of(lacking, u))
 
     @contextmanager

@@ -79,6 +79,10 @@ class Forms:
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
+        # Virtual works of those loads that act in contact, and what they are written with.
+        self._tools: list[tuple[Any, Term, Place]] = []
+        self._curved = spaces.constant(self.mesh, 1.0)  # 0 takes the curvature of tools out of the stiffness
+        self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
         self._loads = self._virtual_works()
         self.symmetric = spec.symmetric
 
@@ -167,9 +171,11 @@ class Forms:
         """Volume (m³) of the undeformed mesh; smaller than that of the body if linear tetrahedra cut its faces."""
         return self.scalar(spaces.constant(self.mesh, 1.0) * self.dx)()
 
-    def surface(self, boundary: str) -> Any:
-        """Measure of a named boundary."""
-        return self._ds(self._tags[boundary])
+    def surface(self, boundary: str, degree: int | None = None) -> Any:
+        """Measure of a named boundary, with at least a degree of quadrature."""
+        if degree is None or degree <= self.spec.body.quadrature:
+            return self._ds(self._tags[boundary])
+        return self._ds(self._tags[boundary], metadata={"quadrature_degree": degree})
 
     def vector(self, form: Any) -> assembly.VectorAssembler:
         """Compile a linear form."""
@@ -194,11 +200,17 @@ class Forms:
     def _virtual_works(self) -> list[Any]:
         """Forms of the virtual works of the loads, with the sign of the imbalance.
 
-        In load steps the numbers of a load are scaled if it is linear in them, otherwise the whole load.
+        In load steps the numbers of a load are scaled if it is linear in them, otherwise the whole load; tools move.
         """
         works = []
         for load in self.spec.loads:
             numbers = self._numbers(f"loads.{load.label}")
+            if load.contact:
+                numbers |= {"depth": self._load * numbers["depth"]}
+                work = self._out_of_balance(load, numbers)
+                self._tools.append((work, load, self.place(numbers)))
+                works.append(self._touched * work)
+                continue
             work = self._out_of_balance(load, {name: self._load * number for name, number in numbers.items()})
             if not _linear(work, numbers.values()):
                 self._proportional = False
@@ -206,8 +218,9 @@ class Forms:
             works.append(work)
         return works
 
-    def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
-        at = Place(
+    def place(self, numbers: dict[str, Any]) -> Place:
+        """Return what a load with these numbers is written with."""
+        return Place(
             u=self.u,
             v=self.test,
             F=self.F,
@@ -219,7 +232,18 @@ class Forms:
             numbers=numbers,
             density=self._factor_of("density"),
             constant=lambda value: spaces.constant(self.mesh, value),
+            ops=OPS,
+            modulus=lambda: self.spec.contact_modulus,
+            bounds=self.spec.body.bounds,
         )
+
+    def tool(self, label: str) -> tuple[Any, Place]:
+        """Return a tool among the loads by its label, and what it is written with."""
+        (load,) = (load for load in self.spec.loads if load.label == label)
+        return load, self.place(self._numbers(f"loads.{label}"))
+
+    def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
+        at = self.place(numbers)
         potential = load.potential(at)
         if potential is None:
             return load.virtual_work(at)
@@ -245,6 +269,16 @@ class Forms:
         ]
         terms += [field.direction * ufl.diff(integrand, field.log) for field in self.fields if field.inside(integrand)]
         return sum(terms[1:], terms[0]) if terms else None
+
+    def stiffness_form(self, imbalance: Any) -> Any:
+        """Derivative of the imbalance by the state, in which the curvature of tools can be left out."""
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        exact = self.derivative(imbalance, trial)
+        along, _ = self.unknowns.split(trial)
+        for work, load, at in self._tools:
+            left_out = load.straight_stiffness(at, along) - self.derivative(work, trial)
+            exact += (1 - self._curved) * left_out
+        return exact
 
     @cached_property
     def _parameter_force(self) -> assembly.VectorAssembler | None:

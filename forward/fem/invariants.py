@@ -34,6 +34,7 @@ OPS = SimpleNamespace(
     inner=ufl.inner,
     outer=ufl.outer,
     positive=lambda x: ufl.max_value(x, 0.0),
+    choose=lambda z, positive, negative: ufl.conditional(ufl.gt(z, 0.0), positive, negative),
     near=lambda z, limit, inside, outside: ufl.conditional(ufl.lt(abs(z), limit), inside, outside),
 )
 OPS.log1p, OPS.expm1 = kinematics.log1p_of(OPS), kinematics.expm1_of(OPS)

@@ -33,8 +33,7 @@ class Linearisation(Forms):
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
         self._prescribe()
-        trial = ufl.TrialFunction(self.unknowns.whole)
-        self._stiffness = self._bilinear(self.derivative(imbalance, trial))
+        self._stiffness = self._bilinear(self.stiffness_form(imbalance))
         if beside is None:
             assert self._solver  # so that memory is checked before anything else is allocated
 
@@ -158,13 +157,17 @@ class Linearisation(Forms):
     def _symmetric_part(self) -> LinearSolver:
         return self.new_symmetric_solver()
 
-    def factorise(self, u: FloatArray) -> None:
-        """Assemble and factorise the stiffness at u (U_local,)."""
+    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
+        """Assemble and factorise the stiffness at u (U_local,), with the curvature of tools or without."""
         self.set_state(u)
         self.work.assemblies += 1
         self.work.factorisations += 1
         self.latest.factorised = None  # a factorisation that fails leaves no factor
-        self._solver.factorise()
+        self._curved.value = float(curved)
+        try:
+            self._solver.factorise()
+        finally:
+            self._curved.value = 1.0
         self.latest.factorised_at = u
 
     def solve(self, right: FloatArray) -> FloatArray:

@@ -101,8 +101,11 @@ class Equations(Protocol):
     def volume(self) -> float:
         """Volume (m³) of the undeformed mesh."""
 
-    def surface(self, boundary: str) -> Any:
-        """Measure of a named boundary."""
+    def surface(self, boundary: str, degree: int | None = None) -> Any:
+        """Measure of a named boundary, with at least a degree of quadrature."""
+
+    def tool(self, label: str) -> tuple[Any, Any]:
+        """Return a tool among the loads by its label, and the expressions with which it is written."""
 
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of an energy density."""
@@ -196,6 +199,7 @@ OUTPUTS = Kinds(
         "strain-energy": "forward.observables.strain_energy:StrainEnergy",
         "volume-change": "forward.observables.volume_change:VolumeChange",
         "max-von-mises": "forward.observables.max_von_mises:MaxVonMises",
+        "force": "forward.observables.force:Force",
     },
     Observable,
 )

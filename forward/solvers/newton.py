@@ -15,6 +15,9 @@ GROWTH = 4.0  # a Newton step that is longer than all before by this factor mean
 NEAR = 0.2  # below this fraction of the last Newton step, a factor is used for more than one correction
 POLISH = 8  # corrections with the factor of a Newton step
 SQUEEZED = 0.3  # J of a cell that is reported if the load cannot be raised
+SEARCHES, ENOUGH = 8, 0.6  # residuals along a line, and the part of the slope that may be left
+TOUCHING = 2  # times the iterations that are allowed, where the area in contact is yet to be found
+CURVED = 0.1  # relative residual below which the stiffness has the curvature of tools
 LOCATED = 1 / 64  # of the load: how accurately the end of a stable branch is located
 REFUSALS = 8  # load steps that may fail once an unstable equilibrium has been found
 
@@ -85,33 +88,70 @@ def _iterate(
     if not np.isfinite(residual.size):
         message = "the starting state has no finite residual"
         raise Diverged(message)
-    for iteration in range(settings.iterations + 1):
+    limit = settings.iterations * (TOUCHING if system.contact else 1)
+    for iteration in range(limit + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if converged(system, settings.tolerance, u, residual, sizes):
             return Found(u, residual.relative, stability=accepted(system, settings, u, residual)), iteration
-        if iteration == settings.iterations:
+        if iteration == limit:
             break
-        factorise(system, u)
+        factorise(system, u, curved=not system.contact or residual.relative < CURVED)
         step = system.solve(-residual.vector)
         before, length = length, system.norm(step)
-        if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest):
+        if not np.isfinite(length) or (iteration > 0 and length > GROWTH * longest and not system.contact):
             raise Diverged("the Newton steps grow" + instability(system))
         longest = max(longest, length)
-        u, residual = admissible_step(system, settings, u, step)
+        if system.contact and residual.gap == 0:
+            u, residual = searched_step(system, settings, u, residual, step)
+        else:
+            u, residual = admissible_step(system, settings, u, step)
         if settings.kind != "newton" and length < NEAR * before < np.inf:
             u, residual, reached = mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
             if reached:
                 return Found(u, residual.relative, stability=accepted(system, settings, u, residual)), iteration + 1
-    message = f"no convergence in {settings.iterations} iterations (relative residual {residual.relative:.3g})"
+    message = f"no convergence in {limit} iterations (relative residual {residual.relative:.3g})"
     raise Diverged(message + instability(system))
 
 
-def factorise(system: System, u: FloatArray) -> None:
+def factorise(system: System, u: FloatArray, *, curved: bool = True) -> None:
     """Factorise the stiffness at u; raise `Diverged` where it is singular."""
     try:
-        system.factorise(u)
+        system.factorise(u, curved=curved)
     except SolveError as error:
         raise Diverged(error.reason) from None
+
+
+def searched_step(
+    system: System, settings: SolverSettings, u: FloatArray, residual: Residual, step: FloatArray
+) -> tuple[FloatArray, Residual]:
+    """Take a step along which the energy falls, nearly to its minimum along that line; the full one if that is so.
+
+    The slope of the energy is that of the imbalance along the step, in the mixed form with the pressures' sign changed
+    (`System.curvature`), which is −1 times a sum of squares at the start wherever the body is stable. A root of it is
+    bracketed and found by the Illinois variant of the false position.
+    """
+    first = system.curvature(step, residual.vector)
+    at, found = admissible_step(system, settings, u, step)
+    if not first < 0:
+        return at, found
+    fraction = 1.0 if at is u else system.norm(at - u) / system.norm(step)
+    low, of_low, high, of_high = 0.0, first, fraction, system.curvature(step, found.vector)
+    last = of_high
+    for _ in range(SEARCHES):
+        if last <= ENOUGH * abs(first) and (last >= -ENOUGH * abs(first) or high == fraction == 1.0):
+            break
+        if of_high <= 0:
+            break
+        fraction = (low * of_high - high * of_low) / (of_high - of_low)
+        fraction = min(max(fraction, low + 0.05 * (high - low)), high - 0.05 * (high - low))
+        at = u + fraction * step
+        found = system.residual(at)
+        last = system.curvature(step, found.vector)
+        if last > 0:
+            high, of_high, of_low = fraction, last, of_low / 2
+        else:
+            low, of_low, of_high = fraction, last, of_high / 2
+    return at, found
 
 
 def admissible_step(

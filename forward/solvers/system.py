@@ -51,6 +51,10 @@ class System(Protocol):
 
     work: Work
 
+    @property
+    def contact(self) -> bool:
+        """Whether forces set in suddenly somewhere, so that whole Newton steps may go to and fro."""
+
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
 
@@ -63,8 +67,8 @@ class System(Protocol):
     def rounding(self, u: FloatArray, scale: float) -> float:
         """Size (N) below which a residual with this scale cannot be expected to fall at u, whatever the loads."""
 
-    def factorise(self, u: FloatArray) -> None:
-        """Assemble and factorise the stiffness at u.
+    def factorise(self, u: FloatArray, *, curved: bool = True) -> None:
+        """Assemble and factorise the stiffness at u; if not `curved`, without the curvature of surfaces in contact.
 
         Raises
         ------

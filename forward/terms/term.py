@@ -21,12 +21,14 @@ methods, so that a study can be checked without it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
+from forward.bodies.geometry import Body, Vector
+from forward.model import Finding
 from forward.registry import Kinds, OfKind
-from forward.scalars import numbers
+from forward.scalars import Scalar, numbers
 from forward.settings import Named
 from forward.words import settings
 
@@ -50,13 +52,19 @@ class Place:
     dx
         Measure of the undeformed body.
     on
-        Returns the measure of a named undeformed boundary.
+        Returns the measure of a named undeformed boundary, with a degree of quadrature if that of the body is too low.
     numbers
         The numbers of this load, by the names of its fields.
     density
         Factor of random fields on the density.
     constant
         Makes a constant (a number or a vector) for which forms need not be compiled again.
+    ops
+        Functions of expressions: sqrt, positive, ….
+    modulus
+        Returns E/(1 − ν²) (Pa) of the stiffest material of the body, with the constants as they are stated.
+    bounds
+        Smallest and largest coordinates (m) of the undeformed body along each axis.
     """
 
     u: Any
@@ -66,16 +74,20 @@ class Place:
     X: Any
     normal: Any
     dx: Any
-    on: Callable[[str], Any]
+    on: Callable[..., Any]
     numbers: Mapping[str, Any]
     density: Any
     constant: Callable[[Any], Any]
+    ops: Any
+    modulus: Callable[[], float]
+    bounds: tuple[tuple[float, float], ...]
 
 
 class Term(Named):
     """A load: either its `potential` or its `virtual_work` is defined by every kind."""
 
     of_density: ClassVar[bool] = False  # whether it depends on the density of the body, which may be a random field
+    contact: ClassVar[bool] = False  # whether it acts only where the body touches it: load steps scale its `depth`
 
     def potential(self, at: Place) -> Any | None:
         """Return its potential energy (J), as a form of UFL; None where it has none.
@@ -84,12 +96,40 @@ class Term(Named):
         """
         return None
 
+    def straight_stiffness(self, at: Place, direction: Any) -> Any:
+        """Return its stiffness along a direction, as a bilinear form without the curvature of the surface touched.
+
+        Only of loads that act in contact: far from equilibrium, pressures are so large that this curvature makes the
+        stiffness indefinite.
+        """
+        raise NotImplementedError
+
     def virtual_work(self, at: Place) -> Any:
         """Return the work (J) that a virtual displacement `at.v` does against it, as a form of UFL.
 
         That of a force f is −∫ f·v, as of a potential its derivative along v; loads that have one are not asked.
         """
         raise NotImplementedError
+
+    def mistakes(self, body: Body, *, alone: bool) -> Iterator[tuple[str, str, Any]]:
+        """Find what cannot be on a body: the field, what is wrong, what was given.
+
+        Parameters
+        ----------
+        body
+            The body, which has the boundary `on`.
+        alone
+            Whether nothing else acts on it or moves it.
+        """
+        return iter(())
+
+    def findings(self, body: Body) -> Iterator[Finding]:
+        """Find what may be wrong on a body before anything is solved."""
+        return iter(())
+
+    def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
+        """Return points (m) of the body and the directions in which it holds them, be it from one side only."""
+        return []
 
     @property
     def symmetric(self) -> bool:
@@ -107,9 +147,9 @@ class Term(Named):
         return f"{self.label}: {settings(dict(self) | dict(numbers), 'kind', 'name')}"
 
     @property
-    def values(self) -> dict[str, float]:
-        """Its numbers, by the names of its fields."""
-        return {name: getattr(self, name) for name in numbers(type(self))}
+    def scalars(self) -> dict[str, Scalar]:
+        """Its numbers that can be parameters, by their names: those of its fields."""
+        return {name: Scalar(getattr(self, name), type(self), name) for name in numbers(type(self))}
 
 
 LOADS = Kinds(
@@ -118,6 +158,7 @@ LOADS = Kinds(
         "gravity": "forward.terms.gravity:Gravity",
         "traction": "forward.terms.traction:Traction",
         "pressure": "forward.terms.pressure:Pressure",
+        "indenter": "forward.terms.indenter:Indenter",
     },
     Term,
 )

@@ -1,0 +1,37 @@
+"""Forces of tools."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from forward.bodies.geometry import AXES, unit_vector
+from forward.observables.observable import Equations, Functional, Observable
+from forward.terms import tools
+
+
+class Force(Observable):
+    """Force (N) with which a tool presses on the body: along its direction, or one component.
+
+    It is the derivative of the potential by the place of the tool, so that it balances the reactions exactly.
+    """
+
+    kind: Literal["force"] = "force"
+    unit: ClassVar[str] = "N"
+    tool: str = "indenter"
+    component: Literal["x", "y", "z", "along"] = "along"
+
+    def functional(self, equations: Equations) -> Functional:
+        """Prepare the evaluation."""
+        import ufl
+
+        from forward.observables.functionals import Integral
+
+        tool, at = equations.tool(self.tool)
+        along = unit_vector(tool.direction) if self.component == "along" else np.eye(3)[AXES.index(self.component)]
+        x = ufl.variable(at.X + at.u)
+        gap = tool.gap(at.ops, x, at.numbers, at.constant)
+        pressure = tools.pressure(at.ops, gap, *map(at.constant, tool.stiffness_at(at)))
+        density = pressure * ufl.dot(ufl.diff(gap, x), at.constant(along))
+        return Integral(equations, density, measure=tool.measure(at))

@@ -1,0 +1,322 @@
+"""Rigid tools that are pressed against a body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt, Unit
+from pydantic import model_validator
+
+from forward.bodies.geometry import Body, Direction, Vector, tolerance, unit_vector
+from forward.bodies.surface import edges, facets, points
+from forward.model import Finding, FloatArray
+from forward.scalars import Scalar
+from forward.settings import Settings
+from forward.terms import tools
+from forward.terms.term import Place, Term
+from forward.words import listed
+
+SHARP = 1 / 20  # radius of an edge relative to that of the tool, and of a tip relative to the depth
+SMOOTH = 0.2  # width over which contact sets in, relative to the penetration that is aimed at
+PEAK = 3.0  # largest pressure over the mean one under flat tools and cones
+MARGIN = 2.0  # stiffness beyond that for the aim: of materials that are stiffer than stated, and of large strains
+AT_REST = 1e-3  # depth relative to the size that stands for a depth of zero
+BORNE = 1e-6  # width over which contact sets in on a plane that does not move, relative to the extent of the body
+SLACK = 0.01  # of the depth, and of the inaccuracy of positions, that a tool may be inside the body at the start
+DEGREE = 8  # of the quadrature under a tool
+Shape = Literal["sphere", "flat", "cylinder", "cone", "plane"]
+NEEDED: dict[str, tuple[str, ...]] = {
+    "sphere": ("radius",),
+    "flat": ("radius",),
+    "cylinder": ("radius", "axis"),
+    "cone": ("angle",),
+    "plane": (),
+}
+ALLOWED: dict[str, tuple[str, ...]] = {"flat": ("edge",), "cone": ("tip",)}
+
+
+class Position(Settings):
+    """Where a tool is.
+
+    Parameters
+    ----------
+    x, y, z
+        Of its tip (m) before it is moved.
+    """
+
+    x: Annotated[float, Unit("m")]
+    y: Annotated[float, Unit("m")]
+    z: Annotated[float, Unit("m")]
+
+
+class Stiffness(NamedTuple):
+    """How a tool resists penetration.
+
+    Attributes
+    ----------
+    value
+        Pressure per penetration (Pa/m).
+    width
+        Range of gaps (m) over which contact sets in.
+    """
+
+    value: float
+    width: float
+
+
+class Indenter(Term):
+    """A rigid tool that touches a boundary and is moved by `depth` against it, without friction.
+
+    The body may slide along it and leave it; points of the boundary resist penetration by a pressure that is
+    proportional to it, so stiff that they enter the tool by no more than a thousandth of the depth
+    (docs/theory/contact.md).
+
+    Parameters
+    ----------
+    shape
+        "sphere", the end of a rod; "flat", a round punch whose edge is rounded; "cylinder", lying along `axis`; "cone"
+        with a rounded tip; "plane", which may also be the table on which a body rests.
+    on
+        The boundary that it may touch.
+    at
+        Its foremost point (m) before it is moved; x, y and z can be random.
+    direction
+        The way it points and moves.
+    depth
+        How far (m) it is moved.
+    radius
+        Of a sphere, a punch or a cylinder (m).
+    edge
+        Radius (m) of the edge of a punch; a twentieth of its radius by default.
+    axis
+        Direction of the axis of a cylinder.
+    angle
+        Between the side of a cone and its axis (degrees).
+    tip
+        Radius (m) of the tip of a cone; a twentieth of the depth by default.
+    penetration
+        Largest penetration that is aimed at, relative to the depth.
+    """
+
+    contact: ClassVar[bool] = True
+    kind: Literal["indenter"] = "indenter"
+    shape: Shape
+    on: str
+    at: Vector
+    direction: Direction
+    depth: Annotated[float, Ge(0), Unit("m")]
+    radius: Annotated[float | None, Gt(0), Unit("m")] = None
+    edge: Annotated[float | None, Gt(0), Unit("m")] = None
+    axis: Direction | None = None
+    angle: Annotated[float | None, Gt(0), Lt(90), Unit("°")] = None
+    tip: Annotated[float | None, Gt(0), Unit("m")] = None
+    penetration: Annotated[float, Gt(0), Le(0.1)] = 1e-3
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Its numbers that can be parameters, the place among them."""
+        found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
+        return found | {axis: Scalar(value, Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
+
+    @property
+    def size(self) -> float:
+        """Radius (m) of the area that it touches at its depth, roughly; infinite for a plane."""
+        depth = self.depth
+        match self.shape:
+            case "plane":
+                return math.inf
+            case "flat":
+                return float(self.radius or 0)
+            case "cone":
+                return 2 / math.pi * depth * math.tan(math.radians(self.angle or 0))
+            case _:
+                return math.sqrt((self.radius or 0) * depth)
+
+    def resistance(self, modulus: float, extent: float) -> Stiffness:
+        """Return the stiffness that keeps the penetration small.
+
+        It follows from the numbers as they are stated, so that it is the same in all solutions of a study. The largest
+        pressures relative to the depth are those of Hertz (sphere and cylinder), a few times the mean ones of a punch
+        and of Sneddon's cone, and that of a compressed column under a plane.
+
+        Parameters
+        ----------
+        modulus
+            E/(1 − ν²) (Pa) of the body.
+        extent
+            Of the body along the direction (m).
+        """
+        match self.shape:
+            case "plane":
+                slope = modulus / extent
+            case "flat":
+                slope = PEAK * 2 / math.pi * modulus / self.size
+            case "cone":
+                slope = PEAK * modulus / (math.pi * self._moved.size)
+            case _:
+                slope = 2 / math.pi * modulus / self._moved.size
+        width = BORNE * extent if self.shape == "plane" and self.depth == 0 else SMOOTH * self.penetration * self._depth
+        return Stiffness(MARGIN * slope / self.penetration, width)
+
+    @property
+    def _depth(self) -> float:
+        """The depth, or a small one in place of zero."""
+        return self.depth or AT_REST * (self.radius or self.tip or 1e-3)
+
+    @property
+    def _moved(self) -> Indenter:
+        return self if self.depth else self.model_copy(update={"depth": self._depth})
+
+    def gap(self, ops: Any, x: Any, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.asarray) -> Any:
+        """Return the signed distance (m) from the tool to points, of which `x` lists the three coordinates.
+
+        Parameters
+        ----------
+        ops
+            Functions for numbers (`tools.NUMPY`) or forms.
+        x
+            Places of the deformed body (m).
+        numbers
+            Its numbers, by the names of `scalars`.
+        constant
+            Makes a constant of forms.
+        """
+        d = constant(unit_vector(self.direction))
+        apart = [x[i] - numbers[axis] for i, axis in enumerate("xyz")]
+        t = _dot(apart, d) - numbers["depth"]
+        if self.axis is not None:
+            side = np.cross(unit_vector(self.direction), unit_vector(self.axis))
+            across = _dot(apart, constant(side / np.linalg.norm(side))) ** 2
+        else:  # |a − (a·d) d|² as |a × d|², which loses no digits
+            across = sum(part**2 for part in _cross(apart, d))
+        return tools.distance(ops, self.shape, t, across, self._sized(numbers, constant))
+
+    def _sized(self, numbers: Mapping[str, Any], constant: Callable[[Any], Any]) -> dict[str, Any]:
+        """Its size in all numbers that its shape needs."""
+        found = dict(numbers)
+        if self.shape == "flat" and self.edge is None:
+            found["edge"] = SHARP * found["radius"]
+        if self.shape == "cone":
+            found["angle"] = found["angle"] * (math.pi / 180)
+            if self.tip is None:
+                found["tip"] = constant(SHARP * self._depth)
+        return found
+
+    def gaps(self, points: FloatArray, depth: float | None = None) -> FloatArray:
+        """Return the signed distances (n,) of points (n, 3) (m), at its own depth or at another."""
+        numbers = {name: scalar.value for name, scalar in self.scalars.items()}
+        if depth is not None:
+            numbers["depth"] = depth
+        return np.asarray(self.gap(tools.NUMPY, list(points.T), numbers))
+
+    def potential(self, at: Place) -> Any:
+        """Potential ∫ φ(g(X + u)) dS of the gap g, over the undeformed boundary."""
+        gap = self.gap(at.ops, at.X + at.u, at.numbers, at.constant)
+        return tools.energy(at.ops, gap, *map(at.constant, self.stiffness_at(at))) * self.measure(at)
+
+    def straight_stiffness(self, at: Place, direction: Any) -> Any:
+        """Stiffness ∫ φ''(g) (∇g·v)(∇g·w) dS, without that of ∇∇g."""
+        import ufl
+
+        x = ufl.variable(at.X + at.u)
+        gap = self.gap(at.ops, x, at.numbers, at.constant)
+        stiffness, width = map(at.constant, self.stiffness_at(at))
+        normal = ufl.diff(gap, x)
+        product = ufl.dot(normal, at.v) * ufl.dot(normal, direction)
+        return stiffness * tools.contact(at.ops, gap, width) * product * self.measure(at)
+
+    def measure(self, at: Place) -> Any:
+        """Measure of its boundary, fine enough for the pressure under it."""
+        return at.on(self.on, DEGREE)
+
+    def stiffness_at(self, at: Place) -> Stiffness:
+        """Return its resistance on a body."""
+        return self.resistance(at.modulus(), self.extent(at.bounds))
+
+    def extent(self, bounds: tuple[tuple[float, float], ...]) -> float:
+        """Extent (m) along its direction of a body within bounds (m)."""
+        return sum(abs(d) * (high - low) for d, (low, high) in zip(unit_vector(self.direction), bounds, strict=True))
+
+    def mistakes(self, body: Body, *, alone: bool) -> Iterator[tuple[str, str, Any]]:
+        """Find a tool that starts inside the body, or that never touches it."""
+        tip, d = np.array(self.at), np.array(unit_vector(self.direction))
+        extent = self.extent(body.bounds)
+        if self.depth >= extent and self.shape != "plane":
+            yield "depth", f"as deep as the body is thick there ({extent:.3g} m), expected less", self.depth
+            return
+        corners = facets(body, self.on)
+        looked_at = points(corners, tip)
+        inside = -float(self.gaps(looked_at, 0.0).min())
+        if inside > max(SLACK * self.depth, tolerance(body) * SLACK):
+            message = (
+                f"the tool starts inside the body, {inside:.3g} m deep at '{self.on}', expected it to touch at most"
+            )
+            yield "at", message, list(self.at)
+            return
+        behind = tip - np.outer([1e-3, 0.01, 0.05], extent * d)
+        if (np.linalg.norm(body.nearest(behind) - behind, axis=1) < 1e-9 * extent).any():
+            message = f"the tool starts inside the body, which lies behind its tip at {listed(self.at)} m as it points"
+            yield "direction", message, list(self.direction)
+        elif alone and self.depth > 0:
+            left = float(self.gaps(looked_at).min())
+            if left > 0:
+                message = f"the tool does not reach '{self.on}': at its depth, {left:.3g} m are left"
+                yield "depth", message, self.depth
+
+    def findings(self, body: Body) -> Iterator[Finding]:
+        """Find a tool that touches too little of the mesh."""
+        corners = facets(body, self.on)
+        near = np.linalg.norm(corners.mean(axis=1) - np.array(self.at), axis=1).argmin()
+        edge = float(edges(corners[[near]])[0])
+        if 0 < self.size < edge:
+            text = (
+                f"loads.{self.label} touches '{self.on}' over a radius of about {self.size:.2g} m, which is below the "
+                f"edges of the cells there ({edge:.2g} m): its force and pressure are rough. Refine the mesh there."
+            )
+            yield Finding("warning", text)
+
+    def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
+        """Return where it holds the body along its direction: a plane all of its boundary, others at their tip."""
+        places = body.corners_of(self.on) if self.shape == "plane" else [self.at]
+        return [(place, unit_vector(self.direction)) for place in places]
+
+    def words(self, numbers: Mapping[str, str]) -> str:
+        """Say what it is, for reports."""
+        shape = {"flat": "flat punch"}.get(self.shape, self.shape)
+        sizes = ", ".join(f"{name} {numbers[name]}" for name in ("radius", "edge", "angle", "tip") if name in numbers)
+        place = ", ".join(numbers[axis] for axis in "xyz")
+        moved = f"moved by {numbers['depth']} along {listed(self.direction)} from ({place})"
+        return f"{self.label} on {self.on}: rigid {shape}{', ' + sizes if sizes else ''}; {moved}, without friction"
+
+    @model_validator(mode="after")
+    def _check(self) -> Indenter:
+        problems = list(self._problems())
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        needed, allowed = NEEDED[self.shape], ALLOWED.get(self.shape, ())
+        for name in ("radius", "edge", "axis", "angle", "tip"):
+            given = getattr(self, name) is not None
+            if name in needed and not given:
+                yield f"a tool with shape = '{self.shape}' needs {name}"
+            if given and name not in (*needed, *allowed):
+                yield f"a tool with shape = '{self.shape}' has no {name}"
+        if self.edge is not None and self.radius is not None and self.edge > self.radius:
+            yield f"its edge is rounder ({self.edge:g} m) than the tool (radius {self.radius:g} m)"
+        if self.axis is not None and np.linalg.norm(np.cross(self.axis, self.direction)) < 1e-9 * np.linalg.norm(
+            self.axis
+        ) * np.linalg.norm(self.direction):
+            yield "the axis of a cylinder lies along its direction, expected one across it"
+
+
+def _dot(a: Any, b: Any) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

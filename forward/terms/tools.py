@@ -1,0 +1,86 @@
+"""Rigid tools: how far a point is from their surface, and the pressure with which they resist it.
+
+Distances are written once, for numbers (NumPy) and for forms (UFL). A tool points along a unit vector d; a point x is
+seen from its tip q by t = (x − q)·d, positive ahead of the tip, and by its distance across from the axis through it.
+Distances are positive outside the tool, which goes on behind its tip: a sphere is the end of a rod as thick as itself.
+Sources: elementary geometry; rounded boxes and cones as in J. C. Hart, Sphere tracing, The Visual Computer 12 (1996)
+527–545.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+TINY = 1e-24  # of the square of a length, which keeps slopes of square roots finite
+NUMPY = SimpleNamespace(
+    sqrt=np.sqrt,
+    sin=np.sin,
+    cos=np.cos,
+    positive=lambda x: np.maximum(x, 0.0),
+    choose=lambda z, positive, negative: np.where(z > 0, positive, negative),
+)
+
+
+def distance(ops: Any, shape: str, t: Any, across: Any, numbers: Mapping[str, Any]) -> Any:
+    """Return the signed distance (m) of a point from a tool.
+
+    Parameters
+    ----------
+    ops
+        Functions for numbers (`NUMPY`) or forms.
+    shape
+        As of an `Indenter`.
+    t
+        Distance (m) ahead of the tip.
+    across
+        Square (m²) of the distance from the axis; for a cylinder, from the plane through its own axis and d.
+    numbers
+        radius and edge, or angle (radians) and tip.
+    """
+    match shape:
+        case "plane":
+            return t
+        case "sphere" | "cylinder":
+            radius = numbers["radius"]
+            beyond = across + t**2 + 2 * radius * t  # |x − centre|² − R², without cancellation
+            ball = beyond / (ops.sqrt(beyond + (1 + TINY) * radius**2) + radius)
+            return ops.choose(t + radius, ball, ops.sqrt(across + TINY * radius**2) - radius)
+        case "flat":
+            radius, edge = numbers["radius"], numbers["edge"]
+            out = ops.sqrt(across + TINY * radius**2) - (radius - edge)
+            ahead = t + edge
+            corner = ops.sqrt(ops.positive(out) ** 2 + ops.positive(ahead) ** 2 + TINY * edge**2)
+            return corner - ops.positive(-(ahead + ops.positive(out - ahead))) - edge
+        case "cone":
+            tip, sine, cosine = numbers["tip"], ops.sin(numbers["angle"]), ops.cos(numbers["angle"])
+            out, ahead = ops.sqrt(across + TINY * tip**2), t + tip  # from the centre of the rounded tip
+            along, off = out * sine - ahead * cosine, out * cosine + ahead * sine  # along the side, and from it
+            return ops.choose(along, off, ops.sqrt(off**2 + along**2 + TINY * tip**2)) - tip
+        case _:
+            message = f"no tool is shaped like '{shape}'"
+            raise ValueError(message)
+
+
+def energy(ops: Any, gap: Any, stiffness: float, width: float) -> Any:
+    """Return the contact energy (J/m²) whose negative derivative by the gap is `pressure`."""
+    near = width / 2 - gap
+    return stiffness / (6 * width) * (ops.positive(near) ** 3 - ops.positive(near - width) ** 3)
+
+
+def pressure(ops: Any, gap: Any, stiffness: float, width: float) -> Any:
+    """Return the contact pressure (Pa): stiffness × penetration, smooth where |gap| < width/2, 0 beyond.
+
+    Its derivative is continuous, so that forces, and what follows from them, are differentiable.
+    """
+    near = width / 2 - gap
+    return stiffness / (2 * width) * (ops.positive(near) ** 2 - ops.positive(near - width) ** 2)
+
+
+def contact(ops: Any, gap: Any, width: float) -> Any:
+    """Return 1 in contact and 0 outside, continuous: the derivative of the pressure relative to its stiffness."""
+    near = width / 2 - gap
+    return (ops.positive(near) - ops.positive(near - width)) / width

@@ -1,0 +1,248 @@
+"""Rigid tools: their distances, contact on tiny meshes against closed forms, derivatives, and what is refused."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from pydantic import ValidationError
+from scipy.optimize import minimize
+
+from forward.conformance import check_derivatives
+from forward.hyperelastic import Hyperelastic
+from forward.terms import tools
+from forward.terms.indenter import Indenter
+from tests.bodies import energy_density
+
+SIDE = 20e-3
+C1, D1 = 1e3, 2e3
+SPHERE = {"shape": "sphere", "radius": 5e-3, "depth": 1e-3}
+PLANE = {"shape": "plane", "depth": 2e-3}
+SHAPES = {
+    "sphere": SPHERE,
+    "flat": {"shape": "flat", "radius": 5e-3, "edge": 5e-4, "depth": 1e-3},
+    "cylinder": {"shape": "cylinder", "radius": 5e-3, "axis": (1.0, 0.0, 0.0), "depth": 1e-3},
+    "cone": {"shape": "cone", "angle": 70.0, "tip": 4e-4, "depth": 1e-3},
+    "plane": PLANE,
+}
+ON_ROLLERS = ({"on": "x-min", "x": 0.0}, {"on": "y-min", "y": 0.0}, {"on": "z-min", "z": 0.0})
+OUTPUTS = (
+    {"kind": "force", "name": "force"},
+    {"kind": "force", "name": "across", "component": "x"},
+    {"kind": "reaction", "name": "below", "on": "z-min", "component": "z"},
+    {"kind": "reaction", "name": "beside", "on": "x-min", "component": "x"},
+    {"kind": "displacement", "name": "top", "at": (SIDE, SIDE, SIDE), "component": "z"},
+)
+
+
+def tool(**changes):
+    return {
+        "kind": "indenter",
+        "on": "z-max",
+        "at": (0.0, 0.0, SIDE),
+        "direction": (0.0, 0.0, -1.0),
+        **SPHERE,
+        **changes,
+    }
+
+
+def body(*loads, cells=2, displacements=ON_ROLLERS, outputs=OUTPUTS, **changes):
+    return Hyperelastic.model_validate(
+        {
+            "body": {
+                "kind": "box",
+                "size": (SIDE,) * 3,
+                "cells": (cells,) * 3,
+                "degree": 2,
+                "grading": {"x-min": 4.0, "y-min": 4.0, "z-max": 4.0},
+            },
+            "material": {"kind": "neo-hookean", "C1": C1, "D1": D1},
+            "formulation": "displacement",
+            "displacements": displacements,
+            "loads": loads,
+            "outputs": outputs,
+            **changes,
+        }
+    )
+
+
+def only(shape, **changes):
+    """A tool of a shape with the numbers of that shape alone."""
+    numbers = {name: value for name, value in tool(**SHAPES[shape]).items() if value is not None}
+    if shape in ("cone", "plane"):
+        numbers.pop("radius")
+    return {**numbers, **changes}
+
+
+def profile(shape, rng):
+    """Points on the surface of a tool, seen along its axis: distance across, and ahead of the tip (m)."""
+    numbers = SHAPES[shape]
+    match shape:
+        case "sphere" | "cylinder":
+            angle, back = rng.uniform(0, np.pi / 2, 4000), rng.uniform(0, 5e-3, 1000)
+            radius = numbers["radius"]
+            round_part = radius * np.array([np.sin(angle), np.cos(angle) - 1])
+            return np.hstack([round_part, [np.full(1000, radius), -radius - back]])
+        case "flat":
+            radius, edge = numbers["radius"], numbers["edge"]
+            angle, r, back = (
+                rng.uniform(0, np.pi / 2, 3000),
+                rng.uniform(0, radius - edge, 3000),
+                rng.uniform(0, 5e-3, 3000),
+            )
+            corner = [radius - edge + edge * np.sin(angle), edge * np.cos(angle) - edge]
+            return np.hstack([corner, [r, np.zeros(3000)], [np.full(3000, radius), -edge - back]])
+        case "cone":
+            angle, tip = np.radians(numbers["angle"]), numbers["tip"]
+            turn, along = rng.uniform(0, np.pi / 2 - angle, 3000), rng.uniform(0, 2e-2, 6000)
+            ball = tip * np.array([np.sin(turn), np.cos(turn) - 1])
+            start = tip * np.array([np.cos(angle), np.sin(angle) - 1])
+            side = start[:, None] + along * np.array([[np.sin(angle)], [-np.cos(angle)]])
+            return np.hstack([ball, side])
+        case _:
+            return np.array([rng.uniform(0, 2e-2, 9000), np.zeros(9000)])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_are_those_to_the_nearest_point_of_the_surface(shape):
+    rng = np.random.default_rng(1)
+    indenter = Indenter.model_validate(only(shape, direction=(0.0, 3.0, -4.0), at=(1e-3, 2e-3, 3e-3)))
+    surface = profile(shape, rng)
+    seen = np.array([rng.uniform(0, 8e-3, 50), rng.uniform(-2e-3, 3e-3, 50)])
+    nearest = np.linalg.norm(surface[:, :, None] - seen[:, None, :], axis=0).min(axis=0)
+    d = np.array([0, 0.6, -0.8])
+    side = np.cross(d, [1.0, 0, 0]) if shape == "cylinder" else np.array([1.0, 0, 0])
+    side /= np.linalg.norm(side)
+    points = np.array(indenter.at) + np.outer(seen[1] + indenter.depth, d) + np.outer(seen[0], side)
+    gaps = indenter.gaps(points)
+    np.testing.assert_allclose(np.abs(gaps), nearest, atol=2e-5)
+    assert (gaps[seen[1] > 0] > 0).all()
+
+
+def test_the_pressure_is_the_slope_of_the_energy_and_smooth():
+    gap = np.linspace(-3, 2, 5001)
+    of = (tools.NUMPY, gap, 2.0, 1.0)
+    np.testing.assert_allclose(-np.gradient(tools.energy(*of), gap)[1:-1], tools.pressure(*of)[1:-1], atol=1e-5)
+    slope = -np.gradient(tools.pressure(*of), gap)
+    np.testing.assert_allclose(slope, 2.0 * tools.contact(tools.NUMPY, gap, 1.0), atol=2e-3)
+    np.testing.assert_allclose(tools.pressure(*of)[gap < -0.5], -2.0 * gap[gap < -0.5])
+    assert (tools.pressure(*of)[gap > 0.5] == 0).all()
+
+
+def uniaxial(stretch):
+    """Nominal stress (Pa) of a column whose sides are free."""
+    import sympy as sp
+
+    across, along = sp.symbols("a b", positive=True)
+    density = energy_density("neo-hookean", sp.diag(across, across, along), C1=C1, D1=D1)
+    W = sp.lambdify((across, along), density)
+    ends = [minimize(lambda x, s=s: W(x[0], s), [1.0], tol=1e-14).fun for s in (stretch + 1e-4, stretch - 1e-4)]
+    return (ends[0] - ends[1]) / 2e-4
+
+
+@pytest.mark.fem
+def test_a_plane_compresses_a_column_homogeneously():
+    """The patch test of contact."""
+    found = body(only("plane")).build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+    force, across, below, beside, top = found.outputs
+    assert force == pytest.approx(-uniaxial(0.9) * SIDE**2, rel=2e-3)  # less by the penetration
+    assert top == pytest.approx(-2e-3, rel=1e-3)
+    assert below == pytest.approx(force, rel=1e-8)
+    assert abs(across) < 1e-12
+    assert abs(beside) < 1e-7 * force
+
+
+@pytest.mark.fem
+def test_forces_balance_and_contact_is_from_one_side():
+    spec = body(tool(at=(4e-3, 3e-3, SIDE)))
+    model = spec.build(MPI.COMM_SELF, ("loads.indenter.depth", "loads.indenter.z"))
+    found = model.solve(np.array([1e-3, SIDE]))
+    force, across, below, beside, _ = found.outputs
+    assert force == pytest.approx(below, rel=1e-8)
+    assert across == pytest.approx(-beside, rel=1e-8)
+    assert found.stability > 1  # negative eigenvalues were counted, and there are none
+    away = model.solve(np.array([1e-3, SIDE + 1.5e-3]))
+    np.testing.assert_allclose(away.outputs, 0, atol=1e-12)
+    nearer = model.solve(np.array([1.5e-3, SIDE + 0.5e-3]))
+    np.testing.assert_allclose(nearer.outputs, found.outputs, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("shape", ["sphere", "flat"])
+def test_derivatives(shape):
+    spec = body(only(shape, at=(2e-3, 1e-3, SIDE)))
+    names = [f"loads.indenter.{name}" for name in ("depth", "x", "radius")] + ["material.C1"]
+    values = np.array([spec.scalars[name].value for name in names])
+    scale = np.array([1e-5, 1e-5, *(0.01 * values[2:])])
+    model = spec.build(MPI.COMM_SELF, tuple(names))
+    check_derivatives(model, values, scale, directions=np.array([[1.0, 0, 0, 0], [0, 0.5, 0.5, 0.5]])).require()
+    slopes = model.solve(values).tangent(np.eye(len(names)))
+    for k in (0, 3):  # the depth and the stiffness
+        step = np.eye(len(names))[k] * 1e-3 * values[k]
+        ends = [model.solve(values + sign * step).outputs for sign in (1, -1)]
+        np.testing.assert_allclose((ends[0] - ends[1])[0] / (2 * step[k]), slopes[k, 0], rtol=1e-4)
+
+
+@pytest.mark.fem
+def test_a_body_rests_on_a_table():
+    """Nothing else holds it up; what lies at the edges would lift off, were it glued."""
+    table = {"kind": "indenter", "name": "table", "shape": "plane", "on": "z-min", "at": (0.0, 0.0, 0.0)}
+    table |= {"direction": (0.0, 0.0, 1.0), "depth": 0.0}
+    weight = {"kind": "gravity", "density": 1000.0}
+    outputs = ({"kind": "force", "name": "force", "tool": "table"}, OUTPUTS[-1])
+    spec = body(table, weight, displacements=ON_ROLLERS[:2], outputs=outputs)
+    force, top = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0)).outputs
+    assert force == pytest.approx(1000 * 9.81 * SIDE**3, rel=1e-7)
+    assert -5e-4 < top < -1e-4
+
+
+@pytest.mark.fem
+def test_two_tools_squeeze_a_body_between_them():
+    upper, lower = tool(name="upper"), tool(name="lower", on="z-min", at=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))
+    outputs = tuple({"kind": "force", "name": name, "tool": name} for name in ("upper", "lower"))
+    spec = body(upper, lower, displacements=ON_ROLLERS[:2], outputs=outputs, cells=3)
+    above, below = spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0)).outputs
+    assert above == pytest.approx(below, rel=1e-7)
+    assert above > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"at": (0.0, 0.0, SIDE - 2e-3)}, "the tool starts inside the body, 0.002 m deep at 'z-max'"),
+        ({"direction": (0.0, 0.0, 1.0)}, "behind its tip"),
+        ({"at": (0.0, 0.0, 2 * SIDE)}, "does not reach 'z-max': at its depth, 0.019 m are left"),
+        ({"depth": 0.03}, r"as deep as the body is thick there \(0.02 m\)"),
+        ({"depth": -1e-3}, "greater than or equal to 0"),
+        ({"radius": None}, "a tool with shape = 'sphere' needs radius"),
+        ({"edge": 1e-3}, "a tool with shape = 'sphere' has no edge"),
+        ({"shape": "cylinder", "axis": (0.0, 0.0, 2.0)}, "lies along its direction"),
+        ({"on": "z-mx"}, "did you mean 'z-max'"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_line(changes, said):
+    with pytest.raises(ValidationError, match=said):
+        body({name: value for name, value in tool(**changes).items() if value is not None})
+
+
+def test_a_tool_does_not_hold_what_it_pushes_away():
+    with pytest.raises(ValidationError, match="nothing holds the body along z"):
+        body(tool(), displacements=ON_ROLLERS[:2])
+
+
+def test_the_force_of_an_unknown_tool():
+    output = {"kind": "force", "name": "F", "tool": "punch"}
+    with pytest.raises(ValidationError, match="unknown tool; expected one of: indenter"):
+        body(tool(), outputs=(output,))
+    with pytest.raises(ValidationError, match="no load is an indenter"):
+        body(outputs=(output,))
+
+
+def test_a_tool_sharper_than_the_mesh_is_said_to_be():
+    texts = [finding.text for finding in body(tool(radius=1e-3, depth=1e-4)).findings]
+    assert any("below the edges of the cells there" in text for text in texts)
+    assert not body(tool(radius=1.0, depth=1e-3)).findings
+
+
+def test_words():
+    words = body(tool()).loads[0].words({name: f"<{name}>" for name in body(tool()).loads[0].scalars})
+    expected = "indenter on z-max: rigid sphere, radius <radius>; moved by <depth> along (0, 0, -1)"
+    assert words.startswith(expected)
