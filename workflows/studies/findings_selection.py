@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.external.derivatives import contradicted
 from forward.model import Finding
 from forward.words import number, with_error
+from workflows.studies.model_selection import ModelSelection
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.model import ForwardModel
     from uq.inputs.distributions import Distribution
     from uq.inputs.random_parameters import Inputs
+    from workflows.studies.selection import Comparison
 
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
@@ -188,6 +192,22 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
     doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
+
+
+def contradictions(study: Comparison, name: str, make: Callable[[], ForwardModel]) -> list[Finding]:
+    """Find that the derivatives which another program states for a candidate are not those of its values; on rank 0."""
+    spec = study.of_candidates[name] if isinstance(study, ModelSelection) else None
+    if spec is None or spec.shareable:
+        return []
+    inputs = study.candidates[name].inputs
+    return [
+        one._replace(text=f"Candidate '{name}': {one.text}") for one in contradicted(make(), inputs.mean, inputs.std)
+    ]
+
+
+def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Dataset:
+    """Trust no evidence of models whose derivatives are wrong: their modes were not found."""
+    return dataset.assign(trusted=dataset["trusted"] & ~dataset["model"].isin(list(wrong)))
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:

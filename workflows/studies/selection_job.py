@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 from inverse.criticism.finer import Finer
 from uq.evaluation.evaluate import Evaluate, Recorder, SerialEvaluate
 from uq.findings import add
-from workflows.studies.findings_selection import doubts_of_selection, findings, trusted_on_meshes
+from workflows.studies.findings_selection import (
+    contradictions,
+    doubts_of_selection,
+    findings,
+    trusted_on_meshes,
+    with_right_derivatives,
+)
 from workflows.studies.finer import FINER, solved_by
 from workflows.studies.job import MethodJob
 from workflows.studies.selection_results import arviz_groups
@@ -49,8 +55,9 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
         found = found.assign_attrs(quantity=study.quantity)
         candidates = {name: candidate.inputs for name, candidate in study.candidates.items()}
         doubts = doubts_of_selection(found, candidates, study.method.noise.factor)
-        add(found, *findings(found), *doubts)
-        return trusted_on_meshes(found)
+        wrong = {name: contradictions(study, name, make) for (name, _), make in makers.items()}
+        add(found, *findings(found), *doubts, *(one for several in wrong.values() for one in several))
+        return trusted_on_meshes(with_right_derivatives(found, [name for name, several in wrong.items() if several]))
 
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
     finer_ones = {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}

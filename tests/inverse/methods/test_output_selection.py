@@ -108,6 +108,18 @@ def test_linear_models_have_their_exact_evidences(folder):
     assert main(["check", str(folder / "rivals.toml")]) == 0
 
 
+def test_a_candidate_with_a_wrong_jacobian_is_named(folder):
+    wrong = LINES.replace("return OTHER\n", "return OTHER * np.array([1.0, 0.9])\n")
+    (folder / "rival_wrong.py").write_text(wrong)
+    (folder / "wrong.toml").write_text(STUDY.replace("rival_lines", "rival_wrong"))
+    assert main(["run", str(folder / "wrong.toml"), "--out", str(folder / "wrong"), "--quiet"]) == 3
+    summary = json.loads((folder / "wrong" / "summary.json").read_text())
+    errors = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
+    assert [text for text in errors if text.startswith("Candidate 'other': ") and "by b 10 % off" in text]
+    assert not any("Candidate 'one" in text for text in errors)
+    assert [name for name, one in summary["models"].items() if not one["trusted"]] == ["other"]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
