@@ -16,7 +16,7 @@ import ffcx.naming
 from dolfinx import fem
 
 from forward.fem.dolfinx import version
-from forward.machine import compiled_forms
+from forward.machine import StopError, compiled_forms
 
 T = TypeVar("T")
 
@@ -49,7 +49,13 @@ def options_for(folder: Path) -> dict[str, Any]:
 @contextmanager
 def _lock(name: str) -> Iterator[None]:
     """Let one process in at a time. The system releases the lock of a process that dies."""
-    _CACHE.mkdir(parents=True, exist_ok=True)
+    try:
+        _CACHE.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        message = (
+            f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
+        )
+        raise StopError(message) from None
     with (_CACHE / f"{name}.lock").open("w") as lock:
         with suppress(OSError):  # some cluster file systems have no locks: then more than one process compiles
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -72,3 +72,20 @@ def test_whoever_is_killed_while_compiling_is_not_waited_for(tmp_path):
     ((volume, made),) = found(start(tmp_path))
     assert volume == "6.0"
     assert int(made) > 0
+
+
+def test_a_cache_that_cannot_be_made_is_said_in_one_line(tmp_path):
+    (tmp_path / "tissuq").write_text("no folder")
+    done = subprocess.run(
+        on_ranks(None, sys.executable, "-m", "workflows", "run", "configs/tiny.toml", "--out", tmp_path / "out"),
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+        cwd=ROOT,
+        env=environment() | {"XDG_CACHE_HOME": str(tmp_path)},
+    )
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"failed: compiled forms cannot be kept in {tmp_path}/tissuq/forms-")
+    assert last.endswith("set XDG_CACHE_HOME to a folder of yours")
