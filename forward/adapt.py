@@ -131,6 +131,13 @@ def largest_bytes(spec: Meshed) -> float:
     return times(own, mixed=mixed, symmetric=symmetric).bytes + of_estimate.bytes
 
 
+def of_fields(spec: Meshed) -> str | None:
+    """Say why random fields keep a mesh from being changed, or None if they do not."""
+    if any(field.basis != "modes" for field in spec.fields):
+        return "a random field with a coefficient at every vertex would change with the mesh, expected basis = 'modes'"
+    return None
+
+
 def mistakes(spec: Meshed) -> Iterator[Mistake]:
     """Find what keeps the mesh of a body from being adapted."""
     adapt = spec.adapt

@@ -294,6 +294,27 @@ class Hyperelastic(ModelSpec):
         """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""
         return self.model_copy(update={"body": self.body.refined(level)})
 
+    def finer(self, times: float) -> Self:
+        """Return the same problem with so many times the cells along each edge, or a few more.
+
+        Raises
+        ------
+        ModelError
+            If the mesh is one of a file, which is not made anew, or coefficients of fields are those of its vertices.
+        """
+        objection = adaptive.of_fields(self)
+        if objection is not None:
+            raise ModelError(objection)
+        if isinstance(self.body, MeshFile):
+            message = f"{'hexahedra' if self.body.cell == 'hexahedron' else 'meshes'} of a file are not made finer"
+            raise ModelError(message)
+        return self.model_copy(update={"body": self.body.with_cells(times)})
+
+    @property
+    def solver_tolerance(self) -> float:
+        """Residual that solutions may have, relative to the loads."""
+        return self.solver.tolerance
+
     def enriched(self) -> Self:
         """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
         formulation = "mixed" if self.mixed else "displacement"

@@ -178,6 +178,22 @@ class ModelSpec(Settings):
         message = f"a model of kind '{self.kind}' has no meshes"
         raise ModelError(message)
 
+    def finer(self, times: float) -> Self:
+        """Return the same model with so many times the cells along each edge of its body, or a few more.
+
+        Raises
+        ------
+        ModelError
+            If there is no such mesh, with the reason.
+        """
+        message = f"a model of kind '{self.kind}' has no meshes"
+        raise ModelError(message)
+
+    @property
+    def solver_tolerance(self) -> float | None:
+        """What its solver leaves of the equations, relative to their terms; None where there is no such number."""
+        return None
+
     def mesh_error_cost(self) -> Estimate | None:
         """Predict what an estimate of the error of its mesh takes (`Solution.mesh_error`); None without a mesh."""
         return None

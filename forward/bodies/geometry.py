@@ -123,6 +123,17 @@ class _SixSided(Settings):
             graded[face] = max(least, self.grading.get(face, 1.0))  # type: ignore[call-overload]
         return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
 
+    def with_cells(self, times: float) -> Self:
+        """Return the same body with so many times the cells along each edge, rounded up.
+
+        Raises
+        ------
+        ValidationError
+            If the mesh is too large.
+        """
+        cells = tuple(math.ceil(times * n * (1 - 1e-9)) for n in self.cells)
+        return self.model_validate(self.model_dump() | {"cells": cells})
+
     @abstractmethod
     def contains(self, point: Vector) -> bool:
         """Whether a point (m) lies in the undeformed body."""

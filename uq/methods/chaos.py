@@ -7,8 +7,8 @@ which functions it has, and when there are enough samples.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
@@ -52,6 +52,8 @@ from uq.surrogates.regression import (
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from uq.accuracy.goal import Goal
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 LARGEST = 1000  # samples after which a tolerance is given up by default
@@ -114,6 +116,11 @@ class Chaos(Amount):
         """All samples, if gradients are fitted."""
         return samples if self.gradients and self.fit == "regression" else 0
 
+    @property
+    def aims(self) -> bool:
+        """Whether it can stop at a goal: the points of a projection are all or nothing."""
+        return self.fit == "regression"
+
     def stream(self) -> tuple[Any, ...] | None:
         """Points of the design."""
         return "design", self.gradients
@@ -142,48 +149,72 @@ class Chaos(Amount):
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
         """Solve at the points of the design and fit; errors as in `run`."""
+        for found in self.rounds(inputs, evaluate):  # noqa: B007 - the last one counts
+            if self.met(found.reached):
+                break
+        limit = self.planned(len(inputs.names)) - 1
+        return replace(found, stopped=self.why_stopped(found.reached, found.error, found.count, limit, found.amount))
+
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
+        """Solve until the claimed errors are those of a goal, or there are no more solves; errors as in `run`."""
+        for found in self.rounds(inputs, evaluate, self.most(goal)):  # noqa: B007
+            if goal.reached(found.regression.estimates()) <= 1:
+                break
+        return self.reported(evaluate, found, f"{found.amount}: {found.error}")
+
+    def reported(self, evaluate: Evaluate, found: Expanded, stopped: str) -> xr.Dataset:
+        """Return the results of an expansion that ended for a reason."""
+        return expansion_dataset(self, evaluate, replace(found, stopped=stopped))
+
+    def most(self, goal: Goal) -> int:
+        """Return how many samples an expansion may take for a goal."""
+        return min(self.samples or LARGEST, max(goal.most - 1, 2))
+
+    def rounds(
+        self, inputs: Inputs, evaluate: Evaluate, limit: int | None = None, scramble: int = 0
+    ) -> Iterator[Expanded]:
+        """Solve and fit, again and again with more samples, up to a limit (by default that of the method).
+
+        The samples are those of a scramble of the Sobol' points. Errors as in `run`.
+        """
         refusal = self.objection(inputs)
         if refusal is not None:
             raise ValueError(refusal)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
-        projection = self.fit == "projection"
+        projection, open_ended = self.fit == "projection", self.open_ended or limit is not None
         gradients = self.gradients and evaluate.differentiable and not projection
-        limit = self.planned(len(inputs.names)) - 1
+        rows = rows_of(inputs, gradients=gradients)
+        most = ROWS_PER_TERM * FIELD_DICTIONARY if limit is not None else np.inf  # of a basis that may grow
+        limit = limit or self.planned(len(inputs.names)) - 1
         grid, weights = gauss(inputs, self.max_order + 2) if projection else (None, None)
         expand_fields = self.fields and centre.state.size > 0
         if projection:
             bases = whole(inputs, self.max_order)
         else:
             dictionary = FIELD_DICTIONARY if expand_fields else DICTIONARY
-            bases = candidates_of(inputs, self.max_order, limit * rows_of(inputs, gradients=gradients), dictionary)
+            bases = candidates_of(inputs, self.max_order, int(min(limit * rows, most)), dictionary)
         largest = orthonormal(inputs, bases.all)
         fields = None
         if expand_fields:
             fields = Projections(
                 largest, centre.state, gradients, grid, weights, evaluate.displacements, evaluate.node_volumes
             )
-        rounds: list[Evaluations] = []
-        count, target = 0, min(limit, _first(inputs, gradients=gradients)) if self.open_ended else limit
-        while True:
+        found: list[Evaluations] = []
+        count, target = 0, min(limit, first_samples(inputs, gradients=gradients)) if open_ended else limit
+        while target > count:
             points = (
                 grid
                 if grid is not None
-                else inputs.points(sobol_points(self.seed, 0, count, target, len(inputs.names)))
+                else inputs.points(sobol_points(self.seed, scramble, count, target, len(inputs.names)))
             )
-            rounds.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
+            found.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
             count = target
-            evaluations = merge(rounds)
+            evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            fitted = fit_best(bases, largest, data)
-            reached = float(fitted.relative.max())
+            yield Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data)))
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             target = int(min(limit, np.ceil(GROWTH * count), paid))
-            if self.met(reached) or target <= count:
-                break
-        error = f"order {fitted.chosen.order}, {fitted.chosen.which.size} terms, leave-one-out error {reached:.3g}"
-        stopped = self.why_stopped(reached, error, count, limit, f"{count} samples")
-        return Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fitted), stopped)
 
 
 def objection(inputs: Inputs, kind: str) -> str | None:
@@ -193,7 +224,7 @@ def objection(inputs: Inputs, kind: str) -> str | None:
     return None
 
 
-def _first(inputs: Inputs, *, gradients: bool) -> int:
+def first_samples(inputs: Inputs, *, gradients: bool) -> int:
     """Samples before a tolerance is first checked: enough for all products of two parameters, or for all slopes."""
     d = len(inputs.names)
     terms = (d + 1) * (d + 2) // 2 if d <= FULL else 2 * (d + 1)
@@ -207,7 +238,28 @@ class Expanded:
     centre: Linearisation
     evaluations: Evaluations
     regression: Regression
-    stopped: str
+    stopped: str = ""
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return len(self.evaluations.points)
+
+    @property
+    def reached(self) -> float:
+        """Largest leave-one-out error of an output, over its standard deviation."""
+        return float(self.regression.fit.relative.max())
+
+    @property
+    def amount(self) -> str:
+        """The samples in words."""
+        return f"{self.count} samples"
+
+    @property
+    def error(self) -> str:
+        """What was fitted, and how well, in words."""
+        chosen = self.regression.fit.chosen
+        return f"order {chosen.order}, {chosen.which.size} terms, leave-one-out error {self.reached:.3g}"
 
 
 # --- what follows from an expansion --------------------------------------------------------------------------------

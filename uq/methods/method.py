@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec, Times
+    from uq.accuracy.goal import Goal
     from uq.evaluation.evaluate import Evaluate
     from uq.inputs.random_parameters import Inputs
 
@@ -49,6 +50,24 @@ class Method(Settings):
         ValueError
             If the method cannot take the parameters, or needs derivatives that the model does not have.
         """
+
+    @property
+    def aims(self) -> bool:
+        """Whether it can stop as soon as errors are those of a goal (`until`)."""
+        return False
+
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
+        """Solve and estimate as `run` does, until the errors of means and standard deviations are those of a goal.
+
+        Where that takes more solves than the goal allows, or than the method, the results say what was reached.
+
+        Raises
+        ------
+        ValueError
+            If the method cannot stop at a goal; otherwise as `run`.
+        """
+        message = f"method.kind = '{self.kind}' does not stop at a tolerance of all errors"
+        raise ValueError(message)
 
     @abstractmethod
     def planned(self, dimension: int) -> int:
@@ -118,6 +137,7 @@ SAMPLING = {
 METHODS = Kinds(
     "method",
     {
+        "automatic": "uq.methods.automatic:Automatic",
         **SAMPLING,
         "multilevel-monte-carlo": "uq.methods.multilevel:MultilevelMonteCarlo",
         "local-sensitivity": "uq.methods.local_sensitivity:LocalSensitivity",

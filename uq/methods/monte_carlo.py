@@ -36,6 +36,8 @@ from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 if TYPE_CHECKING:
     import xarray as xr
 
+    from uq.accuracy.goal import Goal
+
 FIRST_ROUND = 64  # samples before a tolerance or a budget is first checked
 MOST_GROWTH = 4.0  # growth of the number of samples between checks
 UNLIMITED = 100_000  # samples that a tolerance or a budget may take if no limit is given
@@ -92,7 +94,19 @@ class MonteCarlo(Amount):
         SolveError
             If the model has no answer at the mean parameters or at fewer than two samples.
         """
-        return _sample(self, inputs, evaluate, control=None)
+        return self._sampled(inputs, evaluate)
+
+    @property
+    def aims(self) -> bool:
+        """It can stop at a goal."""
+        return True
+
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
+        """Sample until errors are those of a goal; results and errors as in `run`."""
+        return self._sampled(inputs, evaluate, goal)
+
+    def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
+        return _sample(self, inputs, evaluate, None, goal)
 
 
 class SensitivityMonteCarlo(MonteCarlo):
@@ -122,10 +136,13 @@ class SensitivityMonteCarlo(MonteCarlo):
         ValueError
             If the model has no derivatives.
         """
+        return self._sampled(inputs, evaluate)
+
+    def _sampled(self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None) -> xr.Dataset:
         if not evaluate.differentiable:
             message = "the model has no derivatives, expected one that has for method.kind = 'sensitivity-monte-carlo'"
             raise ModelError(message)
-        return _sample(self, inputs, evaluate, control=(self.coefficient, self.second_moment))
+        return _sample(self, inputs, evaluate, (self.coefficient, self.second_moment), goal)
 
 
 @dataclass(frozen=True)
@@ -148,7 +165,11 @@ class _JointMoments:
 
 
 def _sample(
-    method: MonteCarlo, inputs: Inputs, evaluate: Evaluate, control: tuple[Coefficient, SecondMoment] | None
+    method: MonteCarlo,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    control: tuple[Coefficient, SecondMoment] | None,
+    goal: Goal | None,
 ) -> xr.Dataset:
     evaluate = Recorder(evaluate)
     centre = linearise(inputs, evaluate)
@@ -156,8 +177,9 @@ def _sample(
     state = centre.state if slopes is None else centre.state_middle
     fields = _JointMoments(centre.coordinates, state, slopes) if method.fields and centre.state.size else None
     rounds: list[Evaluations] = []
-    limit = method.limit
-    target = min(limit, FIRST_ROUND) if method.open_ended else limit
+    limit = method.limit if goal is None else min(method.limit, goal.most - 1)
+    tolerance = method.tolerance if goal is None else 1.0
+    target = min(limit, FIRST_ROUND) if method.open_ended or goal is not None else limit
     count = 0
     while True:
         points = inputs.points(random_points(method.seed, count, target, len(inputs.names)))
@@ -165,15 +187,16 @@ def _sample(
         count = target
         evaluations = merge(rounds)
         scalars = _scalar_moments(evaluations, inputs, centre, control)
-        reached = float(scalars.relative_error.max())
+        reached = float(scalars.relative_error.max()) if goal is None else goal.reached(scalars)
         growth = MOST_GROWTH
-        if method.tolerance is not None:
-            growth = min(MOST_GROWTH, max(1.5, 1.1 * (reached / method.tolerance) ** 2))
+        if tolerance is not None:
+            growth = min(MOST_GROWTH, max(1.5 if goal is None else 1.1, 1.1 * (reached / tolerance) ** 2))
         paid = count + method.affordable(evaluate.solves, evaluate.seconds)
         target = int(min(limit, int(count * growth) + 1, paid))
-        if method.met(reached) or target <= count:
+        if (tolerance is not None and reached <= tolerance) or target <= count:
             break
-    stopped = method.why_stopped(reached, f"relative error {reached:.3g}", count, limit, f"{count} samples")
+    amount, error = f"{count} samples", f"relative error {float(scalars.relative_error.max()):.3g}"
+    stopped = f"{amount}: {error}" if goal else method.why_stopped(reached, error, count, limit, amount)
     return _dataset(method, inputs, evaluate, centre, evaluations, scalars, control, stopped)
 
 

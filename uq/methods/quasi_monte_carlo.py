@@ -29,6 +29,7 @@ from uq.estimators.moments import (
     monomials,
     quantiles_from_replicates,
     ratio,
+    student,
 )
 from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
@@ -43,6 +44,8 @@ from uq.surrogates.taylor import Control, expansion, held_expansion, quadratic, 
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from uq.accuracy.goal import Goal
 
 Pair = tuple[FloatArray, FloatArray]
 ORDER = 6  # largest order of the expansions tried as control
@@ -155,10 +158,24 @@ class QuasiMonteCarlo(MonteCarlo):
         ValueError
             If the model has no derivatives, which controls need, or the chaos control has correlated parameters.
         """
+        return self._sampled(inputs, evaluate)
+
+    def until(
+        self, inputs: Inputs, evaluate: Evaluate, goal: Goal, expanded: Deviations | None = None
+    ) -> xr.Dataset:
+        """Sample until errors are those of a goal; an expansion that is known already may be the control of "chaos".
+
+        Its samples must not be among those of the scrambles. Results and errors as in `run`.
+        """
+        return self._sampled(inputs, evaluate, goal, expanded)
+
+    def _sampled(
+        self, inputs: Inputs, evaluate: Evaluate, goal: Goal | None = None, expanded: Deviations | None = None
+    ) -> xr.Dataset:
         objection = self.objection(inputs)
         if objection is not None:
             raise ValueError(objection)
-        if self.control != "none" and not evaluate.differentiable:
+        if self.control != "none" and expanded is None and not evaluate.differentiable:
             message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
             raise ModelError(message)
         evaluate = Recorder(evaluate)
@@ -171,19 +188,29 @@ class QuasiMonteCarlo(MonteCarlo):
         fitted = held = None
         start: Start | None = centre.prediction
         if self.control == "chaos":
-            fitted = self._expand(inputs, evaluate, centre)
+            fitted = expanded or self._expand(inputs, evaluate, centre)
             control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
         samples = _Samples(self, inputs, evaluate, centre, control, held, start)
         last = self.limit // self.scrambles
-        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if self.open_ended else last
+        if goal is not None:
+            left = max(goal.most - evaluate.solves, self.scrambles)
+            last = min(last, power_of_two(left // self.scrambles))
+        open_ended, half_width = self.open_ended or goal is not None, student(self.scrambles - 1)
+        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if open_ended else last
         samples.extend(first)
         scalars = samples.scalars(first)
-        while not self.met(float(scalars.relative_error.max())) and samples.each < last:
+
+        def enough() -> bool:
+            if goal is not None:
+                return goal.reached(scalars, half_width) <= 1
+            return self.met(float(scalars.relative_error.max()))
+
+        while not enough() and samples.each < last:
             if self.scrambles * samples.each > self.affordable(evaluate.solves, evaluate.seconds):
                 break
             samples.extend(2 * samples.each)
             scalars = samples.scalars(samples.each)
-        return self._dataset(inputs, evaluate, centre, fitted, samples, scalars)
+        return self._dataset(inputs, evaluate, centre, fitted, samples, scalars, as_asked=goal is None)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
         """Fit the expansion to a separate scramble, so that given the fit, the samples are still random."""
@@ -203,6 +230,8 @@ class QuasiMonteCarlo(MonteCarlo):
         fitted: Deviations | None,
         samples: _Samples,
         scalars: Estimates,
+        *,
+        as_asked: bool,
     ) -> xr.Dataset:
         values, ok, scramble = samples.in_order(samples.outputs), samples.in_order(samples.ok), samples.scramble
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
@@ -243,7 +272,8 @@ class QuasiMonteCarlo(MonteCarlo):
         amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
         reached = float(scalars.relative_error.max())
         error = f"relative error {reached:.3g}"
-        dataset.attrs["stopped"] = self.why_stopped(reached, error, ok.size, self.limit, amount)
+        asked = self.why_stopped(reached, error, ok.size, self.limit, amount) if as_asked else f"{amount}: {error}"
+        dataset.attrs["stopped"] = asked
         notes = []
         if fitted is not None and not fitted.ok.all():
             notes.append(f"{int((~fitted.ok).sum())} of {fitted.ok.size} samples for the chaos control have no answer")

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from uq.methods.method import Method
 
+UNASKED = "method.kind = 'automatic' needs a tolerance, expected accuracy.tolerance, such as 1e-3"
 TEXTBOOK = 15  # ratio of the times of a solve from zero and a predicted one, at 10⁴ unknowns
 
 

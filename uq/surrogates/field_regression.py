@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
 from uq.estimators.indices import partial_variances, shares
-from uq.evaluation.evaluate import Evaluate, Request
+from uq.evaluation.evaluate import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
 from uq.surrogates.linearisation import Linearisation
@@ -154,14 +154,18 @@ def fit_deviations(
     wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    fit = fit_best(candidates, largest, data)
-    basis = largest.subset(fit.chosen.which)
+    return deviations(Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data)), evaluations, centre)
+
+
+def deviations(regression: Regression, evaluations: Evaluations, centre: Linearisation) -> Deviations:
+    """Return an expansion as one of deviations, with the state where `Projections` of it were summed."""
+    fit, basis, data = regression.fit, regression.basis, regression.data
     outputs = fit.coefficients - np.outer((basis.indices == 0).all(axis=1), centre.outputs)
     state, prediction = np.zeros((len(outputs), 0)), None
-    if wanted is not None:
+    if evaluations.fields.size:
         state = solved(fit, evaluations.fields[fit.chosen.which])
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
-    t = inputs.coordinates.of(data.points)
+    t = regression.inputs.coordinates.of(data.points)
     reach = np.array([t.min(axis=0), t.max(axis=0)])
     return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach)
 

@@ -43,8 +43,17 @@ class Accuracy(Settings):
         at a few parameters, in elements of one degree more, for at most a fifth of the solves or three estimates.
     memory
         Memory (MiB) of a group of ranks that these estimates may take; where they would take more there are none, and
-        a finding says so.
+        a finding says so. With a tolerance, refined meshes take no more either.
+    tolerance
+        Largest error of mean and standard deviation of every output, relative to them, of mesh, sampling and solver
+        together, at 95 %: in place of a number of samples. It is split between them, and the number of solves, the mesh
+        and, without a block `[method]`, the method are chosen so that it is met at little cost
+        (docs/how-to/accuracy.md).
+    solves
+        Most solves that a tolerance may take.
     """
 
     mesh_error: bool = True
     memory: Annotated[float, Field(gt=0)] = 4096.0
+    tolerance: Annotated[float, Field(gt=0, lt=1)] | None = None
+    solves: Annotated[int, Field(ge=16)] = 10_000

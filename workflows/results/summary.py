@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,8 @@ def summarise(dataset: xr.Dataset) -> Part:
     for needed, part in _PARTS:
         if needed <= set(dataset.variables):
             summary |= part(dataset)
+    if "accuracy" in dataset.attrs:
+        summary["accuracy"] = json.loads(dataset.attrs["accuracy"])
     return summary
 
 

@@ -15,6 +15,7 @@ from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import estimates_for
+from uq.accuracy.goal import OF_SOLVER, Goal
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
@@ -22,6 +23,7 @@ from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
+from workflows.studies import tolerance_asked
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -77,8 +79,18 @@ class Study(StudyKind):
 
     @cached_property
     def spec(self) -> ModelSpec:
-        """The model, in the form that suits all values of its parameters."""
-        return self.model.over(ranges(self.parameters))
+        """The model, in the form that suits all values of its parameters, solved as exactly as a tolerance needs."""
+        spec, asked = self.model.over(ranges(self.parameters)), self.accuracy.tolerance
+        solver = spec.solver_tolerance
+        return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
+
+    @property
+    def goal(self) -> Goal:
+        """What the tolerance for all errors asks of estimates, before anything is known of the mesh."""
+        assert self.accuracy.tolerance is not None
+        units = [output.unit for output in self.spec.outputs]
+        solver = self.spec.solver_tolerance or 0.0
+        return Goal.of(self.accuracy.tolerance, units, self.accuracy.solves, solver)
 
     @property
     def sampled(self) -> Sampled:
@@ -136,7 +148,8 @@ class Study(StudyKind):
         """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
-        return (*self.model.findings_over(ranges(self.parameters)), *of_draws, *self._of_estimates())
+        found = (*self.model.findings_over(ranges(self.parameters)), *of_draws, *self._of_estimates())
+        return (*found, *tolerance_asked.findings(self)) if self.accuracy.tolerance is not None else found
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self._estimating and self._too_large is not None:
@@ -163,10 +176,11 @@ class Study(StudyKind):
 
     def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
         """Refine the mesh, where that is asked for; collective."""
-        if not self.model.unrefined:
-            return self
-        refined = named("workflows.studies.adapted_mesh:on_adapted_mesh")
-        found: Study = refined(self, ensemble, directory, say)
+        found: Study = self
+        if self.model.unrefined:
+            found = named("workflows.studies.adapted_mesh:on_adapted_mesh")(self, ensemble, directory, say)
+        if self.accuracy.tolerance is not None and self.estimates:
+            found = named("workflows.studies.tolerance:on_fine_mesh")(found, ensemble, directory, say)
         return found
 
     @property
@@ -183,7 +197,7 @@ class Study(StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and others that the method may want, at the points of the method; collective."""
-        made: Job = named("workflows.studies.sampling_job:job")(self, ensemble)
+        made: Job = named("workflows.studies.sampling_job:job")(self, ensemble, directory)
         return made
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
@@ -210,6 +224,12 @@ class Study(StudyKind):
 
     @model_validator(mode="before")
     @classmethod
+    def _choose_method(cls, value: Any) -> Any:
+        """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
+        return tolerance_asked.completed(value) if isinstance(value, dict) else value
+
+    @model_validator(mode="before")
+    @classmethod
     def _gather_accuracy(cls, value: Any) -> Any:
         """Take `mesh_error` from beside the blocks into its own, unless that says it too."""
         if not isinstance(value, dict) or "mesh_error" not in value:
@@ -231,6 +251,7 @@ class Study(StudyKind):
         if not unfit:
             yield from self._mistakes_of_models()
         yield from self._mistakes_of_parameters()
+        yield from tolerance_asked.mistakes(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
         if self.parallel.ranks_per_model > 1 and not self.spec.shareable:

@@ -11,6 +11,7 @@ import numpy as np
 
 from forward.external.derivatives import contradicted
 from forward.model import Finding, SolveError, Stability
+from forward.registry import named
 from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 REALISATIONS = 3  # of random fields, to look at
 
 
-def job(study: Study, ensemble: Ensemble) -> Job:
+def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     """One model, and others that the method may want, at the points of a method; collective over the group."""
     inputs, units = study.inputs, {output.name: output.unit for output in study.model.returned}
     recorders: dict[str, Recorder] = {}
@@ -44,6 +45,9 @@ def job(study: Study, ensemble: Ensemble) -> Job:
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
+        if study.accuracy.tolerance is not None:
+            within: Callable[..., xr.Dataset] = named("workflows.studies.within:within")
+            return within(study, method, inputs, evaluate, recorders, estimates, directory)
         found = method.run(inputs, recorders["/"])
         return (
             _with_mesh_errors(study, found, inputs, evaluate, recorders["/"], estimates) if study.estimates else found

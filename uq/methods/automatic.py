@@ -1,0 +1,282 @@
+"""A method that is chosen by what solves show: an expansion first, quasi-Monte Carlo where that takes less.
+
+An expansion with gradients needs few solves of a smooth model, and any number of one that is not. Which of both a model
+is, the first solves tell: the claimed errors of the expansion are extrapolated as a power of the number of samples,
+with at least the exponent ½ of sampling. Against that stands quasi-Monte Carlo with the tangent, or the expansion so
+far, as control variate: what the control leaves of the standard deviation σ of an output, λσ, and with it about
+
+    √2 λσ n^(−1/2) (n/R)^(−1/4)
+
+of error after n samples in R scrambles, for a standard deviation (Sobol' points do better on smooth functions, and the
+¼ is on the safe side of most). Claims decide when it ends, predictions only which way is gone on.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from math import comb
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from forward.model import FloatArray, SolveError
+from uq.estimators.moments import student
+from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import power_of_two, sobol_points
+from uq.methods.chaos import LARGEST, Chaos, Expanded, Probability
+from uq.methods.method import Method
+from uq.methods.quasi_monte_carlo import FIT, QuasiMonteCarlo
+from uq.methods.stopping import UNASKED
+from uq.surrogates.field_regression import Deviations, deviations
+from uq.surrogates.regression import beyond
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import xarray as xr
+
+    from uq.accuracy.goal import Goal
+
+SEEN = 3  # last rounds of an expansion from which the next ones are predicted
+ROUNDS = 5  # of an expansion in any case, where samples are few
+SOME = 1024  # samples beyond which tails are looked at
+LEAST_POWER = 0.5  # of the number of samples with which claims fall: that of sampling
+WORTH = 1.5  # times fewer solves, predicted: then what was begun is given up,
+PATIENCE = 0.25  # but not before it has taken this share of what would follow: expansions may begin slowly
+FUNCTIONS, LEAST_ORDER, LARGEST_ORDER = 200, 6, 20  # of the largest whole basis, and orders
+SCRAMBLES = 16
+LIMITLESS = 10**9
+WITH_DERIVATIVES = 2.0  # solves that one with derivatives counts as
+Control = Literal["none", "tangent", "chaos"]
+IN_WORDS: dict[Control, str] = {
+    "none": "without a control variate",
+    "tangent": "with the tangent as control variate",
+    "chaos": "with an expansion as control variate",
+}
+
+
+class Automatic(Method):
+    """Means and standard deviations to the tolerance of a study, `[accuracy] tolerance`, by the method that suits.
+
+    Parameters
+    ----------
+    seed
+        Seed of all points.
+    quantiles
+        Probabilities of the quantiles of the outputs.
+    fields
+        Whether the displacement field is estimated too, at each node.
+    """
+
+    kind: Literal["automatic"] = "automatic"
+    seed: Annotated[int, Field(ge=0)] = 0
+    quantiles: tuple[Probability, ...] = (0.05, 0.5, 0.95)
+    fields: bool = True
+
+    @property
+    def aims(self) -> bool:
+        """It does nothing else."""
+        return True
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves of the first expansion."""
+        terms = comb(dimension + 2, 2)
+        return 1 + max(4, -(-2 * terms // (1 + dimension)))
+
+    def with_tangents(self, samples: int) -> int:
+        """All of them."""
+        return samples
+
+    @property
+    def undecided(self) -> str:
+        """What the planned solves are for."""
+        return "a first expansion"
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Without a tolerance nothing can be chosen.
+
+        Raises
+        ------
+        ValueError
+            Always.
+        """
+        raise ValueError(UNASKED)
+
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
+        """Solve until errors are those of a goal.
+
+        Returns
+        -------
+        xarray.Dataset
+            The results of the method that was chosen; its attribute `chosen` says which, and why.
+
+        Raises
+        ------
+        SolveError
+            If the model has no answer at the mean parameters, or at too many samples.
+        """
+        recorder = Recorder(evaluate)
+        pilot = self._pilot(inputs, recorder, goal)
+        solves, reasons = recorder.solves, [pilot.reason]
+        if pilot.control is None and pilot.found is not None:
+            chosen, amount = "chaos", f"{pilot.found.amount}: {pilot.found.error}"
+            dataset = self._chaos(inputs, goal).reported(recorder, pilot.found, amount)
+        else:
+            chosen, left = "quasi-monte-carlo", replace(goal, most=max(goal.most - solves, 2))
+            dataset = self._quasi(pilot.control or "none").until(inputs, recorder, left, pilot.expanded)
+            if solves:
+                reasons.append(f"In all {recorder.solves:,} solves, {solves:,} of them to find out.")
+        dataset.attrs["chosen"] = json.dumps({"method": chosen, "reasons": reasons}, ensure_ascii=False)
+        return dataset
+
+    def _pilot(self, inputs: Inputs, evaluate: Recorder, goal: Goal) -> _Pilot:
+        """Expand until the claims are those of the goal, or something else takes less."""
+        gradients = evaluate.differentiable
+        plain: Control = "tangent" if gradients else "none"
+        if not inputs.independent:
+            return _Pilot(plain, "there are no expansions in parameters that are correlated")
+        chaos = self._chaos(inputs, goal)
+        trail: list[tuple[int, float]] = []
+        found: Expanded | None = None
+        other: _Outlook | None = None
+        try:
+            for found in chaos.rounds(inputs, evaluate, chaos.most(goal), FIT):
+                trail.append((found.count, goal.reached(found.regression.estimates())))
+                if trail[-1][1] <= 1:
+                    break
+                other = _Outlook.of(found, goal, gradients=gradients)
+                weight = WITH_DERIVATIVES if gradients else 1.0
+                spent, further = weight * found.count, weight * _further(trail)
+                if len(trail) >= ROUNDS and spent > PATIENCE * other.samples and further > WORTH * other.samples:
+                    break
+        except SolveError as error:
+            if found is None:
+                return _Pilot(plain, error.reason)
+            raise
+        assert found is not None
+        (first, before), (count, last) = trail[0], trail[-1]
+        fell = f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
+        between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
+        if last <= 1 or other is None or goal.most - count < WORTH * count:
+            what = "fitted to values and gradients" if gradients else "fitted to values"
+            return _Pilot(None, f"Polynomial chaos {what}: {fell}{between}.", found)
+        reason = (
+            f"about {other.samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
+            f"{fell}{between}"
+        )
+        return _Pilot(other.control, reason, found)
+
+    def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
+        return Chaos(
+            samples=max(2, min(LARGEST, goal.most - 1)),
+            max_order=_order(len(inputs.names)),
+            seed=self.seed,
+            quantiles=self.quantiles,
+            fields=self.fields,
+        )
+
+    def _quasi(self, control: Control) -> QuasiMonteCarlo:
+        return QuasiMonteCarlo(
+            samples=SCRAMBLES * power_of_two(LIMITLESS // SCRAMBLES),  # the goal says how many
+            scrambles=SCRAMBLES,
+            control=control,
+            seed=self.seed,
+            quantiles=self.quantiles,
+            fields=self.fields,
+        )
+
+
+@dataclass(frozen=True)
+class _Pilot:
+    """What first solves have shown.
+
+    Attributes
+    ----------
+    control
+        That of quasi-Monte Carlo, if this is to follow.
+    why
+        In words.
+    found
+        The expansion, if there is one.
+    """
+
+    control: Control | None
+    why: str
+    found: Expanded | None = None
+
+    @property
+    def reason(self) -> str:
+        """Why this is the way, in a sentence."""
+        return self.why if self.control is None else f"Quasi-Monte Carlo {IN_WORDS[self.control]}: {self.why}."
+
+    @property
+    def expanded(self) -> Deviations | None:
+        """The expansion as a control variate."""
+        if self.control != "chaos" or self.found is None:
+            return None
+        return deviations(self.found.regression, self.found.evaluations, self.found.centre)
+
+
+def _order(dimension: int) -> int:
+    """Largest order of expansions: more than usual in few parameters, where a small tolerance may need it."""
+    orders = [order for order in range(1, LARGEST_ORDER + 1) if comb(dimension + order, order) <= FUNCTIONS]
+    return max([LEAST_ORDER, *orders])
+
+
+def _further(trail: Sequence[tuple[int, float]]) -> float:
+    """Predict the number of further samples until a claim is 1, from those after numbers of samples."""
+    (before, first), (count, last) = trail[max(0, len(trail) - SEEN)], trail[-1]
+    if not np.isfinite(first) or not np.isfinite(last):
+        return np.inf
+    power = np.log(first / last) / np.log(count / before) if count > before and last < first else 0.0
+    with np.errstate(over="ignore"):
+        return float(count * (np.float64(last) ** (1 / max(power, LEAST_POWER)) - 1))
+
+
+@dataclass(frozen=True)
+class _Outlook:
+    """Quasi-Monte Carlo as it is predicted: the control variate that takes least, and the samples."""
+
+    control: Control
+    samples: int
+
+    @classmethod
+    def of(cls, found: Expanded, goal: Goal, *, gradients: bool) -> _Outlook:
+        """Predict it from an expansion and its samples."""
+        regression, centre = found.regression, found.centre
+        inputs, fit, data, estimates = regression.inputs, regression.fit, regression.data, regression.estimates()
+        std = np.asarray(estimates["std"])
+        left: dict[Control, FloatArray] = {"none": std, "chaos": np.minimum(fit.loo, std)}
+        if gradients:
+            linear = centre.middle + inputs.coordinates.of(data.points) @ centre.output_slopes.T
+            left["tangent"] = np.minimum((data.values - linear).std(axis=0), std)
+        points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
+        outside, _ = beyond(inputs, regression.basis.values, fit.coefficients, points)
+        ways = []
+        for way, of in left.items():
+            tails = of * np.sqrt(outside) if way == "chaos" else np.zeros_like(of)  # as quasi-Monte Carlo claims them
+            ways.append(cls(way, _samples(goal, estimates, of, tails)))
+        return min(ways, key=lambda way: way.samples)
+
+
+def _samples(goal: Goal, estimates: dict[str, FloatArray], left: FloatArray, tails: FloatArray) -> int:
+    """Predict the samples of quasi-Monte Carlo whose control leaves so much (m,) of the standard deviations.
+
+    And so much (m,) of it in tails, however many samples there are.
+    """
+    n, half_width = 4 * SCRAMBLES, student(SCRAMBLES - 1)
+    while n < goal.most:
+        error = left * n**-0.5 * (n / SCRAMBLES) ** -0.25
+        then = {**estimates, "mean_error": error, "std_error": np.hypot(np.sqrt(2) * error, tails)}
+        if goal.reached(then, half_width) <= 1:
+            break
+        n *= 2
+    return n
+
+
+def _rounded(count: float) -> str:
+    """A predicted number in words."""
+    return f"about {float(f'{count:.1g}'):,.0f}" if count < 1e6 else "more than a million"

@@ -1,0 +1,328 @@
+"""A mesh that is fine enough for a tolerance of all errors: found before a study samples, and kept with its results.
+
+On each mesh, the model is linearised at the mean of its parameters and the error of the mesh is estimated at three: what
+is then not known of the error of means and standard deviations, which is left when they are corrected, is held against
+the tolerance. The mesh that is given is kept where that leaves enough for sampling. Otherwise cells are divided so that
+it will, by the rate at which errors fall; of all such numbers of cells the cheapest is taken, by predicted times: those
+of samples, whose number grows as a mesh takes more of the tolerance, and of estimates. Tetrahedra are refined where
+errors arise (`forward.fem.adapt`).
+
+All of this depends on the study only. Blocks of solves are those of the study on that mesh, which finds them again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.adapt import OF_ROUNDING, Adapt, largest_bytes
+from forward.machine import MIB
+from forward.model import FloatArray, SolveError
+from uq.accuracy.budget import FEWEST
+from uq.accuracy.effects import with_mesh_errors
+from uq.accuracy.mesh_errors import MeshErrors, estimate
+from uq.estimators.moments import Z
+from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import sobol_points
+from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
+from workflows.results.directory import write_text
+from workflows.run import own_code
+from workflows.run.version import version
+from workflows.studies.predictions import times_of
+from workflows.studies.tolerance_asked import refinement
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.spec import ModelSpec
+    from uq.evaluation.ensemble import Ensemble
+    from workflows.studies.sampling import Study
+
+FILE = "tolerance.json"
+KEPT = 0.8  # of the tolerance: what a mesh may take that was not predicted
+AIM = 0.6  # the same of one that is predicted
+OF_ADAPTED = 0.4  # the same of one that is refined where errors arise, which stops soon below what it is asked for
+RATE = 1.6  # at which errors are assumed to fall with the size of cells: slowly, as at edges that are held
+RATES = 0.8, 4.0  # that are believed of two meshes
+MOST_MESHES = 4
+STEP = 1.1  # ratio of the numbers of cells that are looked at
+FAR = 2.0  # times as many cells: farther, an assumed rate says too little
+DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
+LARGEST = 16.0  # times as many cells along an edge
+POINTS = 4096  # at which tangents are drawn
+SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """A mesh and its error.
+
+    Attributes
+    ----------
+    unknowns, cells
+        Of the mesh; the cells along each edge, where a body has such.
+    share
+        Largest part of the tolerance that it takes; infinite where that cannot be estimated.
+    output, of
+        Of which estimate of which output that is.
+    relative
+        Largest error of an output at the mean parameters, relative to it.
+    solves, seconds
+        What it took to find out; the time depends on the machine, and nothing on the time.
+    """
+
+    unknowns: int
+    cells: tuple[int, ...]
+    share: float
+    output: str
+    of: str
+    relative: float
+    solves: int
+    seconds: float
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """As it is written down."""
+        return {name: None if value == np.inf else value for name, value in vars(self).items()}
+
+    @classmethod
+    def read(cls, document: Mapping[str, Any]) -> Assessed:
+        """Return what was written down."""
+        return cls(**{name: np.inf if value is None else value for name, value in document.items()})
+
+
+def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
+    """Return the study on a mesh that is fine enough, or on the finest that there may be; collective."""
+    world, path = ensemble.world, directory.resolve() / FILE
+    told = world.bcast(_read(path) if world.rank == 0 else None)
+    first, meshes, why = study, list[Assessed](), ""
+    while told is None:
+        meshes.append(_assessed(study, ensemble, directory))
+        say(_line(meshes[-1]))
+        finer, why = _next(study, first, meshes)
+        if finer is None:
+            told = {"meshes": [one.document for one in meshes], "why": why, "body": _body(study, first)}
+            if world.rank == 0:
+                write_text(path, json.dumps(told, indent=2, ensure_ascii=False) + "\n")
+            return study
+        study = _refined(study, finer, ensemble, directory, say)
+    if "cells" in told["body"]:
+        body = study.model.body  # type: ignore[attr-defined]
+        cells = body.model_validate(body.model_dump() | {"cells": told["body"]["cells"]})
+        return study.of(study.model.model_copy(update={"body": cells}))
+    if "adapt" in told["body"]:
+        return _refined(study, _adapting(study, told["body"]["adapt"]), ensemble, directory, say)
+    return study
+
+
+def history(directory: Path) -> dict[str, Any] | None:
+    """Return how the mesh of a study was found, which stands beside its results; None where it was not looked for."""
+    return _read(directory.resolve() / FILE)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    return found
+
+
+def _body(study: Study, first: Study) -> dict[str, Any]:
+    """What of the body was changed."""
+    if study.model is first.model:
+        return {}
+    if study.model.adaptive:
+        return {"adapt": study.model.adapt.tolerance}  # type: ignore[attr-defined]
+    return {"cells": study.model.body.cells}  # type: ignore[attr-defined]
+
+
+def _refined(
+    study: Study, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]
+) -> Study:
+    """Return the study of a model, whose mesh may have to be refined first; collective."""
+    if not model.unrefined:
+        return study.of(model)
+    from workflows.studies.adapted_mesh import on_adapted_mesh
+
+    return on_adapted_mesh(study.of(model), ensemble, directory, say)
+
+
+# --- what a mesh takes -----------------------------------------------------------------------------------------------
+
+
+class Found:
+    """The model at the mean of its parameters, and the error of its mesh at a few.
+
+    Attributes
+    ----------
+    centre, errors
+        Those.
+    doubts
+        What is not known of the error of means and standard deviations (2, m), by what tangents say of the outputs;
+        zero where there is no estimate.
+    dataset
+        Means and standard deviations by tangents, with these errors.
+    """
+
+    def __init__(self, study: Study, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
+        fields = getattr(study.method, "fields", True) and centre.state.size > 0
+        self.centre = centre
+        self.errors: MeshErrors = estimate(
+            inputs, evaluate, centre, FEWEST, getattr(study.method, "seed", 0), fields=fields
+        )
+        points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
+        drawn = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
+        zero = np.zeros(len(centre.outputs))
+        moments = {"mean": drawn.mean(axis=0), "mean_error": zero, "std": drawn.std(axis=0), "std_error": zero}
+        dataset = local_dataset(inputs, evaluate, centre, fields=False)
+        dataset = dataset.assign({name: (("output",), values) for name, values in moments.items()})
+        units = {output.name: output.unit for output in study.spec.outputs}
+        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, units)
+        self.doubts = doubts(self.dataset)
+
+
+def doubts(dataset: xr.Dataset) -> FloatArray:
+    """Return what is not known of the error of the mesh in means and standard deviations (2, m); zero if not estimated."""
+    names = ("mesh_error_doubt", "std_mesh_error_doubt")
+    if names[0] not in dataset:
+        return np.zeros((2, dataset.sizes["output"]))
+    return np.nan_to_num(np.array([dataset[name].to_numpy() for name in names]))
+
+
+def _assessed(study: Study, ensemble: Ensemble, directory: Path) -> Assessed:
+    """Estimate what the mesh of a study takes of the tolerance; collective."""
+    checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]))
+    model = ensemble.together(lambda: study.spec.build(ensemble.group, study.inputs.names))
+
+    def task(evaluate: Evaluate) -> Assessed:
+        recorder, inputs = Recorder(evaluate), study.inputs
+        centre = linearise(inputs, recorder)
+        output, of, share, relative = "", "mean", np.inf, np.inf
+        try:
+            found: Found | None = Found(study, inputs, recorder, centre)
+        except SolveError:
+            found = None
+        if found is not None and found.errors.evaluations.ok.sum() > 1:
+            goal, data = study.goal, found.dataset
+            sizes = goal.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
+            shares = Z * found.doubts / (goal.tolerance * sizes)
+            row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
+            output, of, share = recorder.outputs[column], ("mean", "standard deviation")[row], float(shares.max())
+            relative = float((np.nan_to_num(np.abs(data["nominal_mesh_error"].to_numpy())) / sizes[0]).max())
+        return Assessed(study.spec.unknowns, _cells(study), share, output, of, relative, recorder.solves, recorder.seconds)
+
+    found = ensemble.run(model, task, checkpoint=checkpoint, blocks=study.parallel.blocks)
+    result: Assessed = ensemble.world.bcast(found)
+    return result
+
+
+def _line(one: Assessed) -> str:
+    if one.share == np.inf:
+        return f"mesh of {one.unknowns:,} unknowns: too coarse for an estimate of its error"
+    return f"mesh of {one.unknowns:,} unknowns: takes {one.share:.2g} of the tolerance ({one.of} of {one.output})"
+
+
+# --- which mesh is next ----------------------------------------------------------------------------------------------
+
+
+def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, str]:
+    """Return the model on the next mesh, or None where this one is taken, and why that is so."""
+    now = meshes[-1]
+    takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.2g} % of the tolerance once corrected"
+    how, words = refinement(study)
+    if not how:
+        return None, f"{takes}; it {words}" if now.share > KEPT else takes
+    if how == "adapt":
+        if now.share <= KEPT:
+            return None, takes
+        wanted = float(np.clip(now.relative * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
+        return _adapting(study, 0.1 if now.share == np.inf else wanted), ""
+    if len(meshes) > MOST_MESHES and now.share > KEPT:
+        return None, f"{takes}, and {len(meshes)} meshes are enough"
+    factors = [_factor(meshes[0].cells, one.cells) for one in meshes]
+    rate = _rate(meshes, factors)
+    ways = list(_ways(study, now.share, rate))
+    if not ways:
+        limit = f"finer meshes would take more than accuracy.memory = {study.accuracy.memory:,.0f} MiB"
+        return None, f"{takes}; {limit}"
+    enough = [way for way in ways if way.share <= (KEPT if way.times == 1 else AIM)]
+    best = min(enough or ways[-1:], key=lambda way: way.seconds)
+    if best.times == 1:
+        return None, takes if enough else f"{takes}; finer meshes would take more than accuracy.memory"
+    if len(meshes) == 1 and best.times > FAR:  # a mesh between them costs little, and tells the rate
+        best = next(way for way in ways if way.times >= best.times**0.5)
+    return best.model, ""
+
+
+def _cells(study: Study) -> tuple[int, ...]:
+    return tuple(getattr(study.model.body, "cells", ()))  # type: ignore[attr-defined]
+
+
+def _factor(before: Sequence[int], after: Sequence[int]) -> float:
+    """By what the longest edges of cells have become shorter."""
+    return min(n / m for m, n in zip(before, after, strict=True))
+
+
+def _rate(meshes: Sequence[Assessed], factors: Sequence[float]) -> float:
+    """The rate at which shares fall with the size of cells, by the last two meshes."""
+    known = [(f, one.share) for f, one in zip(factors, meshes, strict=True) if np.isfinite(one.share) and one.share > 0]
+    if len(known) < 2:
+        return RATE
+    (coarse, before), (fine, after) = known[-2:]
+    return float(np.clip(np.log(before / after) / np.log(fine / coarse), *RATES))
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A mesh that might be taken, what it would take of the tolerance, and the predicted time (s) of the study on it."""
+
+    times: float
+    model: ModelSpec
+    share: float
+    seconds: float
+
+
+def _ways(study: Study, share: float, rate: float) -> Iterator[_Way]:
+    """Go through the meshes with more and more cells for which there is memory, from the given one on."""
+    few, power = SAMPLES[study.method.kind in ("automatic", "chaos") and study.inputs.independent]
+    seen, times = set[int](), 1.0
+    while times <= LARGEST:
+        try:
+            model = study.model if times == 1 else study.model.finer(times)
+        except ValueError:  # too large
+            return
+        other = study.of(model)
+        times *= STEP
+        if other.spec.unknowns in seen:
+            continue
+        seen.add(other.spec.unknowns)
+        cost, estimating = times_of(other.spec), other.spec.mesh_error_cost()
+        assert estimating is not None
+        if cost.bytes + estimating.bytes > MIB * study.accuracy.memory and model is not study.model:
+            return
+        finer = _factor(_cells(study), _cells(other))
+        then = AIM if share == np.inf and finer > DOUBLED else share / finer**rate
+        samples = few / max(1 - then**2, 0.05) ** (power / 2)
+        estimates = estimating.once + FEWEST * (cost.sample + estimating.seconds)
+        yield _Way(1.0 if model is study.model else finer, model, then, cost.first + samples * cost.sample + estimates)
+
+
+def _adapting(study: Study, tolerance: float) -> ModelSpec:
+    """Return the model with a mesh that is refined until its relative error is so much, or memory ends."""
+    model: Any = study.model
+    most = model.unknowns
+    while most < 10**7:
+        asked = Adapt(tolerance=tolerance, unknowns=int(most * STEP) + 1)
+        if largest_bytes(model.model_copy(update={"adapt": asked})) > MIB * study.accuracy.memory:
+            break
+        most = asked.unknowns
+    found: ModelSpec = model.model_copy(update={"adapt": Adapt(tolerance=tolerance, unknowns=most)})
+    return found

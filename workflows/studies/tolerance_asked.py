@@ -1,0 +1,114 @@
+"""What a study says of one tolerance for all errors before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from forward.model import Finding, ModelError
+from forward.scalars import Mistake
+from uq.accuracy.goal import LEAST, OF_SOLVER
+from uq.inputs.sampling import power_of_two
+from uq.methods.stopping import UNASKED
+
+if TYPE_CHECKING:
+    from workflows.studies.sampling import Study
+
+AUTOMATIC = "automatic"
+SCRAMBLES = 16  # of quasi-Monte Carlo, by default
+AMOUNTS = ("samples", "tolerance", "budget_seconds")
+SOLVES = 10_000  # most, by default
+# Methods that stop at a goal, and so need no number of samples.
+AIMING = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
+
+
+def completed(blocks: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the blocks of a study, with what its tolerance decides: a method, or the most samples of the given one."""
+    accuracy = blocks.get("accuracy")
+    if not isinstance(accuracy, Mapping) or accuracy.get("tolerance") is None:
+        return blocks
+    method = blocks.get("method")
+    if method is None:
+        return {**blocks, "method": {"kind": AUTOMATIC}}
+    if not isinstance(method, Mapping) or method.get("kind") not in AIMING or method.get("fit") == "projection":
+        return blocks
+    most = accuracy.get("solves", SOLVES)
+    if not isinstance(most, int) or any(method.get(name) is not None for name in AMOUNTS):
+        return blocks
+    if method["kind"] == "quasi-monte-carlo":
+        scrambles = method.get("scrambles", SCRAMBLES)
+        if not isinstance(scrambles, int) or scrambles < 1:
+            return blocks
+        most = scrambles * power_of_two(most // scrambles)
+    return {**blocks, "method": {**method, "samples": most}}
+
+
+def mistakes(study: Study) -> Iterator[Mistake]:
+    """Find what cannot be asked together with a tolerance, or by it."""
+    asked, method = study.accuracy.tolerance, study.method
+    if asked is None:
+        if method.kind == AUTOMATIC:
+            yield ("method", "kind"), UNASKED, method.kind
+        return
+    if not method.aims:
+        message = (
+            "does not stop at accuracy.tolerance, expected no block [method], or one of the kinds "
+            f"{', '.join(AIMING)}{' by regression' if method.kind == 'chaos' else ''}"
+        )
+        yield ("method", "kind"), message, method.kind
+    if getattr(method, "tolerance", None) is not None:
+        message = "another tolerance than accuracy.tolerance, which counts all errors; expected one of the two"
+        yield ("method", "tolerance"), message, getattr(method, "tolerance")  # noqa: B009
+    if asked < LEAST:
+        yield ("accuracy", "tolerance"), f"below what rounding leaves of results, expected at least {LEAST:g}", asked
+    solver = study.model.solver_tolerance
+    normal = type(study.model).model_fields.get("solver")
+    if solver is not None and normal is not None and solver > max(OF_SOLVER * asked, normal.default.tolerance):
+        message = (
+            f"below what the solver reaches (model.solver.tolerance = {solver:g}), expected at least "
+            f"{solver / OF_SOLVER:g}, or a smaller model.solver.tolerance"
+        )
+        yield ("accuracy", "tolerance"), message, asked
+
+
+def refinement(study: Study) -> tuple[str, str]:
+    """Return how the mesh of a study could be refined, "cells", "adapt" or "", and the same in words."""
+    model = study.model
+    if model.adaptive:
+        return "", "is refined as model.adapt says, and no further"
+    body = getattr(model, "body", None)
+    objection = None
+    try:
+        model.finer(2.0)
+    except ModelError as error:
+        objection = str(error)
+    except ValueError:
+        objection = "it would be too large"
+    if objection is None and body.cell != "tetrahedron":
+        return "cells", "gets more cells along all edges, if its error is too large"
+    if body.cell == "tetrahedron" and not any(field.basis != "modes" for field in getattr(model, "fields", ())):
+        return "adapt", "is refined where its error arises, if that is too large"
+    return "", f"is not refined: {objection}"
+
+
+def findings(study: Study) -> Iterator[Finding]:
+    """Say what of the errors the tolerance cannot hold."""
+    if not study.spec.meshed:
+        return
+    if not study.estimates:
+        why = "it is not estimated" if study.accuracy.mesh_error else "accuracy.mesh_error = false"
+        yield Finding("warning", f"accuracy.tolerance does not count the error of the mesh: {why}.")
+        return
+    unknown = [output.name for output in study.spec.outputs if not getattr(output, "estimable", True)]
+    if unknown:
+        text = f"accuracy.tolerance does not count the error of the mesh in {', '.join(unknown)}, of which there is no estimate."
+        yield Finding("warning", text)
+    how, words = refinement(study)
+    if not how and not study.model.adaptive:
+        instead = (
+            "Take a mesh of tetrahedra, which is refined, or a finer one of hexahedra; the levels of "
+            "multilevel-monte-carlo show what that is worth."
+            if "hexahedra" in words
+            else "Take a finer mesh if its error turns out too large."
+        )
+        yield Finding("note", f"accuracy.tolerance: the mesh {words}. {instead}")

@@ -1,0 +1,166 @@
+"""The sampling of a study with one tolerance for all errors, on a mesh that is fine enough if any may be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import Finding, FloatArray, SolveError
+from uq.accuracy.effects import with_mesh_errors
+from uq.accuracy.goal import Goal
+from uq.estimators.moments import half_width
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.findings import add
+from uq.surrogates.linearisation import linearise
+from workflows.studies.tolerance import Found, doubts, history
+from workflows.studies.tolerance_asked import refinement
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from uq.inputs.random_parameters import Inputs
+    from uq.methods.method import Method
+    from workflows.studies.sampling import Study
+
+ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
+SOURCES = ("mesh", "sampling", "solver", "total")
+ESTIMATED = ("mean", "std")
+IN_WORDS = {"mean": "mean", "std": "standard deviation"}
+
+
+def within(
+    study: Study,
+    method: Method,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    recorders: dict[str, Recorder],
+    estimates: list[Evaluations],
+    directory: Path,
+) -> xr.Dataset:
+    """Sample until mean and standard deviation of every output are within the tolerance, with their mesh errors.
+
+    What is not known of the error of the mesh is known first by tangents, and better once outputs are sampled: then
+    sampling goes on if it needs to. It finds its solves where they are stored.
+
+    Parameters
+    ----------
+    recorders, estimates
+        Of the job, where evaluations are kept.
+    directory
+        Of the results: how the mesh was found stands there.
+    """
+    goal, mesh = study.goal, None
+    if study.estimates:
+        try:
+            mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate))
+        except SolveError as error:
+            unknown: tuple[Finding, ...] = (Finding("warning", f"The error of the mesh is not estimated: {error}."),)
+        else:
+            unknown = ()
+            estimates.append(mesh.errors.evaluations)
+            goal = replace(goal, mesh=mesh.doubts)
+    units = {output.name: output.unit for output in study.model.outputs}
+    for _ in range(ATTEMPTS):
+        recorders["/"] = Recorder(evaluate)
+        found = method.until(inputs, recorders["/"], goal)
+        if mesh is None:
+            break
+        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, units)
+        now = replace(goal, mesh=doubts(found))
+        settled = now.reached(_moments(found), half_width(found)) <= 1
+        goal = now
+        if settled:
+            break
+    if study.estimates:
+        add(found, *unknown)
+    parts = goal.parts(_moments(found), half_width(found))
+    told = _told(study, found, goal, parts, history(directory))
+    found.attrs["accuracy"] = json.dumps(told, ensure_ascii=False)
+    add(found, *_findings(study, told))
+    return found
+
+
+def _moments(dataset: xr.Dataset) -> dict[str, FloatArray]:
+    return {name: dataset[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error")}
+
+
+def _told(
+    study: Study, found: xr.Dataset, goal: Goal, parts: dict[str, FloatArray], before: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Say what was asked for and reached, by what, and why; nothing that depends on the machine."""
+    names = [str(name) for name in found["output"].values]
+    chosen = json.loads(found.attrs.pop("chosen", "{}")) or {"method": study.method.kind, "reasons": []}
+    sizes = goal.sizes(found["mean"].to_numpy(), found["std"].to_numpy())
+    row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
+    meshes = [] if before is None else before["meshes"]
+    return {
+        "tolerance": goal.tolerance,
+        "reached": float(goal.tolerance * parts["total"][row, column]),
+        "kept": bool((parts["total"] <= 1).all()),
+        "worst": {"output": names[column], "of": IN_WORDS[ESTIMATED[row]]},
+        "shares": {source: float(parts[source][row, column]) for source in SOURCES},
+        "method": chosen["method"],
+        "reasons": [*([_of_mesh(before)] if before is not None else []), *chosen["reasons"]],
+        "mesh": {
+            "unknowns": study.spec.unknowns,
+            "tried": [{name: one[name] for name in ("unknowns", "cells", "share")} for one in meshes],
+        }
+        if study.spec.meshed
+        else None,
+        "outputs": {
+            name: {
+                estimate: {
+                    "value": float(found[f"{estimate}_corrected" if _corrected(found, i) else estimate][i]),
+                    "error": float(goal.tolerance * parts["total"][k, i] * sizes[k, i]),
+                    "relative_to": float(sizes[k, i]),
+                    **{source: float(parts[source][k, i]) for source in SOURCES},
+                }
+                for k, estimate in enumerate(ESTIMATED)
+            }
+            for i, name in enumerate(names)
+        },
+    }
+
+
+def _corrected(found: xr.Dataset, output: int) -> bool:
+    """Whether the error of the mesh was estimated of an output."""
+    return "mean_corrected" in found and bool(np.isfinite(found["mean_corrected"][output]))
+
+
+def _of_mesh(before: dict[str, Any]) -> str:
+    meshes = before["meshes"]
+    why = before["why"]
+    if len(meshes) == 1:
+        return f"The mesh is the given one: {why}."
+    shares = " → ".join("?" if one["share"] is None else f"{100 * one['share']:.2g} %" for one in meshes)
+    unknowns = " → ".join(f"{one['unknowns']:,}" for one in meshes)
+    return f"The mesh was refined, {unknowns} unknowns: it took {shares} of the tolerance; {why}."
+
+
+def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
+    """Say whether the tolerance is kept, and if not, what keeps it from being so."""
+    worst, shares = told["worst"], told["shares"]
+    of = f"the {worst['of']} of {worst['output']}"
+    taken = ", ".join(f"{source} {100 * shares[source]:.2g} %" for source in SOURCES[:-1] if shares[source] > 0)
+    if told["kept"]:
+        text = (
+            f"All errors together are within accuracy.tolerance = {told['tolerance']:g}: at most {told['reached']:.2g}, "
+            f"of {of} (of the tolerance: {taken})."
+        )
+        yield Finding("note", text)
+        return
+    text = (
+        f"accuracy.tolerance = {told['tolerance']:g} is not reached: {of} is known to {told['reached']:.2g} "
+        f"(of the tolerance: {taken})."
+    )
+    if shares["mesh"] > 1 - shares["solver"]:
+        how, words = refinement(study)
+        why = f" The mesh {words}." if not how else f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
+    else:
+        why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."
+    yield Finding("warning", text + why)
