@@ -300,14 +300,13 @@ class Hyperelastic(ModelSpec):
         Raises
         ------
         ModelError
-            If the mesh is one of a file, which is not made anew, or coefficients of fields are those of its vertices.
+            If the mesh is divided already, or coefficients of fields are those of its vertices.
         """
         objection = adaptive.of_fields(self)
         if objection is not None:
             raise ModelError(objection)
         if isinstance(self.body, MeshFile):
-            message = f"{'hexahedra' if self.body.cell == 'hexahedron' else 'meshes'} of a file are not made finer"
-            raise ModelError(message)
+            return self.refined(math.ceil(math.log2(times) - 1e-9))
         return self.model_copy(update={"body": self.body.with_cells(times)})
 
     @property

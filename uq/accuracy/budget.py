@@ -1,10 +1,13 @@
-"""How many estimates of the error of the mesh a study affords; apart, since plans ask for it."""
+"""How many estimates of the error of the mesh a study affords, and how tolerances are split; plans ask for it."""
 
 from __future__ import annotations
 
 SHARE = 0.2  # of the solves of a study that estimates may cost
 COST = 4  # of an estimate with its solution, in solves
 FEWEST, MOST = 3, 16  # estimates: the fewest of which one can be left out of a line, and more than are needed
+
+OF_SOLVER = 0.01  # of a tolerance for all errors: what the solver may take
+LEAST = 1e-9  # such tolerance: below, rounding decides
 
 
 def estimates_for(solves: int) -> int:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 SMALL = 1e-3  # of the largest estimate of a kind: smaller ones are held to a tolerance of this
 LEFT = 1 / 3  # of the error of a mesh that takes more than all: sampling need not be better
-OF_SOLVER = 0.01  # of the tolerance: what the solver may take
-LEAST = 1e-9  # tolerance: below, rounding decides
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ class Goal:
             "mesh": Z * self.mesh,
         }
         # Where all is zero, so is the error.
-        shares = {name: np.divide(e, allowed, out=np.zeros_like(e), where=e > 0) for name, e in errors.items()}
+        shares = {name: np.divide(e, allowed, out=np.zeros_like(e), where=e != 0) for name, e in errors.items()}
         shares["solver"] = np.full_like(allowed, self.solver / self.tolerance)
         shares["total"] = np.hypot(shares["sampling"], shares["mesh"]) + shares["solver"]
         return shares

@@ -158,7 +158,9 @@ class Automatic(Method):
             raise
         assert found is not None
         (first, before), (count, last) = trail[0], trail[-1]
-        fell = f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
+        fell = (
+            f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
+        )
         between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
         if last <= 1 or other is None or goal.most - count < WORTH * count:
             what = "fitted to values and gradients" if gradients else "fitted to values"

@@ -149,7 +149,7 @@ class Chaos(Amount):
 
     def expand(self, inputs: Inputs, evaluate: Evaluate) -> Expanded:
         """Solve at the points of the design and fit; errors as in `run`."""
-        for found in self.rounds(inputs, evaluate):  # noqa: B007 - the last one counts
+        for found in self.rounds(inputs, evaluate):
             if self.met(found.reached):
                 break
         limit = self.planned(len(inputs.names)) - 1
@@ -157,7 +157,7 @@ class Chaos(Amount):
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
         """Solve until the claimed errors are those of a goal, or there are no more solves; errors as in `run`."""
-        for found in self.rounds(inputs, evaluate, self.most(goal)):  # noqa: B007
+        for found in self.rounds(inputs, evaluate, self.most(goal)):
             if goal.reached(found.regression.estimates()) <= 1:
                 break
         return self.reported(evaluate, found, f"{found.amount}: {found.error}")
@@ -212,7 +212,9 @@ class Chaos(Amount):
             count = target
             evaluations = merge(found)
             data = Data.of(evaluations, inputs, weights)
-            yield Expanded(centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data)))
+            yield Expanded(
+                centre, evaluations, Regression(inputs, bases, largest, data, fit_best(bases, largest, data))
+            )
             paid = count + self.affordable(evaluate.solves, evaluate.seconds)
             target = int(min(limit, np.ceil(GROWTH * count), paid))
 

@@ -160,9 +160,7 @@ class QuasiMonteCarlo(MonteCarlo):
         """
         return self._sampled(inputs, evaluate)
 
-    def until(
-        self, inputs: Inputs, evaluate: Evaluate, goal: Goal, expanded: Deviations | None = None
-    ) -> xr.Dataset:
+    def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal, expanded: Deviations | None = None) -> xr.Dataset:
         """Sample until errors are those of a goal; an expansion that is known already may be the control of "chaos".
 
         Its samples must not be among those of the scrambles. Results and errors as in `run`.

@@ -154,7 +154,9 @@ def fit_deviations(
     wanted = Projections(largest, centre.state, True, None, None) if fields and centre.state.size else None
     evaluations = evaluate(Request(points, tangents=True, fields=wanted, start=centre.prediction))
     data = Data.of(evaluations, inputs, None)
-    return deviations(Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data)), evaluations, centre)
+    return deviations(
+        Regression(inputs, candidates, largest, data, fit_best(candidates, largest, data)), evaluations, centre
+    )
 
 
 def deviations(regression: Regression, evaluations: Evaluations, centre: Linearisation) -> Deviations:

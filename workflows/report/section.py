@@ -127,6 +127,7 @@ SECTIONS = Kinds(
     {
         "header": f"{_HERE}.header:Header",
         "findings": f"{_HERE}.findings:Findings",
+        "tolerance": f"{_HERE}.tolerance:Tolerance",
         "error-budget": f"{_HERE}.error_budget:ErrorBudget",
         "synthetic-data": f"{_HERE}.synthetic_data:SyntheticData",
         "model": f"{_HERE}.model:Model",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 DIGITS = 2, 8  # significant digits of errors, and most of values
 PARAMETERS = 12  # of which derivatives are listed
 ESTIMATES = {"mean": "", "std": "std_"}  # first part of the names of their mesh and total errors
+WIDTH = 24  # letters of a bar
 Row = Sequence[str]
 
 
@@ -30,6 +31,7 @@ def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any])
     ]
     lines += inverted(summary)
     lines += _outputs(dataset, summary.get("outputs", {}))
+    lines += _bars(summary)
     first = next(iter(dataset.output.values)) if "output" in dataset.coords else ""
     for name, rows in summary.get("methods", {}).items():
         last = rows[-1]
@@ -71,6 +73,22 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
             sampling = values[f"{name}_error"]
             rows.append((f"  {name}", _value(values[name], sampling), _error(sampling), *of_mesh))
     yield from _table(rows)
+
+
+def _bars(summary: Mapping[str, Any]) -> list[str]:
+    """Draw what each error takes of a tolerance for all of them, and say what it costs and why."""
+    told = summary.get("accuracy")
+    if told is None:
+        return []
+    shares, costs = told["shares"], summary.get("accuracy_seconds", {})
+    worst = f"the {told['worst']['of']} of {told['worst']['output']}"
+    kept = "kept" if told["kept"] else "NOT kept"
+    lines = [f"tolerance {told['tolerance']:g}: {kept}; {worst} is known to {told['reached']:.2g}"]
+    for source, share in shares.items():
+        full = min(WIDTH, round(WIDTH * share))
+        cost = f"{costs[source]:8.3g} s of CPU" if source in costs else ""
+        lines.append(f"  {source:9} {'█' * full}{'·' * (WIDTH - full)} {100 * share:5.1f} %{cost}".rstrip())
+    return [*lines, *(f"  {reason}" for reason in told["reasons"])]
 
 
 def _line(output: str, values: Mapping[str, Any], unit: str) -> str:

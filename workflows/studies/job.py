@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, merge
 
@@ -72,6 +72,8 @@ class MethodJob:
         Estimates of the error of the mesh, once they are done; not among what the method has evaluated.
     passing
         Names of other models of which only the last one is kept in memory.
+    meshes_before
+        Meshes whose errors were estimated before this one was taken, as `workflows.studies.tolerance` keeps them.
     """
 
     model: ForwardModel
@@ -85,6 +87,7 @@ class MethodJob:
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
     estimates: Sequence[Evaluations] = ()
     passing: frozenset[str] = frozenset()
+    meshes_before: Sequence[Mapping[str, Any]] = ()
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:

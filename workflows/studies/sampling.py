@@ -14,8 +14,7 @@ from forward.model import Finding, ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from uq.accuracy.budget import estimates_for
-from uq.accuracy.goal import OF_SOLVER, Goal
+from uq.accuracy.budget import OF_SOLVER, estimates_for
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
@@ -23,7 +22,6 @@ from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
-from workflows.studies import tolerance_asked
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -33,6 +31,9 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.evaluate import Evaluations
     from workflows.studies.job import Job
+
+
+OF_TOLERANCE = "workflows.studies.tolerance_asked"  # what a tolerance of all errors decides and forbids
 
 
 class Study(StudyKind):
@@ -83,14 +84,6 @@ class Study(StudyKind):
         spec, asked = self.model.over(ranges(self.parameters)), self.accuracy.tolerance
         solver = spec.solver_tolerance
         return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
-
-    @property
-    def goal(self) -> Goal:
-        """What the tolerance for all errors asks of estimates, before anything is known of the mesh."""
-        assert self.accuracy.tolerance is not None
-        units = [output.unit for output in self.spec.outputs]
-        solver = self.spec.solver_tolerance or 0.0
-        return Goal.of(self.accuracy.tolerance, units, self.accuracy.solves, solver)
 
     @property
     def sampled(self) -> Sampled:
@@ -149,7 +142,7 @@ class Study(StudyKind):
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
         found = (*self.model.findings_over(ranges(self.parameters)), *of_draws, *self._of_estimates())
-        return (*found, *tolerance_asked.findings(self)) if self.accuracy.tolerance is not None else found
+        return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
         if self._estimating and self._too_large is not None:
@@ -226,7 +219,9 @@ class Study(StudyKind):
     @classmethod
     def _choose_method(cls, value: Any) -> Any:
         """Say what a tolerance for all errors leaves out of a file: the method, or how many samples it takes."""
-        return tolerance_asked.completed(value) if isinstance(value, dict) else value
+        accuracy = value.get("accuracy") if isinstance(value, dict) else None
+        asked = isinstance(accuracy, dict | Accuracy) and "tolerance" in dict(accuracy)
+        return named(f"{OF_TOLERANCE}:completed")(value) if asked else value
 
     @model_validator(mode="before")
     @classmethod
@@ -251,7 +246,8 @@ class Study(StudyKind):
         if not unfit:
             yield from self._mistakes_of_models()
         yield from self._mistakes_of_parameters()
-        yield from tolerance_asked.mistakes(self)
+        if self.accuracy.tolerance is not None or self.method.kind == "automatic":
+            yield from named(f"{OF_TOLERANCE}:mistakes")(self)
         not_sampled = list(self.spec.mistakes_of_samples())
         yield from not_sampled
         if self.parallel.ranks_per_model > 1 and not self.spec.shareable:

@@ -80,7 +80,17 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         return with_random_fields(found, factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
-    return MethodJob(model, others, task, recorders, labelled, node_volumes=volumes, estimates=estimates)
+    before = named("workflows.studies.tolerance:meshes_before")(directory) if study.accuracy.tolerance else ()
+    return MethodJob(
+        model,
+        others,
+        task,
+        recorders,
+        labelled,
+        node_volumes=volumes,
+        estimates=estimates,
+        meshes_before=before,
+    )
 
 
 def _with_mesh_errors(
@@ -158,12 +168,18 @@ def with_stability(study: Study, dataset: xr.Dataset, evaluations: Evaluations) 
 def of_estimates(study: Study, job: Job) -> dict[str, Any]:
     """Number and time of the estimates of the error of the mesh, which `evaluations` does not count."""
     assert isinstance(job, MethodJob)
-    if not job.estimates:
-        return {}
-    every = merge(job.estimates)
-    seconds = float(every.seconds.sum()) * study.parallel.ranks_per_model
-    failed = len(every.failures)
-    return {"mesh_error": {"estimates": len(every.points), "failed": failed, "cpu_seconds": seconds}}
+    told: dict[str, Any] = {}
+    seconds = 0.0
+    if job.estimates:
+        every = merge(job.estimates)
+        seconds = float(every.seconds.sum()) * study.parallel.ranks_per_model
+        told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
+    if study.accuracy.tolerance is not None:
+        sampled = sum(float(found.seconds.sum()) for found in job.evaluations.values())
+        earlier = sum(one["seconds"] for one in job.meshes_before)
+        ranks = study.parallel.ranks_per_model
+        told["accuracy_seconds"] = {"sampling": sampled * ranks, "mesh": seconds + earlier * ranks}
+    return told
 
 
 def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START
 from forward.machine import MIB, compiled_forms
 from uq.evaluation.evaluate import OWN
 from workflows.config.priors import ranges
+from workflows.studies import tolerance_asked
 from workflows.studies.predictions import duration, times_of
 
 if TYPE_CHECKING:
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 def plan(study: Study, rank_groups: int) -> list[str]:
     """Say what is sampled, how often, and how long that will take."""
     method, spec, planned = study.method, study.spec, study.planned
-    up_to = "up to " if method.open_ended and not method.undecided else ""
+    open_ended = method.open_ended or study.accuracy.tolerance is not None
+    up_to = "up to " if open_ended and not method.undecided else ""
     later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
     lines = [
         f"method      {method.kind}",
@@ -33,6 +35,7 @@ def plan(study: Study, rank_groups: int) -> list[str]:
         f"parameters  {', '.join([*study.parameters, *_in_series(spec.coefficients)])}",
         f"outputs     {', '.join(output.name for output in spec.returned)}",
         f"solves      {up_to}{planned:,}{later}",
+        *(tolerance_asked.plan(study) if study.accuracy.tolerance is not None else ()),
     ]
     if spec.cost() is None:  # the time of a solve is unknown
         return lines

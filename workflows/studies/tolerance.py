@@ -1,11 +1,11 @@
 """A mesh that is fine enough for a tolerance of all errors: found before a study samples, and kept with its results.
 
-On each mesh, the model is linearised at the mean of its parameters and the error of the mesh is estimated at three: what
-is then not known of the error of means and standard deviations, which is left when they are corrected, is held against
-the tolerance. The mesh that is given is kept where that leaves enough for sampling. Otherwise cells are divided so that
-it will, by the rate at which errors fall; of all such numbers of cells the cheapest is taken, by predicted times: those
-of samples, whose number grows as a mesh takes more of the tolerance, and of estimates. Tetrahedra are refined where
-errors arise (`forward.fem.adapt`).
+On each mesh, the model is linearised at the mean of its parameters and the error of the mesh is estimated at a few:
+what is then not known of the error of means and standard deviations, which is left when they are corrected, is held
+against the tolerance. The mesh that is given is kept where that leaves enough for sampling. Otherwise cells are divided
+so that it will, by the rate at which errors fall; of all such numbers of cells (and of estimates, which are few) the
+cheapest is taken, by predicted times: those of samples, whose number grows as a mesh takes more of the tolerance, and
+of estimates. Tetrahedra are refined where errors arise (`forward.fem.adapt`).
 
 All of this depends on the study only. Blocks of solves are those of the study on that mesh, which finds them again.
 """
@@ -13,7 +13,8 @@ All of this depends on the study only. Blocks of solves are those of the study o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,8 +24,7 @@ import numpy as np
 from forward.adapt import OF_ROUNDING, Adapt, largest_bytes
 from forward.machine import MIB
 from forward.model import FloatArray, SolveError
-from uq.accuracy.budget import FEWEST
-from uq.accuracy.effects import with_mesh_errors
+from uq.accuracy.effects import DOUBT, UNCALIBRATED, with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
 from uq.estimators.moments import Z
 from uq.evaluation.checkpoint import Checkpoint
@@ -36,7 +36,7 @@ from workflows.results.directory import write_text
 from workflows.run import own_code
 from workflows.run.version import version
 from workflows.studies.predictions import times_of
-from workflows.studies.tolerance_asked import refinement
+from workflows.studies.tolerance_asked import goal, refinement
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,6 +56,8 @@ STEP = 1.1  # ratio of the numbers of cells that are looked at
 FAR = 2.0  # times as many cells: farther, an assumed rate says too little
 DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
 LARGEST = 16.0  # times as many cells along an edge
+COUNTS = 3, 4, 6, 9  # estimates
+FALL = 1.5  # power of their number with which what they leave open falls (2 in two parameters)
 POINTS = 4096  # at which tangents are drawn
 SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
 
@@ -68,10 +70,15 @@ class Assessed:
     ----------
     unknowns, cells
         Of the mesh; the cells along each edge, where a body has such.
+    estimates
+        Number of estimates of its error.
     share
         Largest part of the tolerance that it takes; infinite where that cannot be estimated.
     output, of
         Of which estimate of which output that is.
+    close, between
+        Parts of the tolerance that each estimate of each output (2, m) takes, since estimates of the error are not
+        exact, and since there are few; empty where there are none.
     relative
         Largest error of an output at the mean parameters, relative to it.
     solves, seconds
@@ -80,9 +87,12 @@ class Assessed:
 
     unknowns: int
     cells: tuple[int, ...]
+    estimates: int
     share: float
     output: str
     of: str
+    close: list[list[float]]
+    between: list[list[float]]
     relative: float
     solves: int
     seconds: float
@@ -90,41 +100,53 @@ class Assessed:
     @property
     def document(self) -> dict[str, Any]:
         """As it is written down."""
-        return {name: None if value == np.inf else value for name, value in vars(self).items()}
+        return {name: None if value is np.inf else value for name, value in vars(self).items()}
 
-    @classmethod
-    def read(cls, document: Mapping[str, Any]) -> Assessed:
-        """Return what was written down."""
-        return cls(**{name: np.inf if value is None else value for name, value in document.items()})
+    def share_with(self, factor: float, estimates: int) -> float:
+        """Predict the share where errors are so many times smaller, and with another number of estimates."""
+        if not self.close:
+            return np.inf
+        few = (self.estimates / estimates) ** FALL
+        return float(np.hypot(self.close, few * np.array(self.between)).max() / factor)
 
 
 def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
     """Return the study on a mesh that is fine enough, or on the finest that there may be; collective."""
     world, path = ensemble.world, directory.resolve() / FILE
     told = world.bcast(_read(path) if world.rank == 0 else None)
-    first, meshes, why = study, list[Assessed](), ""
+    first, meshes, count = study, list[Assessed](), COUNTS[0]
     while told is None:
-        meshes.append(_assessed(study, ensemble, directory))
+        meshes.append(_assessed(study, ensemble, directory, count))
         say(_line(meshes[-1]))
-        finer, why = _next(study, first, meshes)
+        finer, count, why = _next(study, meshes)
         if finer is None:
-            told = {"meshes": [one.document for one in meshes], "why": why, "body": _body(study, first)}
+            told = {
+                "meshes": [one.document for one in meshes],
+                "why": why,
+                "body": _body(study, first),
+                "estimates": count,
+            }
             if world.rank == 0:
                 write_text(path, json.dumps(told, indent=2, ensure_ascii=False) + "\n")
             return study
         study = _refined(study, finer, ensemble, directory, say)
-    if "cells" in told["body"]:
-        body = study.model.body  # type: ignore[attr-defined]
-        cells = body.model_validate(body.model_dump() | {"cells": told["body"]["cells"]})
-        return study.of(study.model.model_copy(update={"body": cells}))
-    if "adapt" in told["body"]:
-        return _refined(study, _adapting(study, told["body"]["adapt"]), ensemble, directory, say)
-    return study
+    changed = told["body"]
+    if "adapt" in changed:
+        return _refined(study, _adapting(study, changed["adapt"]), ensemble, directory, say)
+    body = study.model.body  # type: ignore[attr-defined]
+    body = body.model_validate(body.model_dump(exclude={"contents"}) | changed)
+    return study.of(study.model.model_copy(update={"body": body})) if changed else study
 
 
 def history(directory: Path) -> dict[str, Any] | None:
     """Return how the mesh of a study was found, which stands beside its results; None where it was not looked for."""
     return _read(directory.resolve() / FILE)
+
+
+def meshes_before(directory: Path) -> list[dict[str, Any]]:
+    """Return the meshes that were looked at before the last one, the estimates on which are those of the study."""
+    told = history(directory)
+    return [] if told is None else list(told["meshes"][:-1])
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -141,12 +163,11 @@ def _body(study: Study, first: Study) -> dict[str, Any]:
         return {}
     if study.model.adaptive:
         return {"adapt": study.model.adapt.tolerance}  # type: ignore[attr-defined]
-    return {"cells": study.model.body.cells}  # type: ignore[attr-defined]
+    body = study.model.body  # type: ignore[attr-defined]
+    return {"levels": body.levels} if hasattr(body, "levels") else {"cells": body.cells}
 
 
-def _refined(
-    study: Study, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]
-) -> Study:
+def _refined(study: Study, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Study:
     """Return the study of a model, whose mesh may have to be refined first; collective."""
     if not model.unrefined:
         return study.of(model)
@@ -168,15 +189,19 @@ class Found:
     doubts
         What is not known of the error of means and standard deviations (2, m), by what tangents say of the outputs;
         zero where there is no estimate.
+    close
+        The part of it that more estimates would leave (2, m).
     dataset
         Means and standard deviations by tangents, with these errors.
     """
 
-    def __init__(self, study: Study, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
+    def __init__(
+        self, study: Study, inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int = COUNTS[0]
+    ) -> None:
         fields = getattr(study.method, "fields", True) and centre.state.size > 0
         self.centre = centre
         self.errors: MeshErrors = estimate(
-            inputs, evaluate, centre, FEWEST, getattr(study.method, "seed", 0), fields=fields
+            inputs, evaluate, centre, count, getattr(study.method, "seed", 0), fields=fields
         )
         points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
         drawn = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
@@ -187,17 +212,23 @@ class Found:
         units = {output.name: output.unit for output in study.spec.outputs}
         self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, units)
         self.doubts = doubts(self.dataset)
+        errors = np.array([self.dataset[name].to_numpy() for name in ERRORS if name in self.dataset])
+        unknown = np.where(np.isfinite(self.errors.saturation) & self.errors.measured, DOUBT, UNCALIBRATED)
+        self.close = np.nan_to_num(unknown * np.abs(errors)) if len(errors) else np.zeros_like(self.doubts)
+
+
+ERRORS = "mesh_error", "std_mesh_error"
 
 
 def doubts(dataset: xr.Dataset) -> FloatArray:
-    """Return what is not known of the error of the mesh in means and standard deviations (2, m); zero if not estimated."""
-    names = ("mesh_error_doubt", "std_mesh_error_doubt")
+    """Return what is not known of the error of the mesh in means and standard deviations (2, m); zero without one."""
+    names = [f"{name}_doubt" for name in ERRORS]
     if names[0] not in dataset:
         return np.zeros((2, dataset.sizes["output"]))
     return np.nan_to_num(np.array([dataset[name].to_numpy() for name in names]))
 
 
-def _assessed(study: Study, ensemble: Ensemble, directory: Path) -> Assessed:
+def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> Assessed:
     """Estimate what the mesh of a study takes of the tolerance; collective."""
     checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]))
     model = ensemble.together(lambda: study.spec.build(ensemble.group, study.inputs.names))
@@ -205,19 +236,29 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path) -> Assessed:
     def task(evaluate: Evaluate) -> Assessed:
         recorder, inputs = Recorder(evaluate), study.inputs
         centre = linearise(inputs, recorder)
-        output, of, share, relative = "", "mean", np.inf, np.inf
-        try:
-            found: Found | None = Found(study, inputs, recorder, centre)
-        except SolveError:
-            found = None
+        found = None
+        with suppress(SolveError):
+            found = Found(study, inputs, recorder, centre, count)
+        shares, close, relative = np.full((2, 1), np.inf), None, np.inf
         if found is not None and found.errors.evaluations.ok.sum() > 1:
-            goal, data = study.goal, found.dataset
-            sizes = goal.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
-            shares = Z * found.doubts / (goal.tolerance * sizes)
-            row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
-            output, of, share = recorder.outputs[column], ("mean", "standard deviation")[row], float(shares.max())
+            asked, data = goal(study), found.dataset
+            sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
+            shares, close = (Z * part / (asked.tolerance * sizes) for part in (found.doubts, found.close))
             relative = float((np.nan_to_num(np.abs(data["nominal_mesh_error"].to_numpy())) / sizes[0]).max())
-        return Assessed(study.spec.unknowns, _cells(study), share, output, of, relative, recorder.solves, recorder.seconds)
+        row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
+        return Assessed(
+            study.spec.unknowns,
+            _cells(study),
+            count,
+            float(shares.max()),
+            recorder.outputs[column],
+            ("mean", "standard deviation")[row],
+            [] if close is None else close.tolist(),
+            [] if close is None else np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist(),
+            relative,
+            recorder.solves,
+            recorder.seconds,
+        )
 
     found = ensemble.run(model, task, checkpoint=checkpoint, blocks=study.parallel.blocks)
     result: Assessed = ensemble.world.bcast(found)
@@ -233,37 +274,43 @@ def _line(one: Assessed) -> str:
 # --- which mesh is next ----------------------------------------------------------------------------------------------
 
 
-def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, str]:
-    """Return the model on the next mesh, or None where this one is taken, and why that is so."""
+def _next(study: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, int, str]:
+    """Return the model on the next mesh and the number of estimates on it, and why that is so.
+
+    None in place of a model where the last mesh is taken.
+    """
     now = meshes[-1]
     takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.2g} % of the tolerance once corrected"
     how, words = refinement(study)
-    if not how:
-        return None, f"{takes}; it {words}" if now.share > KEPT else takes
-    if how == "adapt":
+    if how != "cells":
         if now.share <= KEPT:
-            return None, takes
-        wanted = float(np.clip(now.relative * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
-        return _adapting(study, 0.1 if now.share == np.inf else wanted), ""
+            return None, now.estimates, takes
+        more = [c for c in COUNTS if c > now.estimates and now.share_with(1.0, c) <= AIM]
+        if more:
+            return study.model, more[0], ""
+        if not how:
+            return None, now.estimates, f"{takes}; it {words}"
+        to = 0.1 if now.share == np.inf else float(np.clip(now.relative * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
+        return _adapting(study, to), COUNTS[0], ""
     if len(meshes) > MOST_MESHES and now.share > KEPT:
-        return None, f"{takes}, and {len(meshes)} meshes are enough"
-    factors = [_factor(meshes[0].cells, one.cells) for one in meshes]
-    rate = _rate(meshes, factors)
-    ways = list(_ways(study, now.share, rate))
-    if not ways:
-        limit = f"finer meshes would take more than accuracy.memory = {study.accuracy.memory:,.0f} MiB"
-        return None, f"{takes}; {limit}"
-    enough = [way for way in ways if way.share <= (KEPT if way.times == 1 else AIM)]
-    best = min(enough or ways[-1:], key=lambda way: way.seconds)
-    if best.times == 1:
-        return None, takes if enough else f"{takes}; finer meshes would take more than accuracy.memory"
+        return None, now.estimates, f"{takes}, and {len(meshes)} meshes are enough"
+    ways = list(_ways(study, now, _rate(meshes)))
+    here = [way for way in ways if way.times == 1 and way.estimates == now.estimates and way.share <= KEPT]
+    enough = [*here, *(way for way in ways if way.share <= AIM)]
+    best = min(enough, key=lambda way: way.seconds) if enough else min(ways, key=lambda way: way.share)
+    if best.times == 1 and best.estimates == now.estimates:
+        rest = "" if enough else f"; finer ones would take more than accuracy.memory = {study.accuracy.memory:,.0f} MiB"
+        return None, now.estimates, takes + rest
     if len(meshes) == 1 and best.times > FAR:  # a mesh between them costs little, and tells the rate
-        best = next(way for way in ways if way.times >= best.times**0.5)
-    return best.model, ""
+        between = next(way for way in ways if way.times >= best.times**0.5)
+        return between.model, COUNTS[0], ""
+    return best.model, best.estimates, ""
 
 
 def _cells(study: Study) -> tuple[int, ...]:
-    return tuple(getattr(study.model.body, "cells", ()))  # type: ignore[attr-defined]
+    """Cells along each edge, or how often those of a file are halved."""
+    body = study.model.body  # type: ignore[attr-defined]
+    return tuple(body.cells) if hasattr(body, "cells") else (2**body.levels,)
 
 
 def _factor(before: Sequence[int], after: Sequence[int]) -> float:
@@ -271,26 +318,29 @@ def _factor(before: Sequence[int], after: Sequence[int]) -> float:
     return min(n / m for m, n in zip(before, after, strict=True))
 
 
-def _rate(meshes: Sequence[Assessed], factors: Sequence[float]) -> float:
-    """The rate at which shares fall with the size of cells, by the last two meshes."""
-    known = [(f, one.share) for f, one in zip(factors, meshes, strict=True) if np.isfinite(one.share) and one.share > 0]
+def _rate(meshes: Sequence[Assessed]) -> float:
+    """The rate at which errors fall with the size of cells, by the last two meshes."""
+    factors = [_factor(meshes[0].cells, one.cells) for one in meshes]
+    sizes = [float(np.max(one.close, initial=0.0)) for one in meshes]
+    known = {factor: size for factor, size in zip(factors, sizes, strict=True) if size > 0}
     if len(known) < 2:
         return RATE
-    (coarse, before), (fine, after) = known[-2:]
+    (coarse, before), (fine, after) = list(known.items())[-2:]
     return float(np.clip(np.log(before / after) / np.log(fine / coarse), *RATES))
 
 
 @dataclass(frozen=True)
 class _Way:
-    """A mesh that might be taken, what it would take of the tolerance, and the predicted time (s) of the study on it."""
+    """A mesh that might be taken, its share of the tolerance, and the predicted time (s) of the study on it."""
 
     times: float
     model: ModelSpec
+    estimates: int
     share: float
     seconds: float
 
 
-def _ways(study: Study, share: float, rate: float) -> Iterator[_Way]:
+def _ways(study: Study, now: Assessed, rate: float) -> Iterator[_Way]:
     """Go through the meshes with more and more cells for which there is memory, from the given one on."""
     few, power = SAMPLES[study.method.kind in ("automatic", "chaos") and study.inputs.independent]
     seen, times = set[int](), 1.0
@@ -309,10 +359,16 @@ def _ways(study: Study, share: float, rate: float) -> Iterator[_Way]:
         if cost.bytes + estimating.bytes > MIB * study.accuracy.memory and model is not study.model:
             return
         finer = _factor(_cells(study), _cells(other))
-        then = AIM if share == np.inf and finer > DOUBLED else share / finer**rate
-        samples = few / max(1 - then**2, 0.05) ** (power / 2)
-        estimates = estimating.once + FEWEST * (cost.sample + estimating.seconds)
-        yield _Way(1.0 if model is study.model else finer, model, then, cost.first + samples * cost.sample + estimates)
+        for count in COUNTS:
+            if model is study.model and count < now.estimates:
+                continue
+            share = now.share_with(finer**rate, count)
+            if not now.close and finer > DOUBLED:
+                share = AIM
+            samples = few / max(1 - share**2, 0.05) ** (power / 2)
+            estimates = estimating.once + count * (cost.sample + estimating.seconds)
+            seconds = cost.first + samples * cost.sample + estimates
+            yield _Way(1.0 if model is study.model else finer, model, count, share, seconds)
 
 
 def _adapting(study: Study, tolerance: float) -> ModelSpec:

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from forward.model import Finding, ModelError
 from forward.scalars import Mistake
-from uq.accuracy.goal import LEAST, OF_SOLVER
+from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.inputs.sampling import power_of_two
 from uq.methods.stopping import UNASKED
 
 if TYPE_CHECKING:
+    from uq.accuracy.goal import Goal
     from workflows.studies.sampling import Study
 
 AUTOMATIC = "automatic"
@@ -41,6 +42,15 @@ def completed(blocks: Mapping[str, Any]) -> Mapping[str, Any]:
             return blocks
         most = scrambles * power_of_two(most // scrambles)
     return {**blocks, "method": {**method, "samples": most}}
+
+
+def goal(study: Study) -> Goal:
+    """Return what the tolerance asks of estimates, before anything is known of the mesh."""
+    from uq.accuracy.goal import Goal
+
+    assert study.accuracy.tolerance is not None
+    units = [output.unit for output in study.spec.outputs]
+    return Goal.of(study.accuracy.tolerance, units, study.accuracy.solves, study.spec.solver_tolerance or 0.0)
 
 
 def mistakes(study: Study) -> Iterator[Mistake]:
@@ -84,6 +94,7 @@ def refinement(study: Study) -> tuple[str, str]:
         objection = str(error)
     except ValueError:
         objection = "it would be too large"
+    assert body is not None
     if objection is None and body.cell != "tetrahedron":
         return "cells", "gets more cells along all edges, if its error is too large"
     if body.cell == "tetrahedron" and not any(field.basis != "modes" for field in getattr(model, "fields", ())):
@@ -101,14 +112,23 @@ def findings(study: Study) -> Iterator[Finding]:
         return
     unknown = [output.name for output in study.spec.outputs if not getattr(output, "estimable", True)]
     if unknown:
-        text = f"accuracy.tolerance does not count the error of the mesh in {', '.join(unknown)}, of which there is no estimate."
+        listed = ", ".join(unknown)
+        text = f"accuracy.tolerance does not count the error of the mesh in {listed}, of which there is no estimate."
         yield Finding("warning", text)
     how, words = refinement(study)
     if not how and not study.model.adaptive:
-        instead = (
-            "Take a mesh of tetrahedra, which is refined, or a finer one of hexahedra; the levels of "
-            "multilevel-monte-carlo show what that is worth."
-            if "hexahedra" in words
-            else "Take a finer mesh if its error turns out too large."
-        )
-        yield Finding("note", f"accuracy.tolerance: the mesh {words}. {instead}")
+        text = f"accuracy.tolerance: the mesh {words}. If its error is too large for the tolerance, that will be said."
+        yield Finding("note", text)
+
+
+def plan(study: Study) -> Iterator[str]:
+    """Say what is held, and what is decided by it."""
+    accuracy = study.accuracy
+    chosen = "the method, the" if study.method.kind == AUTOMATIC else "the"
+    mesh = "and the mesh " if study.estimates else ""
+    yield f"tolerance   {accuracy.tolerance:g} of every mean and standard deviation, all errors together, at 95 %"
+    yield f"            {chosen} number of solves (up to {accuracy.solves:,}) {mesh}follow from it"
+    if study.estimates:
+        most = f"accuracy.memory = {accuracy.memory:,.0f} MiB for each group of ranks"
+        yield f"            the mesh {refinement(study)[1]}, up to {most}"
+        yield "            times and memory are those of the given one"

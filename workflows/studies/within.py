@@ -18,6 +18,7 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.findings import add
 from uq.surrogates.linearisation import linearise
 from workflows.studies.tolerance import Found, doubts, history
+from workflows.studies.tolerance_asked import goal as asked
 from workflows.studies.tolerance_asked import refinement
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
 SOURCES = ("mesh", "sampling", "solver", "total")
 ESTIMATED = ("mean", "std")
+TRIED = ("unknowns", "cells", "estimates", "share")  # of a mesh
 IN_WORDS = {"mean": "mean", "std": "standard deviation"}
 
 
@@ -54,14 +56,14 @@ def within(
     directory
         Of the results: how the mesh was found stands there.
     """
-    goal, mesh = study.goal, None
-    if study.estimates:
+    goal, mesh, before = asked(study), None, history(directory)
+    unknown: tuple[Finding, ...] = ()
+    if study.estimates and before is not None:
         try:
-            mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate))
+            mesh = Found(study, inputs, evaluate, linearise(inputs, evaluate), before["estimates"])
         except SolveError as error:
-            unknown: tuple[Finding, ...] = (Finding("warning", f"The error of the mesh is not estimated: {error}."),)
+            unknown = (Finding("warning", f"The error of the mesh is not estimated: {error}."),)
         else:
-            unknown = ()
             estimates.append(mesh.errors.evaluations)
             goal = replace(goal, mesh=mesh.doubts)
     units = {output.name: output.unit for output in study.model.outputs}
@@ -76,10 +78,9 @@ def within(
         goal = now
         if settled:
             break
-    if study.estimates:
-        add(found, *unknown)
+    add(found, *unknown)
     parts = goal.parts(_moments(found), half_width(found))
-    told = _told(study, found, goal, parts, history(directory))
+    told = _told(study, found, goal, parts, before)
     found.attrs["accuracy"] = json.dumps(told, ensure_ascii=False)
     add(found, *_findings(study, told))
     return found
@@ -108,7 +109,7 @@ def _told(
         "reasons": [*([_of_mesh(before)] if before is not None else []), *chosen["reasons"]],
         "mesh": {
             "unknowns": study.spec.unknowns,
-            "tried": [{name: one[name] for name in ("unknowns", "cells", "share")} for one in meshes],
+            "tried": [{name: one[name] for name in TRIED} for one in meshes],
         }
         if study.spec.meshed
         else None,
@@ -133,26 +134,30 @@ def _corrected(found: xr.Dataset, output: int) -> bool:
 
 
 def _of_mesh(before: dict[str, Any]) -> str:
+    """Say how the mesh was found."""
     meshes = before["meshes"]
-    why = before["why"]
-    if len(meshes) == 1:
-        return f"The mesh is the given one: {why}."
     shares = " → ".join("?" if one["share"] is None else f"{100 * one['share']:.2g} %" for one in meshes)
-    unknowns = " → ".join(f"{one['unknowns']:,}" for one in meshes)
-    return f"The mesh was refined, {unknowns} unknowns: it took {shares} of the tolerance; {why}."
+    unknowns = " → ".join(f"{n:,}" for n in dict.fromkeys(one["unknowns"] for one in meshes))
+    if "→" not in unknowns:
+        return f"The mesh is the given one: {before['why']}."
+    return (
+        f"The mesh was refined, {unknowns} unknowns: once corrected it takes {shares} of the tolerance, with "
+        f"{before['estimates']} estimates at last{_after(before['why'])}."
+    )
+
+
+def _after(why: str) -> str:
+    """What stands behind the first part of a reason."""
+    _, semicolon, rest = why.partition("; ")
+    return f"{semicolon}{rest}"
 
 
 def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
-    """Say whether the tolerance is kept, and if not, what keeps it from being so."""
+    """Say that the tolerance is not kept, and what keeps it from being so."""
     worst, shares = told["worst"], told["shares"]
     of = f"the {worst['of']} of {worst['output']}"
     taken = ", ".join(f"{source} {100 * shares[source]:.2g} %" for source in SOURCES[:-1] if shares[source] > 0)
     if told["kept"]:
-        text = (
-            f"All errors together are within accuracy.tolerance = {told['tolerance']:g}: at most {told['reached']:.2g}, "
-            f"of {of} (of the tolerance: {taken})."
-        )
-        yield Finding("note", text)
         return
     text = (
         f"accuracy.tolerance = {told['tolerance']:g} is not reached: {of} is known to {told['reached']:.2g} "

@@ -27,6 +27,7 @@ from workflows.report.plots.moments import (
     standard_error,
 )
 from workflows.report.plots.multilevel import levels, mesh_cost, mesh_mean, mesh_samples, mesh_variance, refinement
+from workflows.report.plots.tolerance import tolerance_bars
 
 __all__ = [
     "BARS",
@@ -62,5 +63,6 @@ __all__ = [
     "span",
     "spectrum",
     "standard_error",
+    "tolerance_bars",
     "tornado",
 ]

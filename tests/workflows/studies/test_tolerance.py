@@ -1,0 +1,305 @@
+"""Studies with one tolerance for all errors: what they choose, what they refuse, and that restarts change nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests import meshes
+from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse
+from workflows.run.plan import plan
+from workflows.studies.tolerance import Assessed, _next, _rate
+
+TINY = ROOT / "configs" / "tiny.toml"
+OWN = ROOT / "configs" / "own-model.toml"
+NAMED = ("model.function=configs.own_model.beam", "model.jacobian=configs.own_model.slopes")
+COARSE = ("model.body.cells=[2, 1, 1]", "method={kind='automatic'}")
+
+
+def asked(tolerance, *more, of=TINY):
+    return load(of, ["method={kind='automatic'}", f"accuracy.tolerance={tolerance}", *more])
+
+
+def without_method(tolerance, solves=10_000):
+    blocks = {name: block for name, block in document(load(OWN, NAMED)).items() if name != "method"}
+    return parse(blocks | {"accuracy": {"tolerance": tolerance, "solves": solves}})
+
+
+# --- what is asked ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.unit
+def test_a_tolerance_stands_in_place_of_a_method():
+    study = without_method(1e-3)
+    assert study.method.kind == "automatic"
+    assert parse(document(study)) == study
+    with pytest.raises(StudyError, match=r"method: missing"):
+        parse({name: block for name, block in document(load(OWN)).items() if name != "method"})
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("method", "samples"),
+    [
+        ("{kind='chaos'}", 500),
+        ("{kind='monte-carlo'}", 500),
+        ("{kind='quasi-monte-carlo'}", 256),
+        ("{kind='quasi-monte-carlo', scrambles=4}", 256),
+        ("{kind='chaos', samples=40}", 40),
+    ],
+)
+def test_a_method_that_is_given_is_kept(method, samples):
+    study = load(TINY, [f"method={method}", "accuracy={tolerance=1e-2, solves=500}"])
+    assert study.method.samples == samples
+    assert parse(document(study)) == study
+    assert any("up to 500" in line for line in plan(study))
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["method={kind='automatic'}"], "method.kind: method.kind = 'automatic' needs a tolerance"),
+        (["accuracy.tolerance=0"], "accuracy.tolerance: .*greater than 0"),
+        (["accuracy.tolerance=2"], "accuracy.tolerance: .*less than 1"),
+        (["accuracy.tolerance=1e-10", "method={kind='automatic'}"], "accuracy.tolerance: below what rounding leaves"),
+        (
+            ["accuracy.tolerance=1e-3", "model.solver.tolerance=1e-3", "method={kind='automatic'}"],
+            "accuracy.tolerance: below what the solver reaches .*at least 0.1, or a smaller model.solver.tolerance",
+        ),
+        (["accuracy.tolerance=1e-3", "method={kind='local-sensitivity'}"], "method.kind: does not stop at accuracy"),
+        (["accuracy.tolerance=1e-3", "method={kind='chaos', fit='projection'}"], "method.kind: does not stop at acc"),
+        (
+            ["accuracy.tolerance=1e-3", "method={kind='chaos', tolerance=1e-2}"],
+            "method.tolerance: another tolerance than accuracy.tolerance",
+        ),
+        (["accuracy.solves=3"], "accuracy.solves: .*16"),
+        (["accuracy.tolerence=1e-3"], "accuracy.tolerence: unknown key; did you mean 'tolerance'"),
+    ],
+)
+def test_what_cannot_be_asked_is_said_in_a_line(settings, said):
+    with pytest.raises(StudyError, match=said) as refused:
+        load(TINY, settings)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.unit
+def test_the_solver_is_as_exact_as_the_tolerance_needs():
+    assert asked(1e-3).spec.solver.tolerance == 1e-8
+    assert asked(1e-7).spec.solver.tolerance == pytest.approx(1e-9)
+    assert load(TINY).spec.solver.tolerance == 1e-8
+
+
+@pytest.mark.unit
+def test_check_says_what_is_held_and_what_is_not(tmp_path):
+    found = "\n".join(plan(asked(1e-2)))
+    assert "0.01 of every mean and standard deviation" in found
+    assert "the method, the number of solves (up to 10,000) and the mesh follow" in found
+    assert "gets more cells along all edges" in found
+    assert "is refined where its error arises" in "\n".join(plan(asked(1e-2, "model.body.cell=tetrahedron")))
+    off = asked(1e-2, "accuracy.mesh_error=false").findings
+    assert any("does not count the error of the mesh: accuracy.mesh_error = false" in one.text for one in off)
+    small = asked(1e-2, "accuracy.memory=1").findings
+    assert any("does not count the error of the mesh: it is not estimated" in one.text for one in small)
+    stress = "model.outputs=[{kind='max-von-mises', name='stress'}, {kind='max-displacement', name='u', component='y'}]"
+    text = "does not count the error of the mesh in stress"
+    assert any(text in one.text for one in asked(1e-2, stress).findings)
+    noise = "model.fields=[{of='stiffness', length=0.1, std=0.1, basis='noise'}]"
+    kept = [one.text for one in asked(1e-2, noise).findings if "the mesh is not refined" in one.text]
+    assert len(kept) == 1
+    assert "basis = 'modes'" in kept[0]
+    path = tmp_path / "box.msh"
+    meshes.box("hexahedron").write(path, file_format="gmsh22")
+    body = f"model.body={{kind='mesh', file='{path}', degree=1}}"
+    assert "gets more cells" in "\n".join(plan(asked(1e-2, body)))
+    divided = asked(1e-2, f"model.body={{kind='mesh', file='{path}', degree=1, divide=['x-min']}}").findings
+    assert any("the mesh is not refined: its mesh is divided already" in one.text for one in divided)
+
+
+# --- which mesh ------------------------------------------------------------------------------------------------------
+
+
+def mesh(study, share, estimates=3, between=0.0):
+    share_close = np.sqrt(max(share**2 - between**2, 0.0))
+    return Assessed(
+        study.spec.unknowns,
+        study.model.body.cells,
+        estimates,
+        share,
+        "uy_max",
+        "mean",
+        [[share_close], [0.0]],
+        [[between], [0.0]],
+        0.01,
+        4,
+        1.0,
+    )
+
+
+@pytest.mark.unit
+def test_a_mesh_that_takes_little_is_kept():
+    study = asked(1e-2)
+    model, count, why = _next(study, [mesh(study, 0.3)])
+    assert model is None
+    assert count == 3
+    assert "takes 30 % of the tolerance" in why
+
+
+@pytest.mark.unit
+def test_where_estimates_are_few_there_are_more_of_them():
+    study = asked(1e-2)
+    model, count, _ = _next(study, [mesh(study, 0.9, between=0.89)])
+    assert model is study.model
+    assert count > 3
+
+
+@pytest.mark.unit
+def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
+    study = asked(1e-2)
+    first = mesh(study, 8.0)
+    model, _, _ = _next(study, [first])
+    assert model.body.cells[0] in range(6, 14)  # between: an assumed rate says little far away
+    finer = study.of(model)
+    factor = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
+    meshes_seen = [first, mesh(finer, 8.0 / factor**2)]
+    assert _rate(meshes_seen) == pytest.approx(2.0)
+    model, _, _ = _next(finer, meshes_seen)
+    last = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
+    assert 8.0 / last**2 <= 0.61
+    assert 8.0 / (0.7 * last) ** 2 > 0.6
+
+
+@pytest.mark.unit
+def test_memory_ends_refinement():
+    # Room for a few more cells, but not for those that it takes.
+    study = asked(1e-2, "accuracy.memory=12")
+    assert study.estimates
+    seen, model = [mesh(study, 50.0)], study.model
+    for _ in range(5):
+        model, _, why = _next(study, seen)
+        if model is None:
+            break
+        study = study.of(model)
+        seen.append(mesh(study, 0.8 * seen[-1].share))
+    assert model is None
+    assert "accuracy.memory = 12 MiB" in why
+
+
+# --- whole studies ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.unit
+def test_a_function_of_two_parameters(tmp_path):
+    found = without_method(1e-5).run(tmp_path / "out")
+    told = json.loads(found.attrs["accuracy"])
+    assert told["kept"]
+    assert told["method"] == "chaos"
+    assert told["mesh"] is None
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["accuracy"] == told
+    assert summary["method"] == "automatic"
+    of = told["outputs"]["weight"]["mean"]
+    assert of["value"] == found["mean"].sel(output="weight").item()
+    assert of["error"] <= 1e-5 * of["value"]
+    # E[q] L of a normal distribution that is cut at five standard deviations on either side.
+    assert of["value"] == pytest.approx(0.1, rel=1e-5)
+
+
+@pytest.mark.fem
+def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
+    load(TINY, [*COARSE, "accuracy.tolerance=0.05"]).run(tmp_path / "out", report=True)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    told = summary["accuracy"]
+    assert told["kept"]
+    assert told["mesh"]["tried"][0]["share"] > 1
+    assert told["mesh"]["unknowns"] > told["mesh"]["tried"][0]["unknowns"]
+    # Against 12 × 2 × 4 cells, corrected, and many samples.
+    settings = ["model.body.cells=[12, 2, 4]", "method={kind='chaos', samples=24}"]
+    exact = load(TINY, settings).run()
+    for output, estimates in told["outputs"].items():
+        for name, of in estimates.items():
+            right = exact[f"{name}_corrected"].sel(output=output).item()
+            assert abs(of["value"] - right) < 0.05 * right
+            assert of["error"] <= 0.05 * of["relative_to"]
+    assert set(summary["accuracy_seconds"]) == {"sampling", "mesh"}
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "What each error takes of the tolerance." in page
+    assert "The mesh was refined" in page
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_the_same_bits_on_any_number_of_ranks_and_after_kills(tmp_path):
+    settings = [*COARSE, "accuracy.tolerance=0.1"]
+    study = ["run", TINY, *(word for one in settings for word in ("--set", one)), "--no-report", "--out"]
+    for ranks in (1, 2):
+        done = run(ranks, TISSUQ, *study, tmp_path / f"{ranks}")
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "1", tmp_path / "2")
+    assert "tolerance 0.1: kept" in done.stdout
+    assert "mesh of" in done.stderr
+    # Killed as it looks at the second mesh, and as it samples on the last one.
+    for meshes_seen in (2, 99):
+        killed = run_script(None, KILLED.replace("MESHES", str(meshes_seen)), *study, tmp_path / "killed")
+        assert killed.returncode == -9, killed.stderr
+        assert any((tmp_path / "killed" / "evaluations").glob("*.h5"))
+    done = run(2, TISSUQ, *study, tmp_path / "killed")
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "1", tmp_path / "killed")
+
+
+KILLED = """
+import os, sys
+import workflows.studies.tolerance as meshes
+from uq.evaluation.checkpoint import Checkpoint
+save, assessed = Checkpoint.save, meshes._assessed
+seen = []
+
+def counted(*given):
+    seen.append(1)
+    return assessed(*given)
+
+def killed(self, key, block):
+    save(self, key, block)
+    sampling = os.path.exists(os.path.join(self._directory, meshes.FILE)) and block.tangents is not None
+    if len(seen) == MESHES or sampling:
+        os.kill(os.getpid(), 9)
+
+meshes._assessed = counted
+Checkpoint.save = killed
+from workflows.__main__ import main
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.fem
+def test_what_is_not_reached_is_said(tmp_path):
+    settings = [*COARSE, "accuracy={tolerance=1e-4, solves=16, memory=3}", "model.body.degree=1"]
+    study = load(TINY, settings)
+    assert study.estimates
+    study.run(tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert not summary["accuracy"]["kept"]
+    texts = [one["text"] for one in summary["findings"] if "is not reached" in one["text"]]
+    assert len(texts) == 1
+    assert "accuracy.memory = 3 MiB" in texts[0]
+
+
+@pytest.mark.unit
+def test_too_few_solves_are_said(tmp_path):
+    without_method(1e-9, solves=16).run(tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert not summary["accuracy"]["kept"]
+    assert any("accuracy.solves = 16" in one["text"] for one in summary["findings"])
+
+
+@pytest.mark.unit
+def test_a_study_without_a_tolerance_imports_nothing_of_it():
+    script = (
+        "import sys; from pathlib import Path; from workflows.config.study import load\n"
+        f"load(Path('{OWN}'), {NAMED}).run()\n"
+        "print([name for name in sys.modules if 'tolerance' in name or name.endswith(('accuracy.goal', 'automatic'))])"
+    )
+    assert run_script(None, script).stdout.strip() == "[]"
