@@ -57,7 +57,8 @@ FAR = 2.0  # times as many cells: farther, an assumed rate says too little
 DOUBLED = 1.9  # times as many cells, where nothing is known: then a mesh may do
 LARGEST = 16.0  # times as many cells along an edge
 COUNTS = 3, 4, 6, 9  # estimates
-FALL = 1.5  # power of their number with which what they leave open falls (2 in two parameters)
+FALL = {1: 2.0, 2: 2.0}  # power of their number with which what they leave open falls, by the number of parameters
+OF_MANY = 1.5  # the same of more parameters
 POINTS = 4096  # at which tangents are drawn
 SAMPLES = {True: (30.0, 0.5), False: (1000.0, 1.5)}  # of expansions and others: number, and power of what is left
 
@@ -74,6 +75,8 @@ class Assessed:
         Number of estimates of its error.
     share
         Largest part of the tolerance that it takes; infinite where that cannot be estimated.
+    parameters
+        Number of random parameters.
     output, of
         Of which estimate of which output that is.
     close, between
@@ -89,6 +92,7 @@ class Assessed:
     cells: tuple[int, ...]
     estimates: int
     share: float
+    parameters: int
     output: str
     of: str
     close: list[list[float]]
@@ -106,7 +110,7 @@ class Assessed:
         """Predict the share where errors are so many times smaller, and with another number of estimates."""
         if not self.close:
             return np.inf
-        few = (self.estimates / estimates) ** FALL
+        few = (self.estimates / estimates) ** FALL.get(self.parameters, OF_MANY)
         return float(np.hypot(self.close, few * np.array(self.between)).max() / factor)
 
 
@@ -251,6 +255,7 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
             _cells(study),
             count,
             float(shares.max()),
+            len(inputs.names),
             recorder.outputs[column],
             ("mean", "standard deviation")[row],
             [] if close is None else close.tolist(),
@@ -280,7 +285,7 @@ def _next(study: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, i
     None in place of a model where the last mesh is taken.
     """
     now = meshes[-1]
-    takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.2g} % of the tolerance once corrected"
+    takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.0f} % of the tolerance once corrected"
     how, words = refinement(study)
     if how != "cells":
         if now.share <= KEPT:

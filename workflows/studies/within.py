@@ -136,7 +136,7 @@ def _corrected(found: xr.Dataset, output: int) -> bool:
 def _of_mesh(before: dict[str, Any]) -> str:
     """Say how the mesh was found."""
     meshes = before["meshes"]
-    shares = " → ".join("?" if one["share"] is None else f"{100 * one['share']:.2g} %" for one in meshes)
+    shares = " → ".join("?" if one["share"] is None else f"{100 * one['share']:.0f} %" for one in meshes)
     unknowns = " → ".join(f"{n:,}" for n in dict.fromkeys(one["unknowns"] for one in meshes))
     if "→" not in unknowns:
         return f"The mesh is the given one: {before['why']}."

@@ -128,6 +128,7 @@ def mesh(study, share, estimates=3, between=0.0):
         study.model.body.cells,
         estimates,
         share,
+        2,
         "uy_max",
         "mean",
         [[share_close], [0.0]],
@@ -215,8 +216,8 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
     assert told["kept"]
     assert told["mesh"]["tried"][0]["share"] > 1
     assert told["mesh"]["unknowns"] > told["mesh"]["tried"][0]["unknowns"]
-    # Against 12 × 2 × 4 cells, corrected, and many samples.
-    settings = ["model.body.cells=[12, 2, 4]", "method={kind='chaos', samples=24}"]
+    # Against 8 × 2 × 4 cells, corrected, and more samples.
+    settings = ["model.body.cells=[8, 2, 4]", "method={kind='chaos', samples=12}"]
     exact = load(TINY, settings).run()
     for output, estimates in told["outputs"].items():
         for name, of in estimates.items():
@@ -289,7 +290,9 @@ def test_what_is_not_reached_is_said(tmp_path):
 
 @pytest.mark.unit
 def test_too_few_solves_are_said(tmp_path):
-    without_method(1e-9, solves=16).run(tmp_path / "out")
+    study = without_method(1e-9, solves=16)
+    wide = {"kind": "uniform", "lower": 1e5, "upper": 1e6}
+    parse(document(study) | {"parameters": document(study)["parameters"] | {"E": wide}}).run(tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert not summary["accuracy"]["kept"]
     assert any("accuracy.solves = 16" in one["text"] for one in summary["findings"])
