@@ -142,6 +142,11 @@ def schema() -> dict[str, Any]:
             found["$defs"] |= table.pop("$defs", {}) | {name: table}
             data = found["$defs"][form.__name__]["properties"]
             data["data"] = {"anyOf": [data["data"], {"$ref": _REFERENCE.format(model=name)}]}
+    # A tolerance for all errors stands in place of a method.
+    sampled = found["$defs"][STUDIES[SAMPLING].__name__]
+    sampled["required"].remove("method")
+    tolerance = {"properties": {"accuracy": {"required": ["tolerance"]}}, "required": ["accuracy"]}
+    sampled["anyOf"] = [{"required": ["method"]}, tolerance]
     # Nothing is known about the blocks of a kind of study that is a dotted path.
     dots = {"type": "object", "properties": {"kind": {"type": "string", "pattern": r"\."}}, "required": ["kind"]}
     known = sorted(STUDIES[SAMPLING].model_fields)

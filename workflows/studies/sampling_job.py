@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from forward.model import FloatArray, ForwardModel
     from forward.spec import ModelSpec
+    from uq.accuracy.doubts import Told
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.sampling import Study
@@ -102,7 +103,6 @@ def _with_mesh_errors(
     estimates: list[Evaluations],
 ) -> xr.Dataset:
     """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
-    from uq.accuracy.doubts import Told
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
@@ -119,11 +119,16 @@ def _with_mesh_errors(
     count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
     estimates.append(errors.evaluations)
-    outputs = study.model.returned
+    return with_mesh_errors(found, inputs, centre, errors, told_of(study))
+
+
+def told_of(study: Study) -> Told:
+    """Return what is known of the outputs of a study beside their values."""
+    from uq.accuracy.doubts import Told
+
+    outputs = study.spec.returned
     never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
-    tolerance = getattr(getattr(study.model, "solver", None), "tolerance", 0.0)
-    told = Told({one.name: one.unit for one in outputs}, never, tolerance)
-    return with_mesh_errors(found, inputs, centre, errors, told)
+    return Told({one.name: one.unit for one in outputs}, never, study.spec.solver_tolerance or 0.0)
 
 
 def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:

@@ -36,6 +36,7 @@ from workflows.results.directory import write_text
 from workflows.run import own_code
 from workflows.run.version import version
 from workflows.studies.predictions import times_of
+from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance_asked import goal, refinement
 
 if TYPE_CHECKING:
@@ -213,8 +214,7 @@ class Found:
         moments = {"mean": drawn.mean(axis=0), "mean_error": zero, "std": drawn.std(axis=0), "std_error": zero}
         dataset = local_dataset(inputs, evaluate, centre, fields=False)
         dataset = dataset.assign({name: (("output",), values) for name, values in moments.items()})
-        units = {output.name: output.unit for output in study.spec.outputs}
-        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, units)
+        self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, told_of(study))
         self.doubts = doubts(self.dataset)
         errors = np.array([self.dataset[name].to_numpy() for name in ERRORS if name in self.dataset])
         unknown = np.where(np.isfinite(self.errors.saturation) & self.errors.measured, DOUBT, UNCALIBRATED)

@@ -49,7 +49,7 @@ def goal(study: Study) -> Goal:
     from uq.accuracy.goal import Goal
 
     assert study.accuracy.tolerance is not None
-    units = [output.unit for output in study.spec.outputs]
+    units = [output.unit for output in study.spec.returned]
     return Goal.of(study.accuracy.tolerance, units, study.accuracy.solves, study.spec.solver_tolerance or 0.0)
 
 
@@ -110,7 +110,7 @@ def findings(study: Study) -> Iterator[Finding]:
         why = "it is not estimated" if study.accuracy.mesh_error else "accuracy.mesh_error = false"
         yield Finding("warning", f"accuracy.tolerance does not count the error of the mesh: {why}.")
         return
-    unknown = [output.name for output in study.spec.outputs if not getattr(output, "estimable", True)]
+    unknown = [output.name for output in study.spec.returned if not getattr(output, "estimable", True)]
     if unknown:
         listed = ", ".join(unknown)
         text = f"accuracy.tolerance does not count the error of the mesh in {listed}, of which there is no estimate."

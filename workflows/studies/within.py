@@ -17,6 +17,7 @@ from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.findings import add
 from uq.surrogates.linearisation import linearise
+from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance import Found, doubts, history
 from workflows.studies.tolerance_asked import goal as asked
 from workflows.studies.tolerance_asked import refinement
@@ -66,13 +67,12 @@ def within(
         else:
             estimates.append(mesh.errors.evaluations)
             goal = replace(goal, mesh=mesh.doubts)
-    units = {output.name: output.unit for output in study.model.outputs}
     for _ in range(ATTEMPTS):
         recorders["/"] = Recorder(evaluate)
         found = method.until(inputs, recorders["/"], goal)
         if mesh is None:
             break
-        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, units)
+        found = with_mesh_errors(found, inputs, mesh.centre, mesh.errors, told_of(study))
         now = replace(goal, mesh=doubts(found))
         settled = now.reached(_moments(found), half_width(found)) <= 1
         goal = now

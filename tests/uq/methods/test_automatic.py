@@ -159,6 +159,6 @@ def test_a_given_method_stops_at_the_goal(method):
 
 
 def test_it_does_nothing_without_a_tolerance():
-    with pytest.raises(ValueError, match="accuracy.tolerance"):
+    with pytest.raises(ValueError, match=r"accuracy\.tolerance"):
         Automatic().run(two(), model(hinge))
     assert not Chaos(fit="projection").aims
