@@ -96,7 +96,7 @@ def whole(text, folder):
     """Return the blocks of a study that a page shows; candidates alone stand in for those of a shipped study."""
     blocks = tomllib.loads(text)
     (folder / "data").symlink_to(ROOT / "configs" / "data")
-    if "method" in blocks:
+    if "method" in blocks or "accuracy" in blocks:
         return blocks
     return tomllib.loads((ROOT / "configs" / "inclusion-material.toml").read_text(encoding="utf-8")) | blocks
 
