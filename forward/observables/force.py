@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Gt
 
 from forward.bodies.geometry import AXES, unit_vector
 from forward.observables.observable import Equations, Functional, Observable
@@ -15,12 +16,22 @@ class Force(Observable):
     """Force (N) with which a tool presses on the body: along its direction, or one component.
 
     It is the derivative of the potential by the place of the tool, so that it balances the reactions exactly.
+
+    Parameters
+    ----------
+    tool
+        Name of the load.
+    component
+        Along the direction of the tool, or along an axis.
+    times
+        What it is multiplied by: 4 where a quarter of a symmetric body is solved.
     """
 
     kind: Literal["force"] = "force"
     unit: ClassVar[str] = "N"
     tool: str = "indenter"
     component: Literal["x", "y", "z", "along"] = "along"
+    times: Annotated[float, Gt(0)] = 1.0
 
     def functional(self, equations: Equations) -> Functional:
         """Prepare the evaluation."""
@@ -34,4 +45,4 @@ class Force(Observable):
         gap = tool.gap(at.ops, x, at.numbers, at.constant)
         pressure = tools.pressure(at.ops, gap, *map(at.constant, tool.stiffness_at(at)))
         density = pressure * ufl.dot(ufl.diff(gap, x), at.constant(along))
-        return Integral(equations, density, measure=tool.measure(at))
+        return Integral(equations, density, 1 / self.times, tool.measure(at))

@@ -26,7 +26,7 @@ SHAPES = {
 ON_ROLLERS = ({"on": "x-min", "x": 0.0}, {"on": "y-min", "y": 0.0}, {"on": "z-min", "z": 0.0})
 OUTPUTS = (
     {"kind": "force", "name": "force"},
-    {"kind": "force", "name": "across", "component": "x"},
+    {"kind": "force", "name": "across", "component": "x", "times": 4.0},
     {"kind": "reaction", "name": "below", "on": "z-min", "component": "z"},
     {"kind": "reaction", "name": "beside", "on": "x-min", "component": "x"},
     {"kind": "displacement", "name": "top", "at": (SIDE, SIDE, SIDE), "component": "z"},
@@ -157,7 +157,7 @@ def test_forces_balance_and_contact_is_from_one_side():
     found = model.solve(np.array([1e-3, SIDE]))
     force, across, below, beside, _ = found.outputs
     assert force == pytest.approx(below, rel=1e-8)
-    assert across == pytest.approx(-beside, rel=1e-8)
+    assert across == pytest.approx(-4 * beside, rel=1e-8)
     assert found.stability > 1  # negative eigenvalues were counted, and there are none
     away = model.solve(np.array([1e-3, SIDE + 1.5e-3]))
     np.testing.assert_allclose(away.outputs, 0, atol=1e-12)
