@@ -85,6 +85,14 @@ class Discretisation(Linearisation):
         """Whether tools touch the body."""
         return bool(self._tools)
 
+    def number(self, path: str) -> float:
+        """The value of a number of the model that is set."""
+        return self._values[path]
+
+    def penetrations(self) -> dict[str, float]:
+        """How deep (m) the body enters each tool, by their labels, at the state that is set."""
+        return {load.label: -ranks.smallest(self.comm, float(gaps().min(initial=0.0))) for load, gaps in self._gaps}
+
     @cached_property
     def _contact_forces(self) -> Callable[[], FloatArray] | None:
         """Forces (U_local,) of all tools, at the state that is set; None without tools."""

@@ -194,6 +194,11 @@ class Forms:
         points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
         return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
 
+    def on_facets(self, expression: Any, boundary: str, degree: int) -> assembly.FacetValues:
+        """Compile an expression for evaluation at the quadrature points of a boundary."""
+        inserted = self._invariants.inserted(expression)
+        return assembly.FacetValues(inserted, self.facets[boundary], degree, self.space, self.comm)
+
     def _bilinear(self, form: Any) -> Any:
         return compile.compile_form(self._invariants.inserted(form), self.comm)
 
@@ -241,6 +246,14 @@ class Forms:
         """Return a tool among the loads by its label, and what it is written with."""
         (load,) = (load for load in self.spec.loads if load.label == label)
         return load, self.place(self._numbers(f"loads.{label}"))
+
+    @cached_property
+    def _gaps(self) -> list[tuple[Term, assembly.FacetValues]]:
+        """Tools, with their gaps (m) at the quadrature points under them."""
+        return [
+            (load, self.on_facets(load.touch(at, at.X + at.u).gap, load.on, load.degree))  # type: ignore[attr-defined]
+            for _, load, at in self._tools
+        ]
 
     def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
         at = self.place(numbers)

@@ -39,6 +39,7 @@ from forward.solvers.stability import NOT_SCREENED, Screened, draw
 from forward.solvers.system import Found, Residual
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
+ENTERED = 5  # times the penetration that is aimed at
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
 
 
@@ -137,11 +138,27 @@ class HyperelasticModel(OneByOne):
         way = None if reference is None else _Way(self, reference, parameters, screen=screen)
         with equations.time_limit(self.spec.solver.solve_seconds):
             found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
+        if found.converged and equations.contact:
+            self._check_contact(found)
         # If Newton's method had to take over, the reference is too far away for the derivatives too.
         solution = FiniteElementSolution(self, parameters, found, equations.work, way if found.corrected else None)
         if found.stability >= Stability.COUNTED and equations.symmetric:
             equations.latest.factorised = solution
         return solution
+
+    def _check_contact(self, found: Found) -> None:
+        """Refuse an equilibrium in which the body enters a tool by far more than is aimed at."""
+        equations = self.equations
+        equations.set_state(found.state)
+        for label, penetration in equations.penetrations().items():
+            depth = equations.number(f"loads.{label}.depth")
+            (aim,) = (load.penetration for load in self.spec.loads if load.label == label)  # type: ignore[attr-defined]
+            if depth > 0 and penetration > ENTERED * aim * depth:
+                message = (
+                    f"the body enters the tool '{label}' by {penetration / depth:.2g} of its depth, where "
+                    f"{aim:g} is aimed at: it is stiffer than its constants as stated; lower loads.{label}.penetration"
+                )
+                raise SolveError(message, work=equations.work)
 
     def visit(self, solution: FiniteElementSolution) -> Discretisation:
         """Set parameters and state to those of a solution, unless they are already."""

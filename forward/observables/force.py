@@ -42,7 +42,6 @@ class Force(Observable):
         tool, at = equations.tool(self.tool)
         along = unit_vector(tool.direction) if self.component == "along" else np.eye(3)[AXES.index(self.component)]
         x = ufl.variable(at.X + at.u)
-        gap = tool.gap(at.ops, x, at.numbers, at.constant)
-        pressure = tools.pressure(at.ops, gap, *map(at.constant, tool.stiffness_at(at)))
-        density = pressure * ufl.dot(ufl.diff(gap, x), at.constant(along))
+        touch = tool.touch(at, x)
+        density = tools.pressure(at.ops, *touch) * ufl.dot(ufl.diff(touch.gap, x), at.constant(along))
         return Integral(equations, density, 1 / self.times, tool.measure(at))

@@ -128,6 +128,9 @@ class Equations(Protocol):
     def by_vertices(self, form: Any) -> Any:
         """Compile a form that is linear in values at the vertices."""
 
+    def on_facets(self, expression: Any, boundary: str, degree: int) -> Any:
+        """Compile an expression for evaluation at the quadrature points of a boundary."""
+
     def at_points(self, expression: Any) -> Any:
         """Compile an expression for evaluation at the quadrature points."""
 
@@ -200,6 +203,8 @@ OUTPUTS = Kinds(
         "volume-change": "forward.observables.volume_change:VolumeChange",
         "max-von-mises": "forward.observables.max_von_mises:MaxVonMises",
         "force": "forward.observables.force:Force",
+        "contact-area": "forward.observables.contact_area:ContactArea",
+        "max-pressure": "forward.observables.max_pressure:MaxPressure",
     },
     Observable,
 )

@@ -20,13 +20,12 @@ from forward.terms.term import Place, Term
 from forward.words import listed
 
 SHARP = 1 / 20  # radius of an edge relative to that of the tool, and of a tip relative to the depth
-SMOOTH = 0.2  # width over which contact sets in, relative to the penetration that is aimed at
+SMOOTH = 0.1  # width over which contact sets in, relative to the penetration that is aimed at
 PEAK = 3.0  # largest pressure over the mean one under flat tools and cones
-MARGIN = 2.0  # stiffness beyond that for the aim: of materials that are stiffer than stated, and of large strains
+MARGIN = 6.0  # stiffness beyond that for the aim: single points are pressed more, most of all on coarse meshes
 AT_REST = 1e-3  # depth relative to the size that stands for a depth of zero
 BORNE = 1e-6  # width over which contact sets in on a plane that does not move, relative to the extent of the body
 SLACK = 0.01  # of the depth, and of the inaccuracy of positions, that a tool may be inside the body at the start
-DEGREE = 8  # of the quadrature under a tool
 Shape = Literal["sphere", "flat", "cylinder", "cone", "plane"]
 NEEDED: dict[str, tuple[str, ...]] = {
     "sphere": ("radius",),
@@ -67,6 +66,14 @@ class Stiffness(NamedTuple):
     width: float
 
 
+class Touch(NamedTuple):
+    """A gap (m) in UFL, and how the tool resists where it closes (as `Stiffness`)."""
+
+    gap: Any
+    stiffness: Any
+    width: Any
+
+
 class Indenter(Term):
     """A rigid tool that touches a boundary and is moved by `depth` against it, without friction.
 
@@ -78,7 +85,7 @@ class Indenter(Term):
     ----------
     shape
         "sphere", the end of a rod; "flat", a round punch whose edge is rounded; "cylinder", lying along `axis`; "cone"
-        with a rounded tip; "plane", which may also be the table on which a body rests.
+        with a rounded tip (a hyperboloid); "plane", which may also be the table on which a body rests.
     on
         The boundary that it may touch.
     at
@@ -90,18 +97,19 @@ class Indenter(Term):
     radius
         Of a sphere, a punch or a cylinder (m).
     edge
-        Radius (m) of the edge of a punch; a twentieth of its radius by default.
+        Width (m) over which the edge of a punch is rounded; a twentieth of its radius by default.
     axis
         Direction of the axis of a cylinder.
     angle
         Between the side of a cone and its axis (degrees).
     tip
-        Radius (m) of the tip of a cone; a twentieth of the depth by default.
+        Radius of curvature (m) of the tip of a cone; a twentieth of the depth by default.
     penetration
         Largest penetration that is aimed at, relative to the depth.
     """
 
     contact: ClassVar[bool] = True
+    degree: ClassVar[int] = 8  # of the quadrature under it
     kind: Literal["indenter"] = "indenter"
     shape: Shape
     on: str
@@ -214,27 +222,27 @@ class Indenter(Term):
 
     def potential(self, at: Place) -> Any:
         """Potential ∫ φ(g(X + u)) dS of the gap g, over the undeformed boundary."""
-        gap = self.gap(at.ops, at.X + at.u, at.numbers, at.constant)
-        return tools.energy(at.ops, gap, *map(at.constant, self.stiffness_at(at))) * self.measure(at)
+        touch = self.touch(at, at.X + at.u)
+        return tools.energy(at.ops, touch.gap, touch.stiffness, touch.width) * self.measure(at)
 
     def straight_stiffness(self, at: Place, direction: Any) -> Any:
         """Stiffness ∫ φ''(g) (∇g·v)(∇g·w) dS, without that of ∇∇g."""
         import ufl
 
         x = ufl.variable(at.X + at.u)
-        gap = self.gap(at.ops, x, at.numbers, at.constant)
-        stiffness, width = map(at.constant, self.stiffness_at(at))
-        normal = ufl.diff(gap, x)
+        touch = self.touch(at, x)
+        normal = ufl.diff(touch.gap, x)
         product = ufl.dot(normal, at.v) * ufl.dot(normal, direction)
-        return stiffness * tools.contact(at.ops, gap, width) * product * self.measure(at)
+        return touch.stiffness * tools.contact(at.ops, touch.gap, touch.width) * product * self.measure(at)
+
+    def touch(self, at: Place, x: Any) -> Touch:
+        """Return how a place `x` of the deformed body is touched, in UFL."""
+        stiffness = self.resistance(at.modulus(), self.extent(at.bounds))
+        return Touch(self.gap(at.ops, x, at.numbers, at.constant), *map(at.constant, stiffness))
 
     def measure(self, at: Place) -> Any:
         """Measure of its boundary, fine enough for the pressure under it."""
-        return at.on(self.on, DEGREE)
-
-    def stiffness_at(self, at: Place) -> Stiffness:
-        """Return its resistance on a body."""
-        return self.resistance(at.modulus(), self.extent(at.bounds))
+        return at.on(self.on, self.degree)
 
     def extent(self, bounds: tuple[tuple[float, float], ...]) -> float:
         """Extent (m) along its direction of a body within bounds (m)."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import basix
 import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.bodies.geometry import Body
@@ -64,12 +66,54 @@ class PointValues:
             (expression, points), lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
         )
         self._mesh = space.mesh
-        self._cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
+        self.cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
 
     def __call__(self) -> FloatArray:
         """Return the values (n_cells, q · size of the expression) at the current state."""
-        values = version.evaluate(self._expression, self._mesh, self._cells)
-        return np.asarray(values).reshape(len(self._cells), -1)
+        values = version.evaluate(self._expression, self._mesh, self.cells)
+        return np.asarray(values).reshape(len(self.cells), -1)
+
+
+class FacetValues:
+    """A compiled UFL expression with its values at the quadrature points of boundary facets of this rank's cells.
+
+    Attributes
+    ----------
+    cells
+        The cell (n,) of each of the n points.
+    local
+        Their places (n, 3) in the reference cell.
+    """
+
+    def __init__(self, expression: Any, facets: NDArray[np.int32], degree: int, space: Any, comm: Any) -> None:
+        msh, kind = space.mesh, version.cell_type(space)
+        msh.topology.create_connectivity(2, 3)
+        msh.topology.create_connectivity(3, 2)
+        to_cells, to_facets = msh.topology.connectivity(2, 3), msh.topology.connectivity(3, 2)
+        pairs = [(to_cells.links(facet)[0], facet) for facet in facets]
+        own = [(cell, facet) for cell, facet in pairs if cell < owned_cells(msh)]
+        which = np.array([np.flatnonzero(to_facets.links(cell) == facet)[0] for cell, facet in own], dtype=int)
+        corners, sides = basix.geometry(kind), basix.topology(kind)[2]
+        flat = basix.CellType.triangle if len(sides[0]) == 3 else basix.CellType.quadrilateral
+        inside, _ = basix.make_quadrature(flat, degree)
+        points = np.concatenate(
+            [corners[side[0]] + inside @ (corners[[side[1], side[2]]] - corners[side[0]]) for side in sides]
+        )
+        self._every = PointValues(expression, points, space, comm)
+        self._every.cells = np.array(sorted({cell for cell, _ in own}), dtype=np.int32)
+        rows = np.searchsorted(self._every.cells, [cell for cell, _ in own])
+        self._rows = np.repeat(rows.astype(int), len(inside))
+        self._columns = (which[:, None] * len(inside) + np.arange(len(inside))).ravel()
+        self._count = len(points)
+        self.cells = self._every.cells[self._rows]
+        self.local = points[self._columns]
+
+    def __call__(self) -> FloatArray:
+        """Return the values (n, size of the expression) at the current state."""
+        if not len(self.cells):
+            return np.zeros((0, 1))
+        values = self._every().reshape(len(self._every.cells), self._count, -1)
+        return np.asarray(values[self._rows, self._columns])
 
 
 class NodalGradients:
