@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.bisection import Bisected
+from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import Contents, IntArray, Loaded, contents
 from forward.bodies.tetrahedra import MeshInMemory, tetrahedra
 from forward.fem import recovery
 from forward.fem.dolfinx import meshes
 from forward.fem.model import HyperelasticModel
 from forward.machine import MIB, headroom
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, Guess, SolveError
 
 if TYPE_CHECKING:
     from forward.fem.model import FiniteElementSolution
@@ -125,7 +126,7 @@ def adapt(
     """
     settings = spec.adapt
     assert settings is not None
-    marked, place = None, None
+    marked, place, before = None, None, None
     if comm.rank == 0:
         first, place = tetrahedra(spec.body)
         marked = Bisected.of(first)
@@ -146,7 +147,7 @@ def adapt(
         begin = time.process_time()
         try:
             model = HyperelasticModel(finer, comm, parameters)
-            solution = model.solve(point)
+            solution = model.solve(point, None if before is None else before.on(model))
             cycle = _cycle(() if found is None else found.cycles, finer, solution)
             relative = cycle.relative[list(settings.named(spec))]
             indicators = _indicators(model, solution, cycle, mesh)
@@ -157,6 +158,7 @@ def adapt(
         cycle = replace(cycle, seconds=time.process_time() - begin)
         cycles = (*(() if found is None else found.cycles), cycle)
         found = Adapted(mesh, indicators, held, cycles, None)
+        before = None if finer.mixed else _Solved.of(model, solution, mesh)
         say(_line(spec, cycle))
         if (relative <= settings.tolerance).all():
             return found
@@ -164,12 +166,63 @@ def adapt(
             marked = marked.refined(largest(indicators), TIMES)
 
 
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Displacements on a mesh, from which those on the next one are found.
+
+    Attributes
+    ----------
+    mesh, displacements
+        The mesh, and the displacements (N, 3) of its nodes; on the first rank.
+    nodes
+        Places (N, 3) of the nodes.
+    quadratic
+        Whether there are nodes on the edges.
+    """
+
+    mesh: Loaded | None
+    displacements: FloatArray | None
+    nodes: FloatArray
+    quadratic: bool
+
+    @classmethod
+    def of(cls, model: HyperelasticModel, solution: FiniteElementSolution, mesh: Loaded | None) -> _Solved:
+        """Collect them; collective."""
+        whole = model.space.gather(solution.state[None])
+        nodes, quadratic = model.space.coordinates, model.spec.body.degree > 1
+        return cls(mesh, None if whole is None else whole[0].reshape(-1, 3), nodes, quadratic)
+
+    def on(self, model: HyperelasticModel) -> Guess:
+        """Interpolate them on another mesh of the same body; collective."""
+        found = None
+        if self.mesh is not None and self.displacements is not None:
+            found = self._interpolated(self.mesh, self.displacements, model.space.coordinates)
+        whole = model.equations.comm.bcast(found)
+        return Guess(model.space.scatter(whole.ravel()[None])[0])
+
+    def _interpolated(self, mesh: Loaded, displacements: FloatArray, places: FloatArray) -> FloatArray:
+        """Return displacements (n, 3) at places (n, 3)."""
+        from scipy.spatial import cKDTree
+
+        corners = mesh.points[mesh.cells]
+        located = locate(corners, places)
+        weights, at = shapes(located.local, 4), corners[located.cells]
+        if self.quadratic:  # O. C. Zienkiewicz et al., The Finite Element Method (2013), section 6.3
+            first, second = np.triu_indices(4, 1)
+            at = np.concatenate([at, (at[:, first] + at[:, second]) / 2], axis=1)
+            weights = np.hstack([weights * (2 * weights - 1), 4 * weights[:, first] * weights[:, second]])
+        _, node = cKDTree(self.nodes).query(at.reshape(-1, 3))
+        return np.asarray(np.einsum("nk,nka->na", weights, displacements[node].reshape(*weights.shape, 3)))
+
+
 def _cycle(before: tuple[Cycle, ...], spec: Hyperelastic, solution: FiniteElementSolution) -> Cycle:
     """Estimate the errors of a solution, after meshes `before`; collective."""
-    values, seen = solution.outputs, solution.mesh_error().outputs
+    values, error = solution.outputs, solution.mesh_error()
+    seen = error.outputs if error.nonlinearity < 1 else np.full(len(values), np.nan)  # worth nothing
+    known = [cycle for cycle in before if np.isfinite(cycle.errors).any()]
     factors = saturation(
-        np.array([*(cycle.values for cycle in before), values]),
-        np.array([*(np.divide(cycle.errors, cycle.factors) for cycle in before), seen]),
+        np.array([*(cycle.values for cycle in known), values]),
+        np.array([*(np.divide(cycle.errors, cycle.factors) for cycle in known), seen]),
     )
     of_outputs, errors, missed = (tuple(map(float, part)) for part in (values, factors * seen, factors))
     return Cycle(spec.body.cell_count, spec.unknowns, of_outputs, errors, missed, 0.0)
@@ -217,7 +270,11 @@ def _indicators(
     """
     spec = model.spec
     assert spec.adapt is not None
-    if spec.adapt.indicator == "recovery":
+    named = np.array(spec.adapt.named(spec))
+    relative, known = cycle.relative[named], named[cycle.sizes[named] > 0]
+    open_ones = relative > spec.adapt.tolerance
+    chosen = named[open_ones] if open_ones.any() else known
+    if spec.adapt.indicator == "recovery" or not len(chosen):  # of a mesh too coarse for estimates, stresses tell
         equations = model.visit(solution)
         stresses = _by_cell(model, equations.stresses_at_vertices())
         corners = _by_cell(model, meshes.corners_as_given(equations.mesh))  # in the order of those stresses
@@ -225,11 +282,6 @@ def _indicators(
             return None
         found = recovery.squares(replace(mesh, cells=corners), stresses.reshape(len(stresses), 4, 9))
         return np.asarray(found / found.sum())
-    named = np.array(spec.adapt.named(spec))
-    relative = cycle.relative[named]
-    open_ones = relative > spec.adapt.tolerance
-    known = named[cycle.sizes[named] > 0]
-    chosen = named[open_ones] if open_ones.any() else known
     weights = np.zeros((len(chosen), len(cycle.values)))
     weights[np.arange(len(chosen)), chosen] = 1 / cycle.sizes[chosen]
     by_output = _by_cell(model, solution.mesh_indicators(weights).T)
@@ -250,5 +302,7 @@ def _by_cell(model: HyperelasticModel, values: NDArray[Any]) -> NDArray[Any] | N
 
 def _line(spec: Hyperelastic, cycle: Cycle) -> str:
     assert spec.adapt is not None
+    if not np.isfinite(cycle.errors).any():
+        return f"mesh of {cycle.unknowns:,} unknowns: too coarse for estimates, refined where stresses jump"
     errors = ", ".join(f"{spec.outputs[i].name} {100 * cycle.relative[i]:.2g} %" for i in spec.adapt.named(spec))
     return f"mesh of {cycle.unknowns:,} unknowns: estimated errors {errors}"

@@ -125,7 +125,9 @@ def _finding(study: Study, told: dict[str, Any]) -> Finding:
     named = [told["outputs"][i] for i in adapt.named(study.model)]
     left = []
     for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
-        if name in named:
+        if name in named and error is None:
+            left.append(f"{name} unknown")
+        elif name in named:
             size = max(abs(value + error), abs(error))
             left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
     text = (

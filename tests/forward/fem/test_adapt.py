@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from forward.bodies.tetrahedra import tetrahedra
 from forward.fem import recovery
 from forward.fem.adapt import BULK, Cycle, adapt, largest, saturation
+from forward.fem.model import HyperelasticModel
 from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from tests.launch import run_script
@@ -237,3 +238,51 @@ def test_mistakes_of_files_and_fields(tmp_path):
         Hyperelastic.model_validate(
             blocks | {"fields": ({"of": "stiffness", "length": 0.3, "std": 0.2, "basis": "noise"},)}
         )
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_each_mesh_starts_from_the_one_before(file, monkeypatch, degree):
+    """Displacements are carried over exactly where the finer mesh can hold them."""
+    guesses, solve = [], HyperelasticModel.solve
+
+    def solved(model, parameters, guess=None):
+        found = solve(model, parameters, guess)
+        first, second = (
+            None if u is None else model.space.gather(u[None])[0] for u in (guess and guess.state, found.state)
+        )
+        guesses.append((first, second, model.space.coordinates, found.work))
+        return found
+
+    monkeypatch.setattr(HyperelasticModel, "solve", solved)
+    body = {"kind": "mesh", "file": file, "degree": degree}
+    adapt(bent(body, tolerance=0.01, cycles=2), MPI.COMM_SELF, (), NOTHING)
+    (none, first, nodes, whole), (guess, second, finer, less), _ = guesses
+    assert none is None
+    known = {tuple(place): u for place, u in zip(nodes.round(9).tolist(), first.reshape(-1, 3), strict=True)}
+    shared = [i for i, place in enumerate(finer.round(9).tolist()) if tuple(place) in known]
+    before = np.array([known[tuple(place)] for place in finer[shared].round(9).tolist()])
+    np.testing.assert_allclose(guess.reshape(-1, 3)[shared], before, atol=1e-12)
+    assert np.linalg.norm(guess - second) < 0.6 * np.linalg.norm(second)  # linear cells bend twice as far
+    assert less.residuals < whole.residuals
+
+
+def test_meshes_too_coarse_for_estimates_are_refined_where_stresses_jump():
+    """A beam of linear tetrahedra that lock: richer elements bend it farther than a few Newton steps reach."""
+    spec = Hyperelastic.model_validate(
+        {
+            "formulation": "displacement",
+            "body": {"size": (2.0, 1.0, 1.0), "cells": (4, 1, 1), "cell": "tetrahedron", "degree": 1},
+            "material": {"kind": "neo-hookean-coupled", "mu": 2e4, "lmbda": 4e7},
+            "clamp": ("x-min",),
+            "loads": ({"kind": "traction", "on": "x-max", "direction": (0, 0, -1), "size": 1000.0},),
+            "outputs": ({"kind": "mean-displacement", "name": "tip", "on": "x-max", "component": "z"},),
+            "adapt": {"tolerance": 0.1, "cycles": 1},
+        }
+    )
+    said = []
+    found = adapt(spec, MPI.COMM_SELF, (), NOTHING, said.append)
+    assert np.isnan([cycle.errors for cycle in found.cycles]).all()
+    assert found.cycles[1].cells > found.cycles[0].cells
+    assert found.indicators.sum() == pytest.approx(1)
+    assert all("too coarse for estimates" in line for line in said)
+    assert found.stopped == "cycles = 1"
