@@ -51,6 +51,23 @@ def test_what_three_estimates_predict_is_what_a_finer_mesh_changes():
 
 
 @pytest.mark.fem
+def test_what_a_finer_mesh_gives_lies_within_the_stated_uncertainty():
+    """The same study on cells half as large, of which the error is a third to a quarter: within it too."""
+    coarse, fine = block((4, 2, 2)), block((8, 4, 4), OFF)
+    for name in ("mean", "std", "quantiles", "sobol_first", "sobol_total", "derivative"):
+        left = abs(fine[name] - coarse[f"{name}_corrected"])
+        assert (left < 2 * coarse[f"{name}_corrected_error"]).all(), name
+    assert (abs(fine["mean"] - coarse["mean"]) > 10 * coarse["mean_error"]).all()  # as are plain values not
+    sag = {"output": "uy_max"}
+    one, other = (found.sel(sag) for found in (coarse, fine))
+    moved, true = one["density_edge_corrected"], other["density_edge"]
+    below = np.interp(moved, true, [0, *np.cumsum(other["density"] * np.diff(true))])
+    expected = [0, *np.cumsum(one["density"] * np.diff(one["density_edge"]))]
+    uncorrected = np.interp(one["density_edge"], true, [0, *np.cumsum(other["density"] * np.diff(true))])
+    assert abs(below - expected).max() < 0.5 * abs(uncorrected - expected).max()
+
+
+@pytest.mark.fem
 def test_fields_are_corrected_too():
     coarse, fine = block((4, 2, 2)), block((8, 4, 4), OFF)
     nodes = {tuple(p): i for i, p in enumerate(np.round(fine["node_position"].values, 9).tolist())}
