@@ -55,7 +55,7 @@ def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any])
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Moments of the outputs: in a table with the errors of the mesh where there are any, else a line each."""
-    if not any(values.get("mean_corrected") is not None for values in outputs.values()):
+    if not any(values.get("mesh_error") is not None for values in outputs.values()):
         for output, values in outputs.items():
             yield _line(output, values, _unit(dataset, output))
         return
@@ -66,10 +66,12 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
         for name, first in ESTIMATES.items() if not nothing else ():
             error = values.get(f"{first}mesh_error")
             of_mesh = [NONE]
-            if error is not None:
+            if error is not None and f"{name}_corrected" in values:
                 total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
                 doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
                 of_mesh = [_signed(error, doubt), _error(total), f"{_value(corrected, its)} ± {_error(its)}"]
+            elif error is not None:  # of the finest of several meshes
+                of_mesh = [f"{error:+.2g}", _error(values[f"{first}total_error"]), NONE]
             sampling = values[f"{name}_error"]
             rows.append((f"  {name}", _value(values[name], sampling), _error(sampling), *of_mesh))
     yield from _table(rows)
@@ -92,15 +94,11 @@ def _bars(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _line(output: str, values: Mapping[str, Any], unit: str) -> str:
-    """Moments of an output, with the error of the finest mesh of a multilevel method."""
-    line = (
+    """Moments of an output."""
+    return (
         f"{output}: mean {values['mean']:.6g} ± {values['mean_error']:.2g} {unit}, "
         f"standard deviation {values['std']:.4g} ± {values['std_error']:.2g} {unit}"
     )
-    if "bias_error" in values:
-        errors = f"{values['bias_error']:.2g} and {values['std_bias_error']:.2g} {unit}"
-        line += f";\n{' ' * len(output)}  error of the mesh about {errors}"
-    return line
 
 
 def _derivatives(dataset: xr.Dataset, summary: Mapping[str, Any]) -> Iterator[str]:
