@@ -31,6 +31,7 @@ from benchmarks import (
     streaming,
     tails,
     throughput,
+    tolerance,
     variance,
 )
 
@@ -38,6 +39,7 @@ ALL = {
     "realisation": realisation.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
+    "tolerance": tolerance.main,
     "variance": variance.main,
     "levels": levels.main,
     "fields": fields.main,
@@ -66,6 +68,7 @@ WITH_OPTIONS = {
     "coverage": coverage.main,
     "meshes": meshes.main,
     "oddities": oddities.main,
+    "tolerance": tolerance.main,
 }
 
 

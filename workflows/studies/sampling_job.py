@@ -182,6 +182,8 @@ def of_estimates(study: Study, job: Job) -> dict[str, Any]:
     if study.accuracy.tolerance is not None:
         sampled = sum(float(found.seconds.sum()) for found in job.evaluations.values())
         earlier = sum(one["seconds"] for one in job.meshes_before)
+        refined = named("workflows.studies.adapted_mesh:history")(study) if study.model.adaptive else None
+        earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         ranks = study.parallel.ranks_per_model
         told["accuracy_seconds"] = {"sampling": sampled * ranks, "mesh": seconds + earlier * ranks}
     return told

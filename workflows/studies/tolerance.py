@@ -35,6 +35,8 @@ from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from workflows.results.directory import write_text
 from workflows.run import own_code
 from workflows.run.version import version
+from workflows.studies.adapted_mesh import FILES as ADAPTED
+from workflows.studies.adapted_mesh import on_adapted_mesh
 from workflows.studies.predictions import times_of
 from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance_asked import goal, refinement
@@ -120,10 +122,12 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
     world, path = ensemble.world, directory.resolve() / FILE
     told = world.bcast(_read(path) if world.rank == 0 else None)
     first, meshes, count = study, list[Assessed](), COUNTS[0]
+    if told is None:
+        _forget(study, world, directory)
     while told is None:
         meshes.append(_assessed(study, ensemble, directory, count))
         say(_line(meshes[-1]))
-        finer, count, why = _next(study, meshes)
+        finer, count, why = _next(study, first, meshes)
         if finer is None:
             told = {
                 "meshes": [one.document for one in meshes],
@@ -134,6 +138,8 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
             if world.rank == 0:
                 write_text(path, json.dumps(told, indent=2, ensure_ascii=False) + "\n")
             return study
+        if finer.unrefined:
+            _forget(first, world, directory)
         study = _refined(study, finer, ensemble, directory, say)
     changed = told["body"]
     if "adapt" in changed:
@@ -141,6 +147,13 @@ def on_fine_mesh(study: Study, ensemble: Ensemble, directory: Path, say: Callabl
     body = study.model.body  # type: ignore[attr-defined]
     body = body.model_validate(body.model_dump(exclude={"contents"}) | changed)
     return study.of(study.model.model_copy(update={"body": body})) if changed else study
+
+
+def _forget(first: Study, world: Any, directory: Path) -> None:
+    """Remove the mesh of an attempt that was given up or interrupted, unless the study itself asked for it."""
+    if world.rank == 0 and not first.model.adaptive:
+        for name in ADAPTED:
+            (directory / name).unlink(missing_ok=True)
 
 
 def history(directory: Path) -> dict[str, Any] | None:
@@ -176,8 +189,6 @@ def _refined(study: Study, model: ModelSpec, ensemble: Ensemble, directory: Path
     """Return the study of a model, whose mesh may have to be refined first; collective."""
     if not model.unrefined:
         return study.of(model)
-    from workflows.studies.adapted_mesh import on_adapted_mesh
-
     return on_adapted_mesh(study.of(model), ensemble, directory, say)
 
 
@@ -279,14 +290,14 @@ def _line(one: Assessed) -> str:
 # --- which mesh is next ----------------------------------------------------------------------------------------------
 
 
-def _next(study: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, int, str]:
+def _next(study: Study, first: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, int, str]:
     """Return the model on the next mesh and the number of estimates on it, and why that is so.
 
     None in place of a model where the last mesh is taken.
     """
     now = meshes[-1]
     takes = f"the mesh of {now.unknowns:,} unknowns takes {100 * now.share:.0f} % of the tolerance once corrected"
-    how, words = refinement(study)
+    how, words = refinement(first)
     if how != "cells":
         if now.share <= KEPT:
             return None, now.estimates, takes
@@ -295,8 +306,12 @@ def _next(study: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, i
             return study.model, more[0], ""
         if not how:
             return None, now.estimates, f"{takes}; it {words}"
-        to = 0.1 if now.share == np.inf else float(np.clip(now.relative * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
-        return _adapting(study, to), COUNTS[0], ""
+        before = getattr(study.model, "adapt", None)
+        if before is not None and (len(meshes) > MOST_MESHES or study.spec.unknowns * STEP > before.unknowns):
+            return None, now.estimates, f"{takes}; finer ones would take more than {_memory(study)}"
+        error = now.relative if before is None else before.tolerance
+        to = 0.1 if now.share == np.inf else float(np.clip(error * OF_ADAPTED / now.share, OF_ROUNDING, 0.5))
+        return _adapting(first, to), COUNTS[0], ""
     if len(meshes) > MOST_MESHES and now.share > KEPT:
         return None, now.estimates, f"{takes}, and {len(meshes)} meshes are enough"
     ways = list(_ways(study, now, _rate(meshes)))
@@ -304,12 +319,16 @@ def _next(study: Study, meshes: Sequence[Assessed]) -> tuple[ModelSpec | None, i
     enough = [*here, *(way for way in ways if way.share <= AIM)]
     best = min(enough, key=lambda way: way.seconds) if enough else min(ways, key=lambda way: way.share)
     if best.times == 1 and best.estimates == now.estimates:
-        rest = "" if enough else f"; finer ones would take more than accuracy.memory = {study.accuracy.memory:,.0f} MiB"
+        rest = "" if enough else f"; finer ones would take more than {_memory(study)}"
         return None, now.estimates, takes + rest
     if len(meshes) == 1 and best.times > FAR:  # a mesh between them costs little, and tells the rate
         between = next(way for way in ways if way.times >= best.times**0.5)
         return between.model, COUNTS[0], ""
     return best.model, best.estimates, ""
+
+
+def _memory(study: Study) -> str:
+    return f"accuracy.memory = {study.accuracy.memory:,.0f} MiB"
 
 
 def _cells(study: Study) -> tuple[int, ...]:

@@ -20,7 +20,6 @@ from uq.surrogates.linearisation import linearise
 from workflows.studies.sampling_job import told_of
 from workflows.studies.tolerance import Found, doubts, history
 from workflows.studies.tolerance_asked import goal as asked
-from workflows.studies.tolerance_asked import refinement
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -164,8 +163,7 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
         f"(of the tolerance: {taken})."
     )
     if shares["mesh"] > 1 - shares["solver"]:
-        how, words = refinement(study)
-        why = f" The mesh {words}." if not how else f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
+        why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
     else:
         why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."
     yield Finding("warning", text + why)

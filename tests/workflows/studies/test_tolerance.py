@@ -142,7 +142,7 @@ def mesh(study, share, estimates=3, between=0.0):
 @pytest.mark.unit
 def test_a_mesh_that_takes_little_is_kept():
     study = asked(1e-2)
-    model, count, why = _next(study, [mesh(study, 0.3)])
+    model, count, why = _next(study, study, [mesh(study, 0.3)])
     assert model is None
     assert count == 3
     assert "takes 30 % of the tolerance" in why
@@ -151,7 +151,7 @@ def test_a_mesh_that_takes_little_is_kept():
 @pytest.mark.unit
 def test_where_estimates_are_few_there_are_more_of_them():
     study = asked(1e-2)
-    model, count, _ = _next(study, [mesh(study, 0.9, between=0.89)])
+    model, count, _ = _next(study, study, [mesh(study, 0.9, between=0.89)])
     assert model is study.model
     assert count > 3
 
@@ -160,13 +160,13 @@ def test_where_estimates_are_few_there_are_more_of_them():
 def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     study = asked(1e-2)
     first = mesh(study, 8.0)
-    model, _, _ = _next(study, [first])
+    model, _, _ = _next(study, study, [first])
     assert model.body.cells[0] in range(6, 14)  # between: an assumed rate says little far away
     finer = study.of(model)
     factor = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     meshes_seen = [first, mesh(finer, 8.0 / factor**2)]
     assert _rate(meshes_seen) == pytest.approx(2.0)
-    model, _, _ = _next(finer, meshes_seen)
+    model, _, _ = _next(finer, study, meshes_seen)
     last = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     assert 8.0 / last**2 <= 0.61
     assert 8.0 / (0.7 * last) ** 2 > 0.6
@@ -179,7 +179,7 @@ def test_memory_ends_refinement():
     assert study.estimates
     seen, model = [mesh(study, 50.0)], study.model
     for _ in range(5):
-        model, _, why = _next(study, seen)
+        model, _, why = _next(study, study, seen)
         if model is None:
             break
         study = study.of(model)
@@ -228,6 +228,26 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What each error takes of the tolerance." in page
     assert "The mesh was refined" in page
+
+
+@pytest.mark.fem
+def test_tetrahedra_are_refined_where_errors_arise(tmp_path):
+    settings = [*COARSE, "accuracy.tolerance=0.05", "model.body.cell=tetrahedron", "model.body.size=[0.2, 0.1, 0.1]"]
+    study = load(TINY, settings)
+    found = study.run(tmp_path / "whole")
+    told = json.loads(found.attrs["accuracy"])
+    assert told["kept"]
+    assert told["mesh"]["tried"][0]["share"] > 1
+    assert (tmp_path / "whole" / "mesh.npz").exists()
+    assert found["cycle_unknowns"].values[-1] == told["mesh"]["unknowns"]
+    # Interrupted once the mesh is refined, before that is written down: its mesh is made again.
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("study.toml", "mesh.npz", "mesh.json"):
+        (other / name).write_bytes((tmp_path / "whole" / name).read_bytes())
+    (other / "mesh.npz").write_bytes(b"of another attempt")
+    study.run(other)
+    assert_same_bits(tmp_path / "whole", other)
 
 
 @pytest.mark.fem
