@@ -234,20 +234,20 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
 def test_tetrahedra_are_refined_where_errors_arise(tmp_path):
     settings = [*COARSE, "accuracy.tolerance=0.05", "model.body.cell=tetrahedron", "model.body.size=[0.2, 0.1, 0.1]"]
     study = load(TINY, settings)
-    found = study.run(tmp_path / "whole")
+    found = study.run(tmp_path / "whole" / "out")
     told = json.loads(found.attrs["accuracy"])
     assert told["kept"]
     assert told["mesh"]["tried"][0]["share"] > 1
-    assert (tmp_path / "whole" / "mesh.npz").exists()
+    assert (tmp_path / "whole" / "out" / "mesh.npz").exists()
     assert found["cycle_unknowns"].values[-1] == told["mesh"]["unknowns"]
     # Interrupted once the mesh is refined, before that is written down: its mesh is made again.
-    other = tmp_path / "other"
-    other.mkdir()
+    other = tmp_path / "other" / "out"
+    other.mkdir(parents=True)
     for name in ("study.toml", "mesh.npz", "mesh.json"):
-        (other / name).write_bytes((tmp_path / "whole" / name).read_bytes())
+        (other / name).write_bytes((tmp_path / "whole" / "out" / name).read_bytes())
     (other / "mesh.npz").write_bytes(b"of another attempt")
     study.run(other)
-    assert_same_bits(tmp_path / "whole", other)
+    assert_same_bits(tmp_path / "whole" / "out", other)
 
 
 @pytest.mark.fem
