@@ -68,6 +68,9 @@ def test_a_model_by_the_names_of_its_numbers():
     np.testing.assert_allclose(
         first.displacement_at(model.nodes[[0, 7, -1]]), first.displacement[[0, 7, -1]], atol=1e-14
     )
+    finer = tissuq.Model(tissuq.load(TINY).model.refined(1)).solve({"material.C1": 9e3})
+    assert first["uy_max"] < finer["uy_max"] < first["uy_max"] + first.mesh_error["uy_max"]  # which errs as much less
+    assert finer["uy_max"] - first["uy_max"] > 0.5 * first.mesh_error["uy_max"]
     assert -first.displacement[:, 1].min() == pytest.approx(first["uy_max"])
     middle = model.nodes[[0, -1]].mean(axis=0)
     assert first.displacement_at(middle).shape == (1, 3)
@@ -86,5 +89,6 @@ def test_a_python_function_is_a_model_too(monkeypatch):
     found = model.solve({"load": 2.0})
     assert found["tip"] == pytest.approx(2 * model.solve()["tip"])
     assert model.nodes is None
+    assert found.mesh_error == {}
     with pytest.raises(ValueError, match="no body"):
         _ = found.displacement

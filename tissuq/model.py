@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, Guess, ReferenceSolution, gathered
+from forward.model import FloatArray, Guess, ReferenceSolution, SolveError, gathered
 from forward.settings import nearest
 
 if TYPE_CHECKING:
@@ -126,6 +126,27 @@ class Solution(Mapping[str, float]):
             message = f"'{output}' is not an output; {nearest(output, tuple(self))}"
             raise KeyError(message)
         return dict(zip(self._of.parameters, map(float, self.solved.adjoint(weights)), strict=True))
+
+    @cached_property
+    def mesh_error(self) -> dict[str, float]:
+        """Errors of the mesh by output, exact minus computed, as estimates: add them to correct. Collective.
+
+        NaN where there is no estimate, of the largest stress for example; empty for a model without a mesh.
+
+        Raises
+        ------
+        SolveError
+            If there is no estimate at this solution.
+        """
+        found = self.solved.mesh_error()
+        if found is None:
+            return {}
+        if not found.nonlinearity < 1:
+            message = "richer elements move the body too far for a few Newton steps: the mesh is much too coarse"
+            raise SolveError(message)
+        calibration = self.solved.saturation()
+        found = found if calibration is None else found.calibrated(calibration)
+        return dict(zip(self, map(float, found.outputs), strict=True))
 
     @cached_property
     def displacement(self) -> FloatArray:
