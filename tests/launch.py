@@ -26,22 +26,22 @@ def on_ranks(ranks, *command):
     return list(map(str, command if ranks is None else (mpirun, "-n", ranks, *command)))
 
 
-def run(ranks, *command, path=None):
+def run(ranks, *command, path=None, timeout=300):
     """Run to the end, with packages in a folder of their own; exit code and output are in what is returned."""
     return subprocess.run(
         on_ranks(ranks, *command),
         capture_output=True,
         text=True,
-        timeout=300,  # a hang; busy machines are slow
+        timeout=timeout,  # a hang; busy machines are slow
         env=environment() | ({} if path is None else {"PYTHONPATH": str(path)}),
         check=False,
         cwd=ROOT,
     )
 
 
-def run_script(ranks, script, *arguments):
+def run_script(ranks, script, *arguments, timeout=300):
     """Run a Python script."""
-    return run(ranks, sys.executable, "-c", script, *arguments)
+    return run(ranks, sys.executable, "-c", script, *arguments, timeout=timeout)
 
 
 def assert_same_bits(a, b):

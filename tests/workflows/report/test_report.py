@@ -630,3 +630,18 @@ def test_axes_of_posteriors_hold_the_posterior(prior, at, std):
     assert high - low < 20 * std
     if prior.support is not None:
         assert high <= prior.support[1]
+
+
+def test_many_load_cases_have_colours_of_one_scale():
+    """As the steps of a path; the first and the last are named."""
+    cases = [f"force.{k}" for k in range(1, 13)]
+    one = xr.Dataset(
+        {
+            "eigenvalue": ("direction", [90.0, 0.5]),
+            "alone_eigenvalue": (("case", "direction"), np.outer(np.arange(1, 13), [6.0, 0.1])),
+        },
+        {"case": cases},
+    )
+    ax = plots.inversion.spectrum(one)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["all together", "force.1", "force.12"]
+    assert len(ax.lines) == 14

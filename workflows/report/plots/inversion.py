@@ -146,6 +146,7 @@ def _draw(ax: Axes, cut: Cut, values: FloatArray, title: str, colours: str, ends
 
 def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw λ of all load cases and of each alone."""
+    from matplotlib import colormaps
     from matplotlib.ticker import MaxNLocator
 
     ax = ax or axes()
@@ -153,8 +154,11 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     rows |= {str(case): one["alone_eigenvalue"].sel(case=case).to_numpy() for case in one.case.values}
     for i, (name, row) in enumerate(rows.items()):
         values = row[np.isfinite(row) & (row > 1e-6 * rows["all together"][0])]
-        colour = DARK if i == 0 else COLOURS[i - 1]
-        ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=name, linewidth=1, markersize=4)
+        many = len(rows) - 1 > len(COLOURS)  # the first and the last are named, as of the steps of a path
+        shade = colormaps["viridis"]((i - 1) / max(len(rows) - 2, 1)) if many else COLOURS[i - 1]
+        label = None if many and 1 < i < len(rows) - 1 else name
+        colour = DARK if i == 0 else shade
+        ax.plot(np.arange(1, len(values) + 1), values, ".-", color=colour, label=label, linewidth=1, markersize=4)
     ax.axhline(SEEN, color=PLAIN, linestyle="--", linewidth=1)
     ax.set_yscale("log")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -292,7 +296,7 @@ def misfits(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     degrees = one["misfit_degrees"].to_numpy()
     ax.bar(places, one["misfit"].to_numpy(), color=CONTROLLED, width=0.55)
     ax.errorbar(places, degrees, yerr=2 * np.sqrt(2 * degrees), fmt="_", color=DARK, markersize=18, capsize=5)
-    ax.set_xticks(places, names)
+    ax.set_xticks(places, names, rotation=45 if len(names) > len(COLOURS) else 0)
     ax.set_ylabel("|r|²")
     return ax
 
