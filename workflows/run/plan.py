@@ -24,13 +24,11 @@ def shortage(study: StudyKind, rank_groups: int = 1) -> Finding | None:
         if wanted > limit.size:
             text = f"memory may run out: about {wanted / MIB:,.0f} MiB are needed, {limit}"
             return Finding("warning", text)
-        largest = max((spec.largest_bytes for spec in study.specs), default=0.0)
+        largest, what = study.growth
         wanted = largest + of_program(limit)
         if wanted > limit.size:
-            text = (
-                f"the mesh is refined as far as memory allows: about {wanted / MIB:,.0f} MiB are needed for as many "
-                f"unknowns as model.adapt.unknowns says, {limit}"
-            )
+            needed = f"about {wanted / MIB:,.0f} MiB are needed for {what} says"
+            text = f"the mesh is refined as far as memory allows: {needed}, {limit}"
             return Finding("warning", text)
     return None
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from workflows.studies.study import StudyKind
 
+CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
 DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
 
 
@@ -120,7 +121,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
     ensemble = Ensemble.split(world, study.parallel.ranks_per_model)
     _warn_of_memory(study, world, quiet=quiet)
     say = _say if world.rank == 0 and not quiet else lambda _: None
-    checkpoint = None
+    checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]), loaded)
     ensemble.say = say
     try:
         study = study.prepared(ensemble, directory, say)
@@ -297,15 +298,14 @@ def _note(text: str) -> None:
     sys.stderr.flush()
 
 
-def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint | None) -> None:
+def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> None:
     """Remove what `_prepare` has made, if nothing else is there, so that the corrected study can use the directory.
 
     Where no solve has an answer, nothing of them is kept, nor a mesh that was refined.
     """
-    if isinstance(error, SolveError) and (checkpoint is None or not checkpoint.answers):
-        if checkpoint is not None:
-            checkpoint.clear()
-        for name in REFINED:
+    if isinstance(error, SolveError) and not checkpoint.answers:
+        checkpoint.clear()
+        for name in (*REFINED, CHOSEN):
             (directory / name).unlink(missing_ok=True)
     made = ("study.toml", own_code.FILE)
     if {path.name for path in directory.iterdir()} <= set(made):

@@ -132,6 +132,13 @@ class Study(StudyKind):
         return super().memory + (0.0 if estimating is None else estimating.bytes)
 
     @property
+    def growth(self) -> tuple[float, str]:
+        """Memory (bytes) of the largest mesh that it may make, and what sets it; 0 where it makes none."""
+        if self.accuracy.tolerance is None or not self.estimates or not named(f"{OF_TOLERANCE}:refinement")(self)[0]:
+            return super().growth
+        return MIB * self.accuracy.memory, "what accuracy.memory"
+
+    @property
     def solves(self) -> int:
         """Number of solves, those for the error of the mesh too."""
         return self.planned + self.estimates

@@ -115,6 +115,11 @@ class StudyKind(Settings):
         return sum(cost.bytes for cost in (spec.cost() for spec in self.specs) if cost is not None)
 
     @property
+    def growth(self) -> tuple[float, str]:
+        """Memory (bytes) of the largest mesh that the study may make, and what sets it; 0 where it makes none."""
+        return max((spec.largest_bytes for spec in self.specs), default=0.0), "as many unknowns as model.adapt.unknowns"
+
+    @property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for its models."""
         return ()

@@ -248,9 +248,12 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
     checkpoint = Checkpoint(directory, json.dumps([own_code.identity(study), version()]))
     model = ensemble.together(lambda: study.spec.build(ensemble.group, study.inputs.names))
 
-    def task(evaluate: Evaluate) -> Assessed:
+    def task(evaluate: Evaluate) -> Assessed | Exception:
         recorder, inputs = Recorder(evaluate), study.inputs
-        centre = linearise(inputs, recorder)
+        try:
+            centre = linearise(inputs, recorder)
+        except (SolveError, ValueError) as error:  # for all ranks, which wait for what comes of it
+            return error
         found = None
         with suppress(SolveError):
             found = Found(study, inputs, recorder, centre, count)
@@ -277,7 +280,9 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
         )
 
     found = ensemble.run(model, task, checkpoint=checkpoint, blocks=study.parallel.blocks)
-    result: Assessed = ensemble.world.bcast(found)
+    result: Assessed | Exception = ensemble.world.bcast(found)
+    if isinstance(result, Exception):
+        raise result
     return result
 
 

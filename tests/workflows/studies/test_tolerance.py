@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from forward.machine import Headroom
 from tests import meshes
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from workflows.config.mistakes import StudyError
@@ -293,6 +294,27 @@ Checkpoint.save = killed
 from workflows.__main__ import main
 main(sys.argv[1:])
 """
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_a_body_without_an_answer_is_one_line_on_all_ranks(tmp_path):
+    heavy = "parameters={'loads.gravity.density'={kind='uniform', lower=1e9, upper=2e9}}"
+    settings = [*COARSE, "accuracy.tolerance=0.1", "model.solver.minimum_load_step=0.5", heavy]
+    study = ["run", TINY, *(word for one in settings for word in ("--set", one)), "--out", tmp_path / "out"]
+    done = run(2, TISSUQ, *study)
+    assert done.returncode == 1
+    assert done.stderr.count("no answer at the mean parameters") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.unit
+def test_memory_for_refined_meshes_is_looked_at_before(monkeypatch):
+    monkeypatch.setattr("workflows.run.plan.limits", lambda: [Headroom(2**30, "1 GiB is left")])
+    said = [line for line in plan(asked(1e-2)) if "as far as memory allows" in line]
+    assert len(said) == 1
+    assert "are needed for what accuracy.memory says" in said[0]
+    assert not any("as far as" in line for line in plan(asked(1e-2, "accuracy.memory=500")))
 
 
 @pytest.mark.fem
