@@ -15,6 +15,7 @@ from benchmarks import (
     chaos,
     coverage,
     fields,
+    indentation,
     inversion,
     levels,
     locking,
@@ -61,8 +62,10 @@ ALL = {
     "scaling": scaling.main,
     "startup": startup.main,
     "adaptive": adaptive.main,
+    "indentation": indentation.main,
 }
 WITH_OPTIONS = {
+    "indentation": indentation.main,
     "chaos": chaos.main,
     "tails": tails.main,
     "coverage": coverage.main,

@@ -1,4 +1,11 @@
-"""Rigid tools that are pressed against a body."""
+"""Rigid tools that are pressed against a body.
+
+The pressure is proportional to the penetration, p = ε s, by a stiffness ε that follows from the numbers as they are
+stated, so that it is the same in all solutions of a study and on all meshes. With the contact modulus E* = E/(1 − ν²)
+the largest pressures over the depth δ are those of Hertz, (2/π) E*/√(R δ), for a sphere of radius R (and a cylinder);
+PEAK times the mean ones of a punch of radius a, (2/π) E*/a, and of Sneddon's cone, E*/(2 tan α δ); and E* over the
+extent of the body under a plane. ε is MARGIN times that over the penetration that is aimed at, relative to the depth.
+"""
 
 from __future__ import annotations
 
@@ -146,9 +153,7 @@ class Indenter(Term):
     def resistance(self, modulus: float, extent: float) -> Stiffness:
         """Return the stiffness that keeps the penetration small.
 
-        It follows from the numbers as they are stated, so that it is the same in all solutions of a study. The largest
-        pressures relative to the depth are those of Hertz (sphere and cylinder), a few times the mean ones of a punch
-        and of Sneddon's cone, and that of a compressed column under a plane.
+        The formulas are at the top of this file.
 
         Parameters
         ----------
