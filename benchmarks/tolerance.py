@@ -27,7 +27,7 @@ from uq.accuracy.goal import Goal
 from uq.estimators.moments import Z
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.methods import chaos
-from uq.methods.automatic import Automatic
+from uq.methods.automatic import Automatic, order_for
 from uq.methods.chaos import Chaos
 from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 from workflows.config.study import parse
@@ -55,9 +55,12 @@ def errors(found: Any, exact: FloatArray) -> float:
 def by_hand(case: Case, tolerances: Sequence[float], repeats: int) -> dict[float, tuple[int, str]]:
     """Return the fewest solves by tolerance, and what takes them."""
     exact = truth(case, ())[0]
-    ways: list[tuple[str, Callable[[int, int], Any], Sequence[int]]] = [
-        ("chaos", lambda n, seed: Chaos(samples=n, seed=seed, quantiles=(), fields=False), SIZES)
-    ]
+    order = order_for(len(case.inputs.names))
+
+    def expansion(n: int, seed: int) -> Any:
+        return Chaos(samples=n, seed=seed, quantiles=(), fields=False, max_order=order)
+
+    ways: list[tuple[str, Callable[[int, int], Any], Sequence[int]]] = [("chaos", expansion, SIZES)]
     for control in ("none", "tangent", "chaos"):
 
         def made(n: int, seed: int, control: str = control) -> Any:

@@ -46,7 +46,7 @@ SOME = 1024  # samples beyond which tails are looked at
 LEAST_POWER = 0.5  # of the number of samples with which claims fall: that of sampling
 WORTH = 1.5  # times fewer solves, predicted: then what was begun is given up,
 PATIENCE = 0.25  # but not before it has taken this share of what would follow: expansions may begin slowly
-FUNCTIONS, LEAST_ORDER, LARGEST_ORDER = 200, 6, 20  # of the largest whole basis, and orders
+FUNCTIONS, LEAST_ORDER, LARGEST_ORDER = 500, 6, 20  # of the largest whole basis, and orders
 SCRAMBLES = 16
 LIMITLESS = 10**9
 WITH_DERIVATIVES = 2.0  # solves that one with derivatives counts as
@@ -174,7 +174,7 @@ class Automatic(Method):
     def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
         return Chaos(
             samples=max(2, min(LARGEST, goal.most - 1)),
-            max_order=_order(len(inputs.names)),
+            max_order=order_for(len(inputs.names)),
             seed=self.seed,
             quantiles=self.quantiles,
             fields=self.fields,
@@ -222,8 +222,8 @@ class _Pilot:
         return deviations(self.found.regression, self.found.evaluations, self.found.centre)
 
 
-def _order(dimension: int) -> int:
-    """Largest order of expansions: more than usual in few parameters, where a small tolerance may need it."""
+def order_for(dimension: int) -> int:
+    """Return the largest order of expansions: more than usual in few parameters, for small tolerances."""
     orders = [order for order in range(1, LARGEST_ORDER + 1) if comb(dimension + order, order) <= FUNCTIONS]
     return max([LEAST_ORDER, *orders])
 
