@@ -1,0 +1,62 @@
+"""What estimates of the error of the mesh cost a study: processor time of whole runs, with and without."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.beams import CONFIG
+
+REPEATS = 3  # in turn, so that the load of the machine is the same for both
+CASES = {
+    "beam, 50 solves": ("beam", 50),
+    "Cook's membrane, nearly incompressible, 50 solves": ("cook", 50),
+    "beam, 500 solves": ("beam", 500),
+}
+
+
+def main() -> None:
+    """Print a table, a row for each study."""
+    print("| study | run without (s) | with (s) | more | solves (s) | estimates and their calibration (s) |")
+    print("|---|---|---|---|---|---|")
+    for name, (config, solves) in CASES.items():
+        _row(name, config, f"method.samples={solves}")
+
+
+def _row(name: str, config: str, change: str) -> None:
+    without, together, told = [], [], {}
+    _run(config, change, "accuracy.mesh_error=true")  # forms are compiled
+    for _ in range(REPEATS):
+        without.append(_run(config, change, "accuracy.mesh_error=false")[0])
+        seconds, told = _run(config, change, "accuracy.mesh_error=true")
+        together.append(seconds)
+    before, after = median(without), median(together)
+    costs = f"{told['cpu_seconds']:.2g} | {told['mesh_error']['cpu_seconds']:.2g}"
+    print(f"| {name} | {before:.1f} | {after:.1f} | {(after - before) / before:.0%} | {costs} |", flush=True)
+
+
+def _run(config: str, *changes: str) -> tuple[float, dict[str, Any]]:
+    """Run a study, with its report: processor time (s) and summary."""
+    command = Path(sys.executable).with_name("tissuq")
+    words = [word for change in changes for word in ("--set", change)]
+    with tempfile.TemporaryDirectory() as place:
+        before = _processor()
+        subprocess.run(
+            [command, "run", CONFIG.with_name(f"{config}.toml"), *words, "--quiet", "--out", place],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            check=True,
+        )
+        return _processor() - before, json.loads((Path(place) / "summary.json").read_text())
+
+
+def _processor() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
