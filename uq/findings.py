@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from forward.model import Finding, Severity
@@ -18,6 +20,14 @@ def add(dataset: xr.Dataset, *found: Finding) -> None:
     kept = list(dict.fromkeys([*_kept(dataset), *found]))
     if kept:
         dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
+
+
+def withdraw(dataset: xr.Dataset, names: Collection[str]) -> None:
+    """Forget findings that speak of one of these outputs: "the expansion of NAME", "the 64 samples of NAME"."""
+    about = re.compile(rf"\bof ({'|'.join(map(re.escape, names))})(?![\w.,])")
+    dataset.attrs["findings"] = json.dumps(
+        [one._asdict() for one in _kept(dataset) if not about.search(one.text)], ensure_ascii=False
+    )
 
 
 def findings(dataset: xr.Dataset) -> list[Finding]:

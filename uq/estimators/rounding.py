@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.model import Finding
+from uq.findings import add, withdraw
+
 if TYPE_CHECKING:
     import xarray as xr
 
 ROUNDING = 1e-9  # of the largest quantity of the same unit: what is zero by symmetry is smaller
+NUMBER = "1"  # unit of ratios, which differ in size
 LENGTH = "m"  # unit of the displacement field
 
 
@@ -34,4 +38,16 @@ def only_rounding(dataset: xr.Dataset, units: Mapping[str, str]) -> NDArray[np.b
     for name in ("field_nominal", "field_mean"):
         if name in dataset and LENGTH in largest and dataset[name].size:
             largest[LENGTH] = max(largest[LENGTH], float(np.nanmax(np.abs(dataset[name].to_numpy()))))
-    return np.asarray(sizes <= ROUNDING * np.array([largest[unit] for unit in known]))
+    comparable = np.array([unit != NUMBER for unit in known])
+    return np.asarray(comparable & (sizes <= ROUNDING * np.array([largest[unit] for unit in known])))
+
+
+def settled(dataset: xr.Dataset, units: Mapping[str, str]) -> None:
+    """Withdraw what was said of outputs that are rounding, of which nothing can be explained, and say that they are."""
+    names = [str(name) for name in dataset["output"].values[only_rounding(dataset, units)]]
+    if names:
+        withdraw(dataset, names)
+        be = "is" if len(names) == 1 else "are"
+        add(
+            dataset, Finding("note", f"{', '.join(names)} {be} zero but for rounding, beside outputs of the same unit.")
+        )

@@ -14,6 +14,7 @@ from forward.model import Finding, SolveError, Stability
 from forward.registry import named
 from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
+from uq.estimators.rounding import settled
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
 from uq.findings import add
 from uq.inputs.sampling import random_points
@@ -76,6 +77,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
+        settled(found, units)
         add(found, *locking)
         found = with_regions(found, model.spec.body.regions, regions)
         return with_random_fields(found, factors, model.space.variance_kept)

@@ -186,6 +186,29 @@ def test_the_summary_and_the_terminal_say_it(tmp_path):
     assert number(of["total_error"], 2) in page
 
 
+@pytest.mark.fem
+def test_outputs_that_are_zero_by_symmetry_do_no_harm(tmp_path):
+    """No expansion explains rounding, which is no error of the study."""
+    outputs = (
+        "[{name='uy', kind='mean-displacement', on='x-max', component='y'}, "
+        "{name='uz', kind='mean-displacement', on='x-max', component='z'}, "
+        "{name='mises', kind='max-von-mises'}]"
+    )
+    small = ["model.body.cells=[2,1,1]", "method={kind='chaos', samples=8, max_order=2}", f"model.outputs={outputs}"]
+    done = run(
+        None, TISSUQ, "run", TINY, *(word for one in small for word in ("--set", one)), "--out", tmp_path / "out"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "uz (m): zero but for rounding" in done.stdout
+    said = json.loads((tmp_path / "out" / "summary.json").read_text())["findings"]
+    assert any(one["text"].startswith("uz is zero but for rounding") for one in said)
+    assert not any(" uz" in one["text"] for one in said)
+    (mises,) = (one for one in said if "mises" in one["text"])
+    assert "not estimated of mises" in mises["text"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Zero but for rounding: uz." in page
+
+
 @pytest.mark.unit
 def test_the_setting():
     on, off = load(TINY), load(TINY, [OFF])
