@@ -1,7 +1,7 @@
 """Whether intervals hold the truth of data that have no mesh in common with the inversion.
 
 Specimens are drawn from the prior: a ball in a cube, or a random stiffness at its vertices. Their data are those of
-another code (`benchmarks.other_code`), on tetrahedra of degree 3, 16 times thinner at the held face; inversions are on
+another code (`benchmarks.other_code`), on tetrahedra of degree 4, 24 times thinner at the held face; inversions are on
 4 quadratic hexahedra along an edge, by the defaults of studies. Of posteriors that are linear at the truth it is known
 in closed form how often intervals hold it, over all noise.
 """
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Factor = Callable[[FloatArray], FloatArray]  # places (n, 3) → (n,)
 
-CELLS, OVERKILL = 4, 7  # along an edge, of the inversion and of the data
+CELLS, OVERKILL = 4, 5  # along an edge, of the inversion and of the data
 WIDE = 1.959964  # deviations of an interval of 95 %
 TRUTHS, FIELDS, SEED = 24, 12, 17
 DIRECTIONS = 4  # of a field, of which the data say most

@@ -1,21 +1,29 @@
 """A cube of tissue by another code, for data that have nothing in common with the models that are inverted.
 
-Tetrahedra of degree 3, six in each cell of a grid that is thinner towards the held face z = 0 and the faces beside it;
+Tetrahedra of degree 4, six in each cell of a grid that is thinner towards the held face z = 0 and the faces beside it;
 dead tractions on z = L; the coupled neo-Hookean material with a factor on its energy. Nothing of `forward` is used:
 shape functions, quadrature, stresses and their derivatives are written out here. Newton's method with conjugate
 gradients, preconditioned by the factor of the first tangent.
+
+python -m benchmarks.other_code FILE.csv writes data for configs/inclusion.toml.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from itertools import permutations, product
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
 FloatArray = NDArray[np.float64]
-DEGREE = 3
+DEGREE = 4
 SETTLED = 1e-7  # forces that are left, over the loads
 ORDERS = list(permutations(range(3)))
 KUHN = np.array([[np.eye(3, dtype=int)[list(order[:k])].sum(axis=0) for k in range(4)] for order in ORDERS])
@@ -23,7 +31,7 @@ POWERS = np.array([p for p in product(range(DEGREE + 1), repeat=3) if sum(p) <= 
 
 
 def _monomials(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Monomials (n, 20) of points (n, 3), and their derivatives (n, 20, 3)."""
+    """Monomials (n, 35) of points (n, 3), and their derivatives (n, 35, 3)."""
     values = (points[:, None, :] ** POWERS).prod(axis=2)
     slopes = np.zeros((*values.shape, 3))
     for axis in range(3):
@@ -48,7 +56,7 @@ def _quadrature(n: int) -> tuple[FloatArray, FloatArray]:
 
 LATTICE = POWERS / DEGREE  # nodes of the reference tetrahedron
 INVERSE = np.linalg.inv(_monomials(LATTICE)[0])  # of monomials at the nodes
-POINTS, WEIGHTS = _quadrature(4)
+POINTS, WEIGHTS = _quadrature(DEGREE)
 SLOPES = np.einsum("qmr,ma->qar", _monomials(POINTS)[1], INVERSE)
 
 
@@ -65,7 +73,7 @@ class Cube:
         How much thinner cells are at z = 0 than at z = L, and at the sides than in the middle.
     """
 
-    def __init__(self, cells: int, size: float, thinner: tuple[float, float] = (16.0, 4.0)) -> None:
+    def __init__(self, cells: int, size: float, thinner: tuple[float, float] = (24.0, 6.0)) -> None:
         self.cells, self.size = cells, size
         t = np.linspace(0, 1, cells + 1)
         up = np.expm1(t * np.log(thinner[0])) / (thinner[0] - 1)
@@ -88,6 +96,7 @@ class Cube:
         self.free = np.flatnonzero(np.repeat(level > 0, 3))
         self.dofs = 3 * self.nodes[:, :, None] + np.arange(3)
         self.load = self._pressed(corners)
+        self._pattern: tuple[NDArray[np.int64], ...] | None = None
         self._solver: Callable[[FloatArray], FloatArray] | None = None
 
     def _pressed(self, corners: FloatArray) -> FloatArray:
@@ -109,12 +118,8 @@ class Cube:
             np.add.at(found, self.nodes[on], areas[:, None] * (w @ values))
         return found
 
-    def _assembled(
-        self, u: FloatArray, mu: float, lmbda: float, factor: FloatArray, *, stiffness: bool
-    ) -> tuple[FloatArray, object]:
-        """Forces (3 nodes,), and their derivatives if asked for."""
-        from scipy.sparse import coo_matrix
-
+    def _assembled(self, u: FloatArray, mu: float, lmbda: float, factor: FloatArray) -> tuple[FloatArray, csr_matrix]:
+        """Forces (3 nodes,), and their derivatives by what is not held."""
         forces, blocks = np.zeros(3 * self.count), []
         eye = np.eye(3)
         for part in np.array_split(np.arange(len(self.tets)), -(-len(self.tets) // 150)):
@@ -129,8 +134,6 @@ class Cube:
             log = np.log(J)[..., None, None]
             P = w[..., None, None] * (mu * (F - turned) + lmbda * log * turned)
             np.add.at(forces, self.dofs[part], np.einsum("eqiJ,eqaJ->eai", P, G))
-            if not stiffness:
-                continue
             A = mu * np.einsum("ik,JL->iJkL", eye, eye) + lmbda * np.einsum("eqiJ,eqkL->eqiJkL", turned, turned)
             A += (mu - lmbda * log)[..., None, None] * np.einsum("eqiL,eqkJ->eqiJkL", turned, turned)
             e, q, a, _ = G.shape
@@ -138,13 +141,25 @@ class Cube:
             rows = left.reshape(e, q, a, 3, 3, 3).transpose(0, 2, 3, 4, 1, 5).reshape(e, a * 9, q * 3)
             K = (rows @ G.transpose(0, 1, 3, 2).reshape(e, q * 3, a)).reshape(e, a, 3, 3, a).transpose(0, 1, 2, 4, 3)
             blocks.append(K.reshape(e, 3 * a, 3 * a))
-        if not stiffness:
-            return forces, None
-        each = self.dofs.reshape(len(self.tets), -1)
-        k = each.shape[1]
-        where = (np.repeat(each, k, axis=1).ravel(), np.tile(each, (1, k)).ravel())
-        matrix = coo_matrix((np.concatenate(blocks).ravel(), where), shape=(3 * self.count,) * 2).tocsr()
-        return forces, matrix[self.free][:, self.free]
+        return forces, self._matrix(np.concatenate(blocks).ravel())
+
+    def _matrix(self, values: FloatArray) -> csr_matrix:
+        """The sum of the matrices of all tetrahedra, without what is held."""
+        from scipy.sparse import csr_matrix
+
+        if self._pattern is None:
+            number = np.full(3 * self.count, -1)
+            number[self.free] = np.arange(len(self.free))
+            each = number[self.dofs.reshape(len(self.tets), -1)]
+            k = each.shape[1]
+            rows, columns = np.repeat(each, k, axis=1).ravel(), np.tile(each, (1, k)).ravel()
+            inside = np.flatnonzero((rows >= 0) & (columns >= 0))
+            places, where = np.unique(rows[inside] * len(self.free) + columns[inside], return_inverse=True)
+            starts = np.searchsorted(places, np.arange(len(self.free) + 1) * len(self.free))
+            self._pattern = inside, where, places % len(self.free), starts
+        inside, where, columns, starts = self._pattern
+        found = np.bincount(where, values[inside], len(columns))
+        return csr_matrix((found, columns, starts), shape=(len(self.free),) * 2)
 
     def solve(
         self,
@@ -185,7 +200,7 @@ class Cube:
     def _newton(self, u: FloatArray, mu: float, lmbda: float, f: FloatArray, load: FloatArray) -> None:
         size = float(np.linalg.norm(load[self.free]))
         for _ in range(25):
-            forces, matrix = self._assembled(u, mu, lmbda, f, stiffness=True)
+            forces, matrix = self._assembled(u, mu, lmbda, f)
             rest = (load - forces)[self.free]
             left = float(np.linalg.norm(rest)) / size
             if left < SETTLED:
@@ -207,15 +222,15 @@ class Cube:
         reference = ordered - np.column_stack([ordered[:, 1:], np.zeros(len(points))])
         tets = 6 * ((cell[:, 0] * self.cells + cell[:, 1]) * self.cells + cell[:, 2]) + which
         values = _monomials(reference)[0] @ INVERSE
-        return np.einsum("na,nai->ni", values, u[self.dofs[tets]])
+        return np.asarray(np.einsum("na,nai->ni", values, u[self.dofs[tets]]))
 
 
-def _factorised(matrix: object) -> Callable[[FloatArray], FloatArray]:
+def _factorised(matrix: csr_matrix) -> Callable[[FloatArray], FloatArray]:
     """Solve with a symmetric matrix."""
     from petsc4py import PETSc
 
-    csr = matrix.sorted_indices()  # type: ignore[attr-defined]
-    A = PETSc.Mat().createAIJ(csr.shape, csr=(csr.indptr.astype("int32"), csr.indices.astype("int32"), csr.data))
+    rows = (matrix.indptr.astype("int32"), matrix.indices.astype("int32"), matrix.data)
+    A = PETSc.Mat().createAIJ(matrix.shape, csr=rows)
     ksp = PETSc.KSP().create(A.comm)
     ksp.setOperators(A)
     ksp.setType("preonly")
@@ -226,19 +241,20 @@ def _factorised(matrix: object) -> Callable[[FloatArray], FloatArray]:
     def solve(rest: FloatArray) -> FloatArray:
         b.array[:] = rest
         ksp.solve(b, x)
-        return np.array(x.array)
+        found: FloatArray = np.array(x.array, dtype=float)
+        return found
 
     return solve
 
 
-def _gradients(matrix: object, b: FloatArray, solve: Callable[[FloatArray], FloatArray], left: float) -> FloatArray:
+def _gradients(matrix: csr_matrix, b: FloatArray, solve: Callable[[FloatArray], FloatArray], left: float) -> FloatArray:
     """Conjugate gradients with a preconditioner, until a share of the right-hand side is left."""
     x, r = np.zeros_like(b), b.copy()
     z = solve(r)
     p, rz = z.copy(), float(r @ z)
     first = rz
     for _ in range(200):
-        q = matrix @ p  # type: ignore[operator]
+        q = matrix @ p
         step = rz / float(p @ q)
         if step <= 0:
             raise ArithmeticError
@@ -250,3 +266,40 @@ def _gradients(matrix: object, b: FloatArray, solve: Callable[[FloatArray], Floa
             break
         p = z + rz / last * p
     return x
+
+
+def main() -> None:
+    """Write displacements for configs/inclusion.toml: 120 random points of four faces, three load cases."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.other_code", description=main.__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--noise", type=float, default=0.03, help="of the root mean square of each load case")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cells", type=int, default=6)
+    given = parser.parse_args()
+    size, rng = 0.05, np.random.default_rng(given.seed)
+    truth = {"x": 0.0273, "y": 0.0221, "z": 0.0311, "radius": 0.0115, "contrast": 4.0}
+    centre = np.array([truth["x"], truth["y"], truth["z"]])
+
+    def factor(places: FloatArray) -> FloatArray:
+        inside = (1 - np.tanh((np.linalg.norm(places - centre, axis=1) - truth["radius"]) / 6e-3)) / 2
+        return np.asarray(truth["contrast"] ** inside)
+
+    points = rng.uniform(0.02, 0.98, (120, 3)) * size
+    for number, (axis, end) in enumerate(((0, 0.0), (0, size), (1, size), (2, size))):
+        points[number::4, axis] = end
+    cube = Cube(given.cells, size)
+    lines = [f"# truth.inclusions.lump.{name} = {value}" for name, value in truth.items()]
+    lines.append("x,y,z,ux,uy,uz,sigma,case")
+    acting = {"shear": (150.0, 0.0, 0.0), "compression": (0.0, 0.0, -200.0), "extension": (0.0, 0.0, 200.0)}
+    for case, traction in acting.items():
+        moved = cube.observed(cube.solve(1e3, 4e3, factor, np.array(traction)), points)
+        sigma = given.noise * float(np.sqrt((moved**2).mean()))
+        moved += sigma * rng.standard_normal(moved.shape)
+        for point, u in zip(points, moved, strict=True):
+            lines.append(",".join([*(f"{value:.9g}" for value in (*point, *u, sigma)), case]))
+    given.file.parent.mkdir(parents=True, exist_ok=True)
+    given.file.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -21,6 +21,7 @@ from workflows.studies.inversion import Inversion
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.bodies.random_fields import NodalPrior
     from uq.evaluation.tasks import Outcome
     from workflows.studies.inversion import InversionStudy
     from workflows.studies.measured import Measurement
@@ -57,7 +58,8 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
     held["ok"] = ("data_set", [one is not None for one in each])
     found = list(study.measurements)
     count = len(found)
-    mean, std = prior_moments(study)
+    prior = study.model.fields[0].prior(study.model.body) if study.field else None
+    mean, std = _prior_moments(study, prior)
     held["prior_mean"], held["prior_std"] = ("parameter", mean), ("parameter", std)
     true = np.full((count, len(study.names)), np.nan)
     for k, m in enumerate(found):
@@ -67,7 +69,9 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
     held["true"] = (("data_set", "parameter"), true)
     if vertices is not None:
         assert isinstance(study, Inversion)
-        held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices)
+        held |= _of_specimen(study, {name: values for name, (_, values) in record.items()}, vertices, prior)
+        if prior is not None:  # the first unknown is the mean over the body
+            true[:, 0] = held["stiffness_true"][1] @ prior.matern.mass / prior.matern.mass.sum()
     coordinates = {
         "data_set": [item.name for item in study.data.sets],
         "parameter": list(study.names),
@@ -80,14 +84,16 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
     return xr.Dataset(held, coordinates, {} if vertices is not None else {"quantity": study.quantity})
 
 
-def _of_specimen(study: Inversion, record: Mapping[str, FloatArray], vertices: Vertices) -> dict[str, Any]:
+def _of_specimen(
+    study: Inversion, record: Mapping[str, FloatArray], vertices: Vertices, prior: NodalPrior | None
+) -> dict[str, Any]:
     """What is known beside the inversions of a specimen: of its points, its inclusions, its mesh."""
     places, cells, kind = vertices
     found = list(study.measurements)
     return {
         "points_moved": ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found]),
         "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found]),
-        "stiffness_prior_std": ("node", prior_stiffness_std(study, places)),
+        "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
         "node_position": (("node", "axis"), places),
@@ -124,11 +130,10 @@ def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any
     }
 
 
-def prior_moments(study: InversionStudy) -> tuple[FloatArray, FloatArray]:
+def _prior_moments(study: InversionStudy, prior: NodalPrior | None) -> tuple[FloatArray, FloatArray]:
     """Prior mean and standard deviation (c,) of the parameters."""
-    if study.field:
+    if prior is not None:
         field = study.model.fields[0]
-        prior = field.prior(study.model.body)
         volumes = prior.matern.mass
         g = volumes / volumes.sum()
         width = float(np.linalg.norm(prior.root_transposed(g)))
@@ -141,10 +146,10 @@ def prior_moments(study: InversionStudy) -> tuple[FloatArray, FloatArray]:
     return mean, std
 
 
-def prior_stiffness_std(study: Inversion, places: FloatArray) -> FloatArray:
+def _prior_stiffness_std(study: Inversion, places: FloatArray, prior: NodalPrior | None) -> FloatArray:
     """Return the prior standard deviation (N,) of ln stiffness at places (N, 3)."""
-    if study.field:
-        return np.asarray(np.sqrt(study.model.fields[0].prior(study.model.body).variance))
+    if prior is not None:
+        return np.asarray(np.sqrt(prior.variance))
     return np.asarray(study.stiffness(places, prior_draws(study)).std(axis=0))
 
 

@@ -560,6 +560,8 @@ def test_a_field_and_its_report(folder):
     assert (found["alone_stiffness_std"] >= found["stiffness_std"] - 1e-9).all()
     assert int((found["eigenvalue"] > 1).sum()) > int((found["alone_eigenvalue"] > 1).sum("direction").max())
     assert np.isfinite(found["stiffness_true"]).all()
+    weights = np.where(abs(found["node_position"] - 0.5) < 0.1, 0.5, 0.25).prod(axis=1)  # of the vertices in the mean
+    assert float(found["true"][0]) == pytest.approx(weights @ found["stiffness_true"].to_numpy())
     centre = int(np.abs(found["node_position"] - [0.5, 0.5, 0.5]).sum("axis").argmin())
     assert float(found["stiffness_true"][centre]) == pytest.approx(np.log(4), abs=0.5)
     page = (folder / "field" / "report.html").read_text()
