@@ -45,7 +45,7 @@ Factor = Callable[[FloatArray], FloatArray]  # places (n, 3) → (n,)
 
 CELLS, OVERKILL = 4, 5  # along an edge, of the inversion and of the data
 WIDE = 1.959964  # deviations of an interval of 95 %
-TRUTHS, FIELDS, SEED = 24, 12, 17
+TRUTHS, ALSO_INVERTED, FIELDS, SEED = 20, 4, 3, 17
 DIRECTIONS = 4  # of a field, of which the data say most
 NOISES = (0.01, 0.03)  # of the root mean square of the displacements of each load case
 LMBDA, WIDTH = 4e4, 0.15
@@ -169,16 +169,16 @@ def main(options: Sequence[str] = ()) -> None:
     """Print how often intervals hold the truth: expected of linear posteriors, and counted in inversions."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks meshes")
     parser.add_argument("--truths", type=int, default=TRUTHS)
-    parser.add_argument("--inverted", type=int, default=TRUTHS)
+    parser.add_argument("--inverted", type=int, default=ALSO_INVERTED)
     parser.add_argument("--fields", type=int, default=FIELDS)
     parser.add_argument("--seed", type=int, default=SEED, help="of the truths; what is uncertain was chosen on 16")
     given = parser.parse_args(list(options))
     inputs = Inputs(PRIORS)
     model: SpecimenModel = specimen().build(MPI.COMM_SELF, PARAMETERS)
     case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).observing(model)))
-    truths, clean = balls(model, inputs, given.truths, given.seed)
+    truths, clean = balls(model, inputs, max(given.truths, given.inverted), given.seed)
     if given.truths:
-        _expect(case, truths, clean)
+        _expect(case, truths[: given.truths], clean[: given.truths])
     if given.inverted:
         _invert(case, truths[: given.inverted], clean[: given.inverted])
     if given.fields:
