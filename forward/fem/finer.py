@@ -4,6 +4,11 @@ Cells are smaller everywhere, and smaller still at the faces that are held, wher
 mesh that is refined equally shares most of the error there. The same grading with as many cells as the specimen has
 tells how fast the error falls, from which follows what the finer mesh still misses (`forward.extrapolated`). Random
 fields are those of the mesh itself, interpolated.
+
+Finer meshes are quadratic, with as many nodes where the specimen is linear, and never coarser than a few cells: the
+differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
+(docs/decisions/0017-mesh-error.md). Only the meshes of random fields on linear boxes are linear: with half the cells
+they could not hold the field.
 """
 
 from __future__ import annotations
@@ -27,6 +32,9 @@ if TYPE_CHECKING:
     from forward.specimen import Specimen
 
 TIMES = 1.5  # cells along an edge, over those of the specimen
+LEAST = {TIMES: 5, 1.0: 3}  # cells along an edge of the finer and of the coarser mesh
+OF_LINEAR = 0.1  # what quadratic cells of the same size still miss, over what they add to linear ones
+QUADRATIC = {"degree": 2, "quadrature_degree": None}
 HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
@@ -53,17 +61,27 @@ def graded(spec: Specimen) -> Specimen | None:
 def share(spec: Specimen) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
     if isinstance(spec.body, MeshFile):
-        return HALVED
-    times = (finer(spec).body.cell_count / spec.body.cell_count) ** (1 / 3)
+        return OF_LINEAR if spec.body.degree == 1 else HALVED
+    fine, coarse = finer(spec).body, (graded(spec) or spec).body
+    times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
     # Displacements converge like h^(degree + 1) where meshes are graded as singular stresses want it.
-    return float(1 / (times ** (spec.body.degree + 1) - 1))
+    return float(1 / (times ** (fine.degree + 1) - 1))
 
 
 def _on(spec: Specimen, times: float) -> Specimen:
     if any(field.of != "stiffness" for field in spec.fields):
         raise ModelError("its density is a random field")
     held = [face for case in spec.cases for face in (*case.clamp, *(item.on for item in case.displacements))]
-    body = spec.body.finer(times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+    body, linear = spec.body, spec.body.degree == 1
+    if isinstance(body, MeshFile) and linear:
+        body = body.model_validate(body.model_dump(exclude={"contents"}) | QUADRATIC)
+    elif isinstance(body, MeshFile):
+        body = body.finer(times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+    else:
+        halve = linear and not spec.fields
+        body = body.finer(times / 2 if halve else times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+        cells = {"cells": tuple(max(n, LEAST[times]) for n in body.cells)}
+        body = body.model_validate(body.model_dump() | cells | (QUADRATIC if halve else {}))
     fields = (RandomField(of="stiffness", length=1.0, std=1.0, basis="nodes"),) if spec.fields else ()
     return spec.model_copy(update={"body": body, "fields": fields, "observed": ()})
 

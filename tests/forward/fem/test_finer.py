@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile, contents, divided
-from forward.fem.finer import OtherMesh, extrapolated, finer, graded, share
+from forward.extrapolated import HALVED
+from forward.fem.finer import OF_LINEAR, OtherMesh, extrapolated, finer, graded, share
 from forward.model import ModelError
 from forward.specimen import Specimen
 from tests.meshes import box, numbered
@@ -180,13 +181,24 @@ FIELD = {"of": "stiffness", "length": 0.6, "std": 0.4}
 
 def test_meshes_are_graded_to_the_faces_that_are_held():
     spec = finer(Specimen.model_validate(CUBE))
-    assert spec.body.cells == (3, 3, 3)
+    assert (spec.body.cells, spec.body.degree) == ((5, 5, 5), 2)
     beside = dict.fromkeys(("x-min", "x-max", "y-min", "y-max"), 4.0)
     assert {face: ratio for face, ratio in spec.body.grading.items() if ratio > 1} == {"z-min": 8.0} | beside
     same = graded(Specimen.model_validate(CUBE))
-    assert same.body.cells == (2, 2, 2)
+    assert (same.body.cells, same.body.degree) == ((3, 3, 3), 2)
     assert same.body.grading == spec.body.grading
-    assert share(Specimen.model_validate(CUBE)) == pytest.approx(1 / (1.5**2 - 1))
+    assert share(Specimen.model_validate(CUBE)) == pytest.approx(1 / ((5 / 3) ** 3 - 1))
+    # As many nodes as linear cells that are smaller, but for fields, which half the cells could not hold.
+    many = CUBE["body"] | {"cells": [12, 12, 8], "quadrature_degree": 3}
+    one, field = CUBE | {"body": many}, {**FIELD, "basis": "nodes"}
+    found = [make(Specimen.model_validate(one)).body for make in (finer, graded)]
+    assert [(body.cells, body.degree) for body in found] == [((9, 9, 6), 2), ((6, 6, 4), 2)]
+    assert found[0].quadrature_degree is None
+    found = [make(Specimen.model_validate(one | {"fields": [field]})).body for make in (finer, graded)]
+    assert [(body.cells, body.degree) for body in found] == [((18, 18, 12), 1), ((12, 12, 8), 1)]
+    two = Specimen.model_validate(CUBE | {"body": many | {"degree": 2, "quadrature_degree": None}})
+    assert (finer(two).body.cells, finer(two).body.degree) == ((18, 18, 12), 2)
+    assert share(two) == pytest.approx(1 / (1.5**3 - 1))
     # A body that is graded more stays so, and one that is graded so is its own.
     steep = CUBE["body"] | {"grading": {"z-min": 20.0}}
     assert finer(Specimen.model_validate(CUBE | {"body": steep})).body.grading["z-min"] == 20.0
@@ -196,6 +208,22 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     cases = [{**CUBE["cases"][0], "loads": [*CUBE["cases"][0]["loads"], heavy]}]
     with pytest.raises(ModelError, match="density is a random field"):
         finer(Specimen.model_validate(CUBE | {"cases": cases, "fields": fields}))
+
+
+def test_linear_cells_of_a_file_are_looked_at_as_quadratic_ones(tmp_path):
+    meshio.write(tmp_path / "box.vtu", numbered(box("tetra")))
+    body = {"kind": "mesh", "file": str(tmp_path / "box.vtu"), "degree": 1}
+    held, loaded = MeshFile(file=body["file"]).boundaries[:2]
+    pull = {"kind": "traction", "on": loaded, "direction": [0, 0, 1], "size": 900}
+    case = {"name": "pull", "clamp": [held], "loads": [pull]}
+    spec = Specimen.model_validate(CUBE | {"body": body, "cases": [case], "observed": [{"on": loaded}]})
+    found = finer(spec).body
+    assert (found.degree, found.cell_count) == (2, spec.body.cell_count)
+    assert share(spec) == OF_LINEAR
+    assert graded(spec) is None
+    two = spec.model_copy(update={"body": found})
+    assert (finer(two).body.degree, finer(two).body.cell_count) == (2, 8 * found.cell_count)
+    assert share(two) == HALVED
 
 
 @pytest.mark.fem
@@ -216,6 +244,8 @@ def test_the_finer_mesh_is_nearer_to_the_truth():
     limit = extrapolated(model, np.array([1e4])).observing(model).solve(point)
     tends, between = np.split(limit.outputs, 2)
     assert np.linalg.norm(truth - tends) < 0.5 * np.linalg.norm(truth - there)
+    # Linear meshes of 3 and 2 cells left a sixth of the error.
+    assert np.linalg.norm(truth - tends) < 0.05 * np.linalg.norm(truth - here)
     assert np.linalg.norm(between) > np.linalg.norm(truth - there)
     slopes = best.observing(model.places, model.axes, model.cases).solve(point).tangent(np.ones(1))
     gaps = [
