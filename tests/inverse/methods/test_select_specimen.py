@@ -152,7 +152,7 @@ def test_one_line_for_a_mistake(study, old, new, told):
 
 def test_what_a_mesh_does_to_an_evidence(study):
     """Beside the evidence of a model that has no such error, of one candidate that moves little and one that does."""
-    it = load(study, ["method.noise.absolute=0.02", "method.samples=64", "method.mesh_error='report'"])
+    it = load(study, ["method.noise.absolute=0.06", "method.samples=64", "method.mesh_error='report'"])
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
     finer = {name: extrapolated(model, np.array([1e3])).observing(model) for name, model in coarse.items()}
 
@@ -183,7 +183,7 @@ def test_what_a_mesh_does_to_an_evidence(study):
     np.testing.assert_allclose(moves, exact, atol=0.4)  # of a model that is linear at the mode
     mode = here["constant_mode"].values[1, 0]
     error = finer["stiff"].solve(mode).outputs[:12] - coarse["stiff"].solve(mode).outputs
-    np.testing.assert_allclose(here["mesh_error"].values[1], error / 0.02, rtol=1e-6)
+    np.testing.assert_allclose(here["mesh_error"].values[1], error / 0.06, rtol=1e-6)
     shift = here["mesh_shift"].values[1, 0, 0] * here["constant_std"].values[1, 0, 0]
     gone = (there["constant_mode"] - here["constant_mode"]).values[1, 0, 0]
     assert shift == pytest.approx(gone, rel=0.5)
