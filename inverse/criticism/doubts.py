@@ -30,6 +30,7 @@ BIASED, WRONG = (
     2.0,
 )  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
+OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
 GRID = np.linspace(-40.0, 40.0, 8001)
 
 
@@ -240,6 +241,10 @@ def mesh_corrected(
         return [Doubt("warning", f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
     if worst > EXTREME or uncertain > DECIDES:
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
+    if len(nodes) and size > OF_FIELD:
+        why = "finer meshes see a field interpolated: what the data determine best may be off by many deviations"
+        short = "its mesh is too coarse for what the data determine best"
+        return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
     return [Doubt("note", text, "")]
 
 
