@@ -87,6 +87,8 @@ class Assessed:
         exact, and since there are few; empty where there are none.
     relative
         Largest error of an output at the mean parameters, relative to it.
+    means
+        Of each output with an estimate: its name, its mean by tangents, the error of that, and what is not known of it.
     solves, seconds
         What it took to find out; the time depends on the machine, and nothing on the time.
     """
@@ -101,6 +103,7 @@ class Assessed:
     close: list[list[float]]
     between: list[list[float]]
     relative: float
+    means: list[tuple[str, float, float, float]]
     solves: int
     seconds: float
 
@@ -257,11 +260,14 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
         found = None
         with suppress(SolveError):
             found = Found(study, inputs, recorder, centre, count)
-        shares, close, relative = np.full((2, 1), np.inf), None, np.inf
+        shares, close, relative, means = np.full((2, 1), np.inf), None, np.inf, list[tuple[str, float, float, float]]()
         if found is not None and found.errors.evaluations.ok.sum() > 1:
             asked, data = goal(study), found.dataset
             sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
             shares, close = (Z * part / (asked.tolerance * sizes) for part in (found.doubts, found.close))
+            known = (data[name].to_numpy().tolist() for name in ("mean", ERRORS[0], f"{ERRORS[0]}_doubt"))
+            rows = zip(recorder.outputs, *known, strict=True)
+            means = [row for row in rows if np.isfinite(row[2])]
             relative = float((np.nan_to_num(np.abs(data["nominal_mesh_error"].to_numpy())) / sizes[0]).max())
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
         return Assessed(
@@ -275,6 +281,7 @@ def _assessed(study: Study, ensemble: Ensemble, directory: Path, count: int) -> 
             [] if close is None else close.tolist(),
             [] if close is None else np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist(),
             relative,
+            means,
             recorder.solves,
             recorder.seconds,
         )

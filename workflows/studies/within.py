@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from uq.methods.method import Method
     from workflows.studies.sampling import Study
 
+FAR_OFF = 2.0  # times what is not known: then estimates on two meshes contradict each other
 ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
 SOURCES = ("mesh", "sampling", "solver", "total")
 ESTIMATED = ("mean", "std")
@@ -81,7 +82,7 @@ def within(
     parts = goal.parts(_moments(found), half_width(found))
     told = _told(study, found, goal, parts, before)
     found.attrs["accuracy"] = json.dumps(told, ensure_ascii=False)
-    add(found, *_findings(study, told))
+    add(found, *_findings(study, told), *contradictions([] if before is None else before["meshes"], told["outputs"]))
     return found
 
 
@@ -149,6 +150,38 @@ def _after(why: str) -> str:
     """What stands behind the first part of a reason."""
     _, semicolon, rest = why.partition("; ")
     return f"{semicolon}{rest}"
+
+
+def contradictions(meshes: Sequence[Mapping[str, Any]], outputs: Mapping[str, Any]) -> Iterator[Finding]:
+    """Find means that moved otherwise, from one mesh to the next, than the estimates of their errors say.
+
+    Parameters
+    ----------
+    meshes
+        Those that were looked at, as they are written down.
+    outputs
+        Of the results, with the error (95 %) of each mean: less does not matter.
+    """
+    if not meshes:
+        return
+    fine = meshes[-1]
+    coarse = next((one for one in reversed(meshes) if one["unknowns"] != fine["unknowns"] and one["means"]), None)
+    if coarse is None:
+        return
+    before = {name: row for name, *row in coarse["means"]}
+    for name, value, error, doubt in fine["means"]:
+        if name not in before:
+            continue
+        its_value, its_error, its_doubt = before[name]
+        seen, foreseen = value - its_value, its_error - error
+        off = abs(seen - foreseen)
+        if off > FAR_OFF * np.hypot(doubt, its_doubt) and off > outputs[name]["mean"]["error"]:
+            text = (
+                f"The estimates of the mesh error of {name} contradict each other: between meshes of "
+                f"{coarse['unknowns']:,} and {fine['unknowns']:,} unknowns its mean moved by {seen:.2g}, where they "
+                f"foresaw {foreseen:.2g}. The error of the corrected value may be larger than is said."
+            )
+            yield Finding("warning", text)
 
 
 def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:

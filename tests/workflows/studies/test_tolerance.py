@@ -12,6 +12,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.plan import plan
 from workflows.studies.tolerance import Assessed, _next, _rate
+from workflows.studies.within import contradictions
 
 TINY = ROOT / "configs" / "tiny.toml"
 OWN = ROOT / "configs" / "own-model.toml"
@@ -135,6 +136,7 @@ def mesh(study, share, estimates=3, between=0.0):
         [[share_close], [0.0]],
         [[between], [0.0]],
         0.01,
+        [],
         4,
         1.0,
     )
@@ -171,6 +173,24 @@ def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
     last = min(n / m for m, n in zip(study.model.body.cells, model.body.cells, strict=True))
     assert 8.0 / last**2 <= 0.61
     assert 8.0 / (0.7 * last) ** 2 > 0.6
+
+
+@pytest.mark.unit
+def test_estimates_that_contradict_each_other_are_said():
+    outputs = {"u": {"mean": {"error": 0.001}}}
+
+    def looked_at(unknowns, value, error, doubt):
+        return {"unknowns": unknowns, "means": [["u", value, error, doubt]]}
+
+    right = [looked_at(100, 1.0, 0.1, 0.025), looked_at(800, 1.08, 0.03, 0.0075)]
+    assert list(contradictions(right, outputs)) == []
+    wrong = [looked_at(100, 1.0, 0.1, 0.025), looked_at(800, 0.95, -0.01, 0.0025)]
+    (found,) = contradictions(wrong, outputs)
+    assert found.severity == "warning"
+    assert "moved by -0.05, where they foresaw 0.11" in found.text
+    assert list(contradictions(wrong, {"u": {"mean": {"error": 0.5}}})) == []  # within the error that is said anyway
+    for few in ([], wrong[:1], [wrong[0], wrong[0]], [{"unknowns": 10, "means": []}, wrong[0]]):
+        assert list(contradictions(few, outputs)) == []
 
 
 @pytest.mark.unit
