@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -21,7 +22,8 @@ from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_point
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
-from forward.fem.cost import Estimate, Times, estimate, times
+from forward.fem.affordable import finer, own_estimate
+from forward.fem.cost import Estimate, Times, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
@@ -382,9 +384,11 @@ class Hyperelastic(ModelSpec):
         return times(self.body, mixed=self.mixed, symmetric=self.symmetric, predicted=predicted, factors=factors)
 
     def mesh_error_cost(self) -> Estimate:
-        """Predict what an estimate of the error of the mesh takes."""
-        enriched = self.enriched()
-        return estimate(self.body, enriched.body, mixed=self.mixed, symmetric=self.symmetric)
+        """Predict what an estimate of the error of the mesh takes, and what calibrates it."""
+        own, calibrating = own_estimate(self), finer(self)
+        if calibrating is None:
+            return own
+        return replace(own, calibration=calibrating.seconds, bytes=own.bytes + calibrating.bytes)
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, and how many unknowns there are of which kind."""

@@ -182,12 +182,19 @@ class Saturation:
         The same of the energy of the difference.
     measured
         Whether they were found for this model; typical values if not.
+    shifts
+        What is added to these errors (m,) then, where what is seen and what is true do not go together; None for zeros.
+    doubts
+        How far the calibrated errors (m,) may be wrong at the solution where this was found; None where that is not
+        known.
     """
 
     outputs: FloatArray
     state: float
     energy: float
     measured: bool = True
+    shifts: FloatArray | None = None
+    doubts: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +236,7 @@ class MeshError:
         """Return the estimate of the whole error, with what elements of one degree more do not see."""
         return replace(
             self,
-            outputs=saturation.outputs * self.outputs,
+            outputs=saturation.outputs * self.outputs + (0.0 if saturation.shifts is None else saturation.shifts),
             seen=self.outputs,
             state=saturation.state * self.state,
             energy=saturation.energy * self.energy,

@@ -12,6 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from forward.bodies.geometry import AXES, Body, Vector, holds
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
+from forward.fem.affordable import own_estimate
 from forward.fem.cost import Estimate, Times, sum_of
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.hyperelastic import Hyperelastic, materials
@@ -224,7 +225,7 @@ class Specimen(ModelSpec):
 
     def mesh_error_cost(self) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all load cases."""
-        return sum_of([self.loaded(case).mesh_error_cost() for case in self.cases])
+        return sum_of([own_estimate(self.loaded(case)) for case in self.cases])
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, which load cases there are, and which unknowns they have."""

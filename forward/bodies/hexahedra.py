@@ -65,11 +65,12 @@ def divided(points: FloatArray, cells: IntArray, boundaries: dict[str, IntArray]
     edge_keys, side_keys = ends[:, 0] << 32 | ends[:, 1], {tuple(side): n for n, side in enumerate(sides.tolist())}
 
     def quartered(facets: IntArray) -> IntArray:
-        pairs = np.sort(np.stack([facets, np.roll(facets, -1, axis=1)], axis=2), axis=2)
+        which = np.array([side_keys[tuple(sorted(facet))] for facet in facets.tolist()])
+        around = circles[which]
+        pairs = np.sort(np.stack([around, np.roll(around, -1, axis=1)], axis=2), axis=2)
         after = starts[0] + np.searchsorted(edge_keys, pairs[..., 0] << 32 | pairs[..., 1])
         before = np.roll(after, 1, axis=1)
-        middle = np.array([starts[1] + side_keys[tuple(sorted(facet))] for facet in facets.tolist()])
-        quads = [np.stack([facets[:, k], after[:, k], middle, before[:, k]], axis=1) for k in range(4)]
+        quads = [np.stack([around[:, k], after[:, k], starts[1] + which, before[:, k]], axis=1) for k in range(4)]
         return np.asarray(np.stack(quads, axis=1).reshape(-1, 4))
 
     found = {name: quartered(facets) for name, facets in boundaries.items()}

@@ -13,7 +13,7 @@ from pydantic import PrivateAttr
 
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.mesh_file import BOUNDARY, Contents, Loaded, MeshFile
-from forward.model import FloatArray
+from forward.model import FloatArray, ModelError
 
 INDICATORS = "indicators"  # name of the array
 
@@ -53,6 +53,17 @@ class MeshInMemory(MeshFile):
         body = cls(contents=found, degree=like.degree, quadrature_degree=like.quadrature_degree)
         body._mesh = mesh
         return body
+
+    def refined(self, level: int) -> Self:
+        """Refuse: there is no file to begin with.
+
+        Raises
+        ------
+        ModelError
+            Always.
+        """
+        message = "a mesh in memory is not divided"
+        raise ModelError(message)
 
     def load(self) -> Loaded:
         """Return the mesh; on the first rank."""

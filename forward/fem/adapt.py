@@ -21,6 +21,7 @@ from forward.bodies.location import locate, shapes
 from forward.bodies.mesh_file import Contents, IntArray, Loaded, contents
 from forward.bodies.tetrahedra import MeshInMemory, tetrahedra
 from forward.fem import recovery
+from forward.fem.affordable import own_estimate
 from forward.fem.dolfinx import meshes
 from forward.fem.model import HyperelasticModel
 from forward.machine import MIB, headroom
@@ -255,7 +256,7 @@ def _too_large(spec: Hyperelastic, most: int) -> str | None:
     """Say why the mesh is too large to be made; None if it is not."""
     if spec.unknowns > most:
         return f"the next mesh would have {spec.unknowns:,} unknowns, unknowns = {most:,}"
-    needed, left = spec.cost(factors=1).bytes + spec.mesh_error_cost().bytes, headroom()
+    needed, left = spec.cost(factors=1).bytes + own_estimate(spec).bytes, headroom()
     if needed > left.size:
         return f"the next mesh, of {spec.unknowns:,} unknowns, would need {needed / MIB:,.0f} MiB, {left}"
     return None

@@ -235,12 +235,18 @@ class Estimate:
         What comes once for many, before the first (s): a factor, or what the steps are preconditioned by.
     bytes
         Memory.
+    calibration
+        What calibrates estimates, once (s); 0 where no finer mesh does.
+    alone
+        Whether the factor of a reference and one of its own are never kept together, since both would be too large.
     """
 
     way: Way
     seconds: float
     once: float
     bytes: float
+    calibration: float = 0.0
+    alone: bool = False
 
 
 def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) -> Estimate:
@@ -258,7 +264,8 @@ def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) ->
     if one <= min(near, smoothed):
         return Estimate(Way.FACTOR, one, fine.setup, held)
     if mixed or (body.degree == 1 and held <= MOST_BYTES):
-        return Estimate(Way.REFERENCE, near, fine.setup + factored, held)
+        alone = held > MOST_BYTES
+        return Estimate(Way.REFERENCE, near, fine.setup + factored, fine.bytes if alone else held, alone=alone)
     return Estimate(Way.SMOOTHING, smoothed, fine.assembly, BYTES_PER_UNKNOWN * 3 * enriched.nodes)
 
 

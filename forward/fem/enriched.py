@@ -40,6 +40,8 @@ ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 1e-3  # relative tolerance of the same solves
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
+BENT_MIXED = 1e-4  # the same with pressures, whose part of the work has the other sign
+NEAR = 0.1  # nonlinearity below which these need no other stiffness
 MORE = 6  # of these, at most: bodies that lock so that they bend half as far as richer ones take four
 AFFORDED = 40_000  # unknowns up to which they have a factor of their own, where the first one does without
 BARELY = 0.3  # nonlinearity up to which a larger body does without them
@@ -108,7 +110,9 @@ class EnrichedState(NamedTuple):
     work
         Its cost.
     before, step
-        The last state (U⁺_local,) of which the equations were linearised, and the step from there to `state`.
+        The last state (U⁺_local,) before it, and the step from there to `state`.
+    linearised
+        The state (U⁺_local,) with whose stiffness that step was found.
     """
 
     state: FloatArray
@@ -119,6 +123,7 @@ class EnrichedState(NamedTuple):
     work: Work
     before: FloatArray
     step: FloatArray
+    linearised: FloatArray
 
     @property
     def relative(self) -> float:
@@ -182,7 +187,8 @@ class Enriched:
             for output, functional in zip(spec.outputs, functionals, strict=True)
         ]
         self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
-        self.way = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric).way
+        cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        self.way, self._alone = cost.way, cost.alone
         self._blocks: tuple[ReferenceSolution | Solved, FloatArray | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
@@ -221,8 +227,15 @@ class Enriched:
         forces[equations.fixed] = 0
         return forces
 
-    def state(self, solution: Solved) -> EnrichedState:
+    def state(self, solution: Solved, bent: float | None = None) -> EnrichedState:
         """Find u_h + e; collective.
+
+        Parameters
+        ----------
+        solution
+            A solution of the body.
+        bent
+            Nonlinearity above which more steps are made; None for the usual one.
 
         Raises
         ------
@@ -230,6 +243,8 @@ class Enriched:
             If the stiffness is singular.
         """
         equations = self.equations
+        if bent is None:
+            bent = BENT_MIXED if equations.spec.mixed else BENT
         equations.work = Work()
         forces = -self.imbalance(solution)
         (change,) = self._solve(solution, forces[None])
@@ -238,24 +253,26 @@ class Enriched:
         energy = 0.5 * equations.curvature(change, forces)
         equations.set_state(start)
         stored = float(self._stored())
-        before, step, moved = start, change, Moved(solution, start + change)
+        before, step, linearised, moved = start, change, start, Moved(solution, start + change)
         left = self.imbalance(moved)
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         for _ in range(MORE):
-            if not BENT < far < np.inf:
+            if not bent < far < np.inf:
                 break
             # Outputs of second order need u_h + e to be in equilibrium.
-            if self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
+            near = far < NEAR  # the stiffness at u_h will do
+            if not near and self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
-            (more,) = self._solve(moved, -left[None])
-            before, step = moved.enriched, more
+            (more,) = self._solve(solution if near else moved, -left[None])
+            before, step, linearised = moved.enriched, more, start if near else moved.enriched
             change = change + more
             moved = Moved(solution, start + change)
             left = self.imbalance(moved)
             closer = nonlinearity(energy, stored, equations.curvature(change, left))
-            far = closer if closer < far else np.inf
-        return EnrichedState(start + change, change, energy, stored, far, equations.work, before, step)
+            settled = closer < NEAR and near  # where pressures and displacements cancel, work says little
+            far = closer if closer < far or settled else np.inf
+        return EnrichedState(start + change, change, energy, stored, far, equations.work, before, step, linearised)
 
     def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
@@ -339,6 +356,8 @@ class Enriched:
     ) -> FloatArray | None:
         """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
         equations = self.equations
+        if self._alone:
+            equations.release()
         known = ReferenceSolution(reference.parameters, self.up(reference.state))
         self._reference.prepare(known)
         R = self._reference.rotation(self._state_of(solution))
@@ -356,6 +375,8 @@ class Enriched:
     def _factorise(self, solution: Solved) -> None:
         equations = self.visit(solution)
         if equations.latest.factorised is not solution:
+            if self._alone:
+                self._reference.release()
             equations.factorise(self._state_of(solution))
             equations.latest.factorised = equations.latest.solution = solution
 
@@ -365,12 +386,11 @@ class Enriched:
         Outputs of the balance of forces are linearised along the last step, as the equations that it solves: at the
         state itself, what is left of second order would count as a force.
         """
-        equations = self.visit(Moved(solution, found.before))
-        linear = {
-            i: f.value() + equations.dot(f.gradient(), found.step)
-            for i, f in enumerate(self._functionals)
-            if f is not None and self._of_forces[i]
-        }
+        forces = {i: f for i, f in enumerate(self._functionals) if f is not None and self._of_forces[i]}
+        equations = self.visit(Moved(solution, found.linearised))
+        slopes = {i: equations.dot(f.gradient(), found.step) for i, f in forces.items()}
+        self.visit(Moved(solution, found.before))
+        linear = {i: f.value() + slopes[i] for i, f in forces.items()}
         self.visit(Moved(solution, found.state))
         known = [np.nan if f is None or i in linear else f.value() for i, f in enumerate(self._functionals)]
         return np.array([linear.get(i, value) for i, value in enumerate(known)])

@@ -170,6 +170,12 @@ class Linearisation(Forms):
             self._curved.value = 1.0
         self.latest.factorised_at = u
 
+    def release(self) -> None:
+        """Free the factor, if there is one."""
+        if "_solver" in vars(self) and self._solver.memory():
+            self._solver.release()
+        self.latest.factorised = None
+
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve K x = right; rows of prescribed unknowns hold their values."""
         if self._moves or self._movers:

@@ -7,6 +7,7 @@ dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
 from __future__ import annotations
 
 import copy
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -32,6 +33,7 @@ from forward.model import (
     Work,
 )
 from forward.observables.observable import Functional
+from forward.registry import named
 from forward.solvers.anderson import Inverse, block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
@@ -399,13 +401,14 @@ class FiniteElementSolution:
     def enriched_state(self) -> EnrichedState:
         """The state in elements of one degree higher, by one linear solve from this state; collective."""
         self._model.visit(self)
-        return self._estimated(self._model.enriched)
+        return self.estimated(self._model.enriched)
 
-    def _estimated(self, enriched: Enriched) -> EnrichedState:
+    def estimated(self, enriched: Enriched, bent: float | None = None) -> EnrichedState:
         """Find the state in an enriched space; solves with the stiffness of the body are charged to it too."""
+        self._model.visit(self)
         kept, self.work = self.work, Work()
         try:
-            found = enriched.state(self)
+            found = enriched.state(self, bent)
             work = found.work.as_array() + self.work.as_array()
         finally:
             self.work = kept
@@ -435,7 +438,7 @@ class FiniteElementSolution:
         twice = model.enriched_twice
         if twice is None:
             return None
-        once, found = self.enriched_state, self._estimated(twice)
+        once, found = self.enriched_state, self.estimated(twice)
         n = 3 * model.equations.nodes_owned
         seen, more = model.enriched.down(once.change)[:n], twice.down(found.change)[:n]
         products = model.equations.total(np.array([seen @ seen, seen @ more]))
@@ -444,22 +447,34 @@ class FiniteElementSolution:
         (of_energy,) = factors(once.energy, found.energy, degree)
         return twice, found, float(of_state), float(of_energy)
 
-    def saturation(self) -> Saturation:
-        """Calibrate estimates of the error of the mesh by elements of two degrees more (`forward.fem.saturation`).
+    def saturation(self, finer: Any | None = None) -> Saturation:
+        """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
-        Collective; typical values where this takes too much memory.
+        Where that is too large, by elements of two degrees more (`forward.fem.saturation`); typical values where this
+        takes too much memory too.
+
+        Parameters
+        ----------
+        finer
+            The body on a finer mesh (`forward.fem.calibration.FinerMesh`), where there is one already.
 
         Raises
         ------
         SolveError
             If a stiffness in an enriched space is singular.
         """
+        if finer is None:
+            finer = named("forward.fem.calibration:FinerMesh")(self._model)
+        with suppress(SolveError):
+            found: Saturation | None = finer.calibrated(self)
+            if found is not None:
+                return found
         seen = self.mesh_error().outputs
         saturated = self.saturated()
         if saturated is None:
             return typical(seen, self._model.spec.body.degree)
-        twice, found, of_state, of_energy = saturated
-        more = twice.values(self, found) - self.outputs
+        twice, state, of_state, of_energy = saturated
+        more = twice.values(self, state) - self.outputs
         return Saturation(factors(seen, more, self._model.spec.body.degree), of_state, of_energy)
 
     def mesh_indicators(self, weights: FloatArray) -> FloatArray:

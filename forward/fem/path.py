@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from forward.fem.calibration import FinerMesh
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
 from forward.model import (
     FloatArray,
@@ -203,10 +204,15 @@ class PathSolution:
 
     def saturation(self) -> Saturation:
         """Calibrate estimates of the error of the mesh, step by step; collective."""
-        found = [step.saturation() for step in self.steps]
+        finer = FinerMesh(self.steps[0]._model)
+        found = [step.saturation(finer) for step in self.steps]
         return Saturation(
             np.concatenate([one.outputs for one in found]),
             float(np.mean([one.state for one in found])),
             float(np.mean([one.energy for one in found])),
             all(one.measured for one in found),
+            np.concatenate([one.shifts if one.shifts is not None else np.zeros(len(one.outputs)) for one in found]),
+            np.concatenate(
+                [one.doubts if one.doubts is not None else np.full(len(one.outputs), np.nan) for one in found]
+            ),
         )

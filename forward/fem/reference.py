@@ -42,6 +42,12 @@ class ReferenceFactor:
         self._rotations = rotations(equations.gradients())
         self._reference = reference
 
+    def release(self) -> None:
+        """Free the factor, if there is one."""
+        if self._reference is not None:
+            self._solver.release()
+            self._reference = self._slopes = self._vectors = None
+
     def _set(self, reference: ReferenceSolution) -> Discretisation:
         equations = self._equations
         equations.set_parameters(reference.parameters)

@@ -29,6 +29,9 @@ class LinearSolver(Protocol):
     def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides."""
 
+    def release(self) -> None:
+        """Free what `factorise` has prepared."""
+
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative eigenvalues of K (its inertia); None if the solver does not know it."""
 

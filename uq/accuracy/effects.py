@@ -36,7 +36,8 @@ Variables = dict[str, tuple[tuple[str, ...], Any]]
 POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
-DOUBT = 0.25  # of an estimate that is calibrated, relative to it
+DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
+ELSEWHERE = 0.1  # the same of what was found at the mean, at other parameters
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
 DIRECTIONS = 12  # of what the estimates leave open, at most, along which its consequences are looked at
 
@@ -85,7 +86,7 @@ def with_mesh_errors(
     """
     drawn = sketch(dataset, inputs, centre)
     effects = [_Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])]
-    unknown = np.where(np.isfinite(found.saturation) & found.measured, DOUBT, UNCALIBRATED)
+    unknown = _unknown(found)
     variables = _of_outputs(dataset, inputs, centre, drawn, effects, unknown)
     variables |= {
         "mesh_error_points": (("estimate", "parameter"), found.evaluations.points),
@@ -97,6 +98,17 @@ def with_mesh_errors(
     dataset = dataset.assign(variables)
     add(dataset, *doubts(dataset, found.evaluations, told))
     return dataset
+
+
+def _unknown(found: MeshErrors) -> FloatArray:
+    """What is not known of each calibrated error (m,), relative to it."""
+    usual = np.where(np.isfinite(found.saturation) & found.measured, DOUBT, UNCALIBRATED)
+    if not len(found.points):
+        return usual
+    at_mean = np.abs(found.errors[0])
+    known = np.isfinite(found.doubts) & (at_mean > 0)
+    share = np.divide(found.doubts, at_mean, out=usual, where=known)
+    return np.where(known, np.hypot(share, ELSEWHERE), usual)
 
 
 # --- outputs ---------------------------------------------------------------------------------------------------------

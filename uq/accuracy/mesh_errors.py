@@ -104,12 +104,18 @@ class MeshErrors:
         Factors (m,) that calibrate errors of outputs, which are multiplied by them; NaN where there are none.
     measured
         Whether these were found at the mean; else they are typical ones.
+    shifts
+        What is added to the errors (m,) then.
+    doubts
+        How far the errors (m,) may be wrong at the mean; NaN where that is not known.
     """
 
     evaluations: Evaluations
     fields: FloatArray | None
     saturation: FloatArray
     measured: bool
+    shifts: FloatArray
+    doubts: FloatArray
 
     @property
     def points(self) -> FloatArray:
@@ -125,7 +131,8 @@ class MeshErrors:
     def errors(self) -> FloatArray:
         """Errors (n, m) of the outputs there; NaN in columns of what is not estimated."""
         assert self.evaluations.mesh_errors is not None
-        return np.asarray(self.evaluations.mesh_errors[self.evaluations.ok] * _factors(self.saturation))
+        seen = self.evaluations.mesh_errors[self.evaluations.ok]
+        return np.asarray(seen * _factors(self.saturation) + np.nan_to_num(self.shifts))
 
 
 def estimate(
@@ -144,8 +151,9 @@ def estimate(
         if calibrated:
             assert found.saturations is not None
             *of_outputs, of_state, measured = found.saturations[0]
+            factors, shifts, doubts = np.reshape(of_outputs, (3, -1))
     displaced = float(_factors(np.array(of_state))) * np.vstack(states) if states else None
-    return MeshErrors(merge(parts), displaced, np.array(of_outputs), bool(measured == 1))
+    return MeshErrors(merge(parts), displaced, factors, bool(measured == 1), shifts, doubts)
 
 
 def _factors(saturation: FloatArray) -> FloatArray:

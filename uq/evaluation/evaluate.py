@@ -83,8 +83,9 @@ class Evaluations:
     mesh_errors
         Estimated errors of the mesh (n, m) if requested, NaN where a solve failed or nothing is estimated.
     saturations
-        Factors (n, m + 2) that calibrate estimated errors of outputs and of the state, and whether they were measured
-        here (1) or are typical ones (0), where they were asked for; NaN where there are none.
+        What calibrates estimated errors (n, 3m + 2), where it was asked for: factors of outputs, what is added then,
+        and how far that may be wrong; the factor of the state; whether they were measured here (1) or are typical
+        ones (0). NaN where there is none.
     """
 
     points: FloatArray
@@ -513,11 +514,11 @@ class BlockSolver:
 
 
 class _MeshErrors:
-    """Errors of the mesh (n, m) of solutions, and what calibrates them (n, m + 2) where it is asked for."""
+    """Errors of the mesh (n, m) of solutions, and what calibrates them (n, 3m + 2) where it is asked for."""
 
     def __init__(self, n: int, m: int, *, saturations: bool) -> None:
         self.errors = np.full((n, m), np.nan)
-        self.saturations = np.full((n, m + 2), np.nan) if saturations else None
+        self.saturations = np.full((n, 3 * m + 2), np.nan) if saturations else None
 
     def take(self, i: int, solution: Solution) -> None:
         """Take those of one; collective. Errors that cannot be calibrated remain estimates.
@@ -537,7 +538,11 @@ class _MeshErrors:
         except SolveError:
             return
         if factors is not None:
-            self.saturations[i] = [*factors.outputs, factors.state, factors.measured]
+            shifts, doubts = (
+                np.full(len(factors.outputs), nothing) if known is None else known
+                for known, nothing in ((factors.shifts, 0.0), (factors.doubts, np.nan))
+            )
+            self.saturations[i] = [*factors.outputs, *shifts, *doubts, factors.state, factors.measured]
 
 
 def merge(blocks: Sequence[Evaluations], fields: FieldSum | None = None) -> Evaluations:

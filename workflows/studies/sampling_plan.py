@@ -96,7 +96,7 @@ def _estimates(study: Study) -> Iterator[Part]:
         return
     each = times_of(study.spec).sample + estimating.seconds
     yield Part(
-        estimating.once + study.estimates * each,
+        estimating.once + estimating.calibration + study.estimates * each,
         f"{study.estimates} estimates of the mesh error, {each:.2g} s each",
         True,
     )
@@ -104,7 +104,10 @@ def _estimates(study: Study) -> Iterator[Part]:
 
 def _compilation(study: Study) -> float:
     """Seconds of the forms of a body, and of those for the error of its mesh."""
-    return COMPILATION * (3 if study.estimates else 1)  # in elements of one degree more, and once of two
+    estimating = study.spec.mesh_error_cost() if study.estimates else None
+    if estimating is None:
+        return COMPILATION
+    return COMPILATION * (2 if estimating.calibration else 3)  # in elements of one degree more, and perhaps of two
 
 
 def _compiled_before() -> bool:

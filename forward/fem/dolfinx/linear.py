@@ -226,6 +226,11 @@ class DirectSolver:
         solutions.destroy()
         return result
 
+    def release(self) -> None:
+        """Free the factor."""
+        self._renew()
+        self._factorised = False
+
     def negative_eigenvalues(self) -> int | None:
         """Return the number of negative pivots of LDLᵀ, which is that of negative eigenvalues; None for LU."""
         if not self._symmetric:

@@ -1,0 +1,169 @@
+"""What errors of a mesh tend to: a solution on a finer mesh at the same parameters, with its own estimate.
+
+With ψ_h and the error e_h that elements of one degree more see of it, and ψ_f and e_f of the same elements on a mesh
+whose cells are t times smaller, the richer values ψ_h + e_h and ψ_f + e_f err by a power of t. That power is the one
+with which e itself falls, e_f = s e_h, where the same singularity (a held edge, a re-entrant corner, a jump of a load)
+makes the errors of both degrees. So ψ = ψ_f + e_f + s/(1 − s) (ψ_f + e_f − ψ_h − e_h), Richardson's extrapolation with
+the order that is observed (L. F. Richardson, Phil. Trans. R. Soc. A 226 (1927) 299–361). Where linear elements show an
+order a, which is 2 at most, the richer ones have 2a − 1. Orders below 1, and estimates that change their sign, are not
+believed: then it is 1, and the doubt is larger.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from forward.fem.affordable import finer
+from forward.fem.dolfinx import spaces
+from forward.fem.layout import sorted_by_place
+from forward.model import FloatArray, Guess, Saturation
+
+if TYPE_CHECKING:
+    from forward.fem.model import FiniteElementSolution, HyperelasticModel
+
+LOWEST, HIGHEST = 1.0, 4.0  # orders
+OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated, and of the whole error
+LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
+THOROUGH = {False: 1e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
+
+
+class Limit(NamedTuple):
+    """Errors (m,) of a mesh, exact minus computed, and how far they may be wrong."""
+
+    errors: FloatArray
+    doubts: FloatArray
+
+
+def limit(
+    own: ArrayLike, seen: ArrayLike, finer: ArrayLike, seen_there: ArrayLike, times: float, degree: int = 2
+) -> Limit:
+    """Extrapolate errors of outputs on a mesh.
+
+    Parameters
+    ----------
+    own, seen
+        Outputs (m,) on the mesh, and their errors as elements of one degree more see them.
+    finer, seen_there
+        The same on the finer mesh.
+    times
+        Cells there along each edge, over those of the mesh.
+    degree
+        Of the body.
+    """
+    parts = (np.asarray(part, dtype=float) for part in (own, seen, finer, seen_there))
+    values, e, there, e_there = np.broadcast_arrays(*parts)
+    ratio = np.divide(e_there, e, out=np.full(e.shape, np.nan), where=e != 0)
+    regular = (ratio > 0) & (ratio <= times**-LOWEST)
+    share = np.where(regular, np.maximum(ratio, times**-HIGHEST), times**-LOWEST)
+    if degree == 1:  # whose own order is at most 2, and that of richer elements more where the solution is smooth
+        share = share**2 * times
+    rest = share / (1 - share) * (there + e_there - values - e)
+    errors = there + e_there - values + rest
+    doubts = OF_REST * np.abs(rest) + OF_ALL * np.abs(errors) + np.where(regular, 0.0, np.abs(e_there))
+    return Limit(errors, doubts)
+
+
+def saturation(seen: FloatArray, found: Limit, of_state: float) -> Saturation:
+    """Return what makes errors (m,) as they are usually seen those that were found."""
+    ratio = np.divide(found.errors, seen, out=np.zeros(seen.shape), where=seen != 0)
+    together = (ratio >= LEAST) & (ratio <= MOST)
+    outputs = np.where(np.isnan(found.errors), np.nan, np.where(together, ratio, 1.0))
+    shifts = np.where(together | np.isnan(found.errors), 0.0, found.errors - seen)
+    return Saturation(outputs, of_state, of_state, shifts=shifts, doubts=found.doubts)
+
+
+class FinerMesh:
+    """A body on a finer mesh, made when it is first solved on.
+
+    Parameters
+    ----------
+    model
+        The body.
+    """
+
+    def __init__(self, model: HyperelasticModel) -> None:
+        self._model = model
+        self._scalars = [i for i, path in enumerate(model.parameters) if path in model.spec.scalars]
+
+    @cached_property
+    def _made(self) -> tuple[HyperelasticModel, float] | None:
+        model, found = self._model, finer(self._model.spec)
+        if found is None:
+            return None
+        return found.spec.build(model.equations.comm, tuple(model.parameters[i] for i in self._scalars)), found.times
+
+    def calibrated(self, solution: FiniteElementSolution) -> Saturation | None:
+        """Calibrate estimates by the finer mesh at the parameters of a solution; collective.
+
+        None where that takes too much, or where coefficients of random fields are not zero: every mesh has its own.
+
+        Raises
+        ------
+        SolveError
+            If there is no such solution on the finer mesh.
+        """
+        model, point = self._model, solution.parameters
+        if np.delete(point, self._scalars).any() or self._made is None:
+            return None
+        (other, times), degree = self._made, model.spec.body.degree
+        usual, bent = solution.mesh_error().outputs, THOROUGH[model.spec.mixed]
+        own = solution.estimated(model.enriched, bent)
+        seen = model.enriched.values(solution, own) - solution.outputs
+        guess = other.space.scatter(_moved(model, other, solution.state[None]))[0]
+        there = other.solve(point[self._scalars], Guess(guess))
+        richer = there.estimated(other.enriched, bent)
+        seen_there = other.enriched.values(there, richer) - there.outputs
+        found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
+        before = _everywhere(model, np.array([solution.state, model.enriched.down(own.change)]))
+        after = _moved(other, model, np.array([there.state, other.enriched.down(richer.change)]))
+        n = model.space.displacements
+        return saturation(usual, found, of_states(before[:, :n], after[:, :n], times, degree))
+
+
+def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) -> float:
+    """Return the factor between the error of a state and what is seen of it.
+
+    Parameters
+    ----------
+    before, after
+        State and estimate (2, U) on the mesh, and on the finer one.
+    times, degree
+        As of `limit`.
+    """
+    (own, seen), (there, seen_there) = before, after
+    square = float(seen @ seen)
+    if not square > 0:
+        return 1.0
+    along = [float(x @ seen) / square for x in (there - own, seen_there)]
+    return float(np.clip(limit(0.0, 1.0, along[0], along[1], times, degree).errors, LEAST, MOST))
+
+
+def _everywhere(model: HyperelasticModel, rows: FloatArray) -> FloatArray:
+    """Return rows (k, U_local) as (k, U) on every rank."""
+    whole = model.space.gather(rows)
+    return np.asarray(model.equations.comm.bcast(whole))
+
+
+def _moved(model: HyperelasticModel, other: HyperelasticModel, rows: FloatArray) -> FloatArray:
+    """Return rows (k, U_local), interpolated at the nodes of another mesh, as (k, U') on every rank; collective."""
+    whole, start, parts = _everywhere(model, rows), 0, []
+    here, there = model.equations.unknowns, other.equations.unknowns
+    for source, target, components in ((here.displacement, there.displacement, 3), (here.pressure, there.pressure, 1)):
+        if source is None:
+            continue
+        points, *_ = sorted_by_place(target, other.equations.comm)
+        nodes, canonical, _ = sorted_by_place(source, model.equations.comm)
+        values = whole[:, start : start + components * len(nodes)].reshape(len(rows), -1, components)
+        start += components * len(nodes)
+        numbers = canonical[spaces.global_node_numbers(source)]
+        weights, _ = spaces.point_weights(source, points)
+        moved = np.zeros((len(rows), len(points), components))
+        for i, one in enumerate(weights):
+            if one is not None:
+                moved[:, i] = one[1] @ values[:, numbers[one[0]]]
+        parts.append(moved.reshape(len(rows), -1))
+    return np.asarray(model.equations.comm.allreduce(np.concatenate(parts, axis=1)))
