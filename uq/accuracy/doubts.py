@@ -81,7 +81,15 @@ def _unexplained(names: Names, dataset: xr.Dataset, counts: NDArray[np.bool_]) -
     error, doubt = np.abs(dataset["mesh_error"].to_numpy()), dataset["mesh_error_doubt"].to_numpy()
     rough = doubt > ROUGH * error
     visible = doubt > np.maximum(dataset["mean_error"].to_numpy(), VISIBLE * np.abs(dataset["mean"].to_numpy()))
-    unclear = rough & visible & counts
+    contradicted = dataset["mesh_error_unknown"].to_numpy() > ROUGH
+    unclear = rough & visible & counts & ~contradicted
+    if (contradicted & visible & counts).any():
+        text = (
+            "Richer elements and a finer mesh do not agree on the error of the mesh for "
+            f"{_listed(names[contradicted & visible & counts].tolist(), ', ')}: where errors of several places cancel, "
+            "little more than their size is known (mesh_error_doubt). A finer mesh makes it smaller."
+        )
+        yield Finding("note", text)
     if unclear.any():
         listed = ", ".join(names[unclear])
         text = (

@@ -37,7 +37,7 @@ POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
-ELSEWHERE = 0.1  # the same of what was found at the mean, at other parameters
+ELSEWHERE = 0.15  # the same of what was found at the mean, at other parameters
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
 DIRECTIONS = 12  # of what the estimates leave open, at most, along which its consequences are looked at
 
@@ -92,6 +92,8 @@ def with_mesh_errors(
         "mesh_error_points": (("estimate", "parameter"), found.evaluations.points),
         "mesh_error_values": (("estimate", "output"), found.evaluations.mesh_errors),
         "mesh_error_saturation": (("output",), found.saturation),
+        "mesh_error_shift": (("output",), found.shifts),
+        "mesh_error_unknown": (("output",), unknown),
     }
     if found.fields is not None and len(found.points) >= FEWEST_ANSWERS:
         variables |= _of_fields(dataset, inputs, centre, drawn, found)

@@ -9,7 +9,7 @@ import xarray as xr
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
 from uq.accuracy.doubts import Told
-from uq.accuracy.effects import DOUBT, UNCALIBRATED, with_mesh_errors
+from uq.accuracy.effects import DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors
 from uq.accuracy.mesh_errors import design, estimate
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
@@ -36,6 +36,8 @@ class OnMesh(FunctionModel):
 
     exact: FunctionModel | None = None
     seen: float = 1.0  # share of the error that an estimate sees
+    missed: float = 0.0  # constant part of it that estimates do not see
+    doubt: float | None = None  # of calibrated errors
 
     def solve(self, parameters, guess=None):
         found = super().solve(parameters, guess)
@@ -48,13 +50,17 @@ class SolvedOnMesh(FunctionSolution):
 
     def mesh_error(self):
         errors = self.model.exact.function(self.parameters) - self.outputs
-        seen = self.model.seen * errors
+        seen = self.model.seen * errors - self.model.missed
         return MeshError(seen, np.empty(0), 0.0, np.nan, Work())
 
     def saturation(self):
+        m = len(self.outputs)
+        if self.model.doubt is not None:
+            shifts, doubts = np.full(m, self.model.missed), np.full(m, self.model.doubt)
+            return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts)
         if self.model.seen == 1.0:
             return None
-        return Saturation(np.full(len(self.outputs), 1 / self.model.seen), 1.0, 1.0)
+        return Saturation(np.full(m, 1 / self.model.seen), 1.0, 1.0)
 
 
 def on_mesh(error, names=("a", "b")):
@@ -406,3 +412,21 @@ def test_estimates_are_calibrated_once_at_the_mean():
     np.testing.assert_allclose(found["mesh_error_saturation"], 1 / 0.6)
     np.testing.assert_allclose(found["mesh_error_doubt"], DOUBT * abs(found["mesh_error"]), rtol=0.05)
     np.testing.assert_allclose(plain["mesh_error_doubt"], UNCALIBRATED * abs(plain["mesh_error"]), rtol=0.05)
+
+
+def test_what_estimates_miss_is_added_and_its_doubt_is_told():
+    _, plain = studied(Chaos(samples=24), on_mesh(affine))
+    sure, unsure = (
+        studied(Chaos(samples=24), replace(on_mesh(affine), missed=0.2, doubt=doubt))[1] for doubt in (0.01, 0.2)
+    )
+    for name in ("mesh_error", "std_mesh_error", "quantiles_mesh_error", "derivative_mesh_error"):
+        np.testing.assert_allclose(sure[name], plain[name], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(sure["mesh_error_shift"], 0.2)
+    at_mean = abs(np.array(affine(INPUTS.mean)))
+    for found, doubt in ((sure, 0.01), (unsure, 0.2)):
+        relative = np.hypot(doubt / at_mean, ELSEWHERE)
+        np.testing.assert_allclose(found["mesh_error_unknown"], relative)
+        np.testing.assert_allclose(found["mesh_error_doubt"], relative * abs(found["mesh_error"]), rtol=0.05)
+    told = "do not agree on the error of the mesh for u, v"
+    assert any(told in one.text for one in findings(unsure))
+    assert not any("do not agree" in one.text for one in findings(sure))
