@@ -183,7 +183,8 @@ class Saturation:
     measured
         Whether they were found for this model; typical values if not.
     shifts
-        What is added to these errors (m,) then, where what is seen and what is true do not go together; None for zeros.
+        What is added to these errors (m,) then, where what is seen and what is true do not go together; at other
+        solutions, in proportion to the outputs. None for zeros.
     doubts
         How far the calibrated errors (m,) may be wrong at the solution where this was found; None where that is not
         known.
@@ -232,11 +233,20 @@ class MeshError:
     seen: FloatArray | None = None
     nonlinearity: float = 0.0
 
-    def calibrated(self, saturation: Saturation) -> MeshError:
-        """Return the estimate of the whole error, with what elements of one degree more do not see."""
+    def calibrated(self, saturation: Saturation, ratios: ArrayLike = 1.0) -> MeshError:
+        """Return the estimate of the whole error, with what elements of one degree more do not see.
+
+        Parameters
+        ----------
+        saturation
+            What calibrates it.
+        ratios
+            Outputs (m,) over those where that was found.
+        """
+        added = 0.0 if saturation.shifts is None else saturation.shifts * np.asarray(ratios)
         return replace(
             self,
-            outputs=saturation.outputs * self.outputs + (0.0 if saturation.shifts is None else saturation.shifts),
+            outputs=saturation.outputs * self.outputs + added,
             seen=self.outputs,
             state=saturation.state * self.state,
             energy=saturation.energy * self.energy,

@@ -38,9 +38,10 @@ STEPS = 100  # of conjugate gradients, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 1e-3  # relative tolerance of the same solves
+CLOSER = 0.1  # that of further steps, which change a tenth
 NEGLIGIBLE = 1e-3  # error relative to the state below which nothing bends
 BENT = 0.05  # nonlinearity above which more steps are made
-BENT_MIXED = 1e-4  # the same with pressures, whose part of the work has the other sign
+BENT_MIXED = 1e-3  # the same with pressures, whose part of the work has the other sign
 NEAR = 0.1  # nonlinearity below which these need no other stiffness
 MORE = 6  # of these, at most: bodies that lock so that they bend half as far as richer ones take four
 AFFORDED = 40_000  # unknowns up to which they have a factor of their own, where the first one does without
@@ -235,7 +236,8 @@ class Enriched:
         solution
             A solution of the body.
         bent
-            Nonlinearity above which more steps are made; None for the usual one.
+            Nonlinearity above which more steps are made; None for the usual one, and then one step with the stiffness
+            at the solution is enough.
 
         Raises
         ------
@@ -243,6 +245,7 @@ class Enriched:
             If the stiffness is singular.
         """
         equations = self.equations
+        once = bent is None
         if bent is None:
             bent = BENT_MIXED if equations.spec.mixed else BENT
         equations.work = Work()
@@ -264,7 +267,7 @@ class Enriched:
             if not near and self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
-            (more,) = self._solve(solution if near else moved, -left[None])
+            (more,) = self._solve(solution, -left[None], close=CLOSER) if near else self._solve(moved, -left[None])
             before, step, linearised = moved.enriched, more, start if near else moved.enriched
             change = change + more
             moved = Moved(solution, start + change)
@@ -272,18 +275,23 @@ class Enriched:
             closer = nonlinearity(energy, stored, equations.curvature(change, left))
             settled = closer < NEAR and near  # where pressures and displacements cancel, work says little
             far = closer if closer < far or settled else np.inf
+            if near and once:
+                break
         return EnrichedState(start + change, change, energy, stored, far, equations.work, before, step, linearised)
 
-    def _solve(self, solution: Solved, right: FloatArray, *, transpose: bool = False) -> FloatArray:
+    def _solve(
+        self, solution: Solved, right: FloatArray, *, transpose: bool = False, close: float = CLOSE
+    ) -> FloatArray:
         """Solve with K⁺ at a solution for rows (k, U⁺_local) that are zero on prescribed unknowns.
 
-        To rounding with its own factor, or roughly in one of the other ways.
+        To rounding with its own factor, or roughly in one of the other ways: with that of a reference, to a relative
+        tolerance.
         """
         found = None
         if self.way == Way.SMOOTHING and not isinstance(solution, Moved):  # where K(u_h) is near
             found = self._solve_by_smoothing(solution, right, transpose=transpose)
         elif self.way == Way.REFERENCE and solution.reference is not None:
-            found = self._solve_near(solution, solution.reference, right, transpose=transpose)
+            found = self._solve_near(solution, solution.reference, right, close, transpose=transpose)
         if found is None:
             self._factorise(solution)
             found = self.equations.back_substitute(right, transpose=transpose)
@@ -352,7 +360,7 @@ class Enriched:
         return ReferenceFactor(self.equations)
 
     def _solve_near(
-        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, *, transpose: bool
+        self, solution: Solved, reference: ReferenceSolution, right: FloatArray, close: float, *, transpose: bool
     ) -> FloatArray | None:
         """Solve with the factor of the enriched stiffness at a reference; None if the reference is too far away."""
         equations = self.equations
@@ -368,7 +376,7 @@ class Enriched:
             right,
             equations.total,
             equations.norms,
-            CLOSE,
+            close,
             ITERATIONS,
         )
 

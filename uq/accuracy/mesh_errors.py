@@ -33,6 +33,7 @@ EXPECTED, BELIEF = (
     0.3,
     2.0,
 )  # how far an error is expected to vary, relative to itself, and the estimates that this is worth
+FAR_OFF = 10.0  # times the output at the mean: beyond, what is added to errors does not follow the output
 SMALL = 0.05  # of the largest output at the points: where it is smaller somewhere, no ratio to it is taken
 
 
@@ -105,7 +106,7 @@ class MeshErrors:
     measured
         Whether these were found at the mean; else they are typical ones.
     shifts
-        What is added to the errors (m,) then.
+        What is added to the errors (m,) then, at the mean; elsewhere in proportion to the outputs.
     doubts
         How far the errors (m,) may be wrong at the mean; NaN where that is not known.
     """
@@ -132,7 +133,11 @@ class MeshErrors:
         """Errors (n, m) of the outputs there; NaN in columns of what is not estimated."""
         assert self.evaluations.mesh_errors is not None
         seen = self.evaluations.mesh_errors[self.evaluations.ok]
-        return np.asarray(seen * _factors(self.saturation) + np.nan_to_num(self.shifts))
+        outputs = self.outputs
+        first = outputs[:1] if len(outputs) and self.evaluations.ok[0] else np.ones((1, outputs.shape[1]))
+        ratios = np.divide(outputs, first, out=np.ones(outputs.shape), where=first != 0)
+        near = (ratios > 1 / FAR_OFF) & (ratios < FAR_OFF)
+        return np.asarray(seen * _factors(self.saturation) + np.nan_to_num(self.shifts) * np.where(near, ratios, 1.0))
 
 
 def estimate(

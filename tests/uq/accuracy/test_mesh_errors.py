@@ -36,7 +36,7 @@ class OnMesh(FunctionModel):
 
     exact: FunctionModel | None = None
     seen: float = 1.0  # share of the error that an estimate sees
-    missed: float = 0.0  # constant part of it that estimates do not see
+    missed: float = 0.0  # part of the output that estimates of its error do not see
     doubt: float | None = None  # of calibrated errors
 
     def solve(self, parameters, guess=None):
@@ -50,13 +50,13 @@ class SolvedOnMesh(FunctionSolution):
 
     def mesh_error(self):
         errors = self.model.exact.function(self.parameters) - self.outputs
-        seen = self.model.seen * errors - self.model.missed
+        seen = self.model.seen * errors - self.model.missed * self.outputs
         return MeshError(seen, np.empty(0), 0.0, np.nan, Work())
 
     def saturation(self):
         m = len(self.outputs)
         if self.model.doubt is not None:
-            shifts, doubts = np.full(m, self.model.missed), np.full(m, self.model.doubt)
+            shifts, doubts = self.model.missed * self.outputs, np.full(m, self.model.doubt)
             return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts)
         if self.model.seen == 1.0:
             return None
@@ -421,7 +421,7 @@ def test_what_estimates_miss_is_added_and_its_doubt_is_told():
     )
     for name in ("mesh_error", "std_mesh_error", "quantiles_mesh_error", "derivative_mesh_error"):
         np.testing.assert_allclose(sure[name], plain[name], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(sure["mesh_error_shift"], 0.2)
+    np.testing.assert_allclose(sure["mesh_error_shift"], 0.2 * on_mesh(affine).function(INPUTS.mean))
     at_mean = abs(np.array(affine(INPUTS.mean)))
     for found, doubt in ((sure, 0.01), (unsure, 0.2)):
         relative = np.hypot(doubt / at_mean, ELSEWHERE)
