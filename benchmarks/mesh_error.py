@@ -330,7 +330,7 @@ def elsewhere() -> None:
     compressible = {"kind": "neo-hookean", "C1": 40e6, "D1": 80e6}
     of_cook = load(CONFIGS / "cook.toml").inputs
     of_tube = Inputs(
-        {"material.c": Uniform(lower=7e3, upper=1.3e4), "loads.pressure.size": Uniform(lower=1e3, upper=3e3)}
+        {"material.c": Uniform(lower=8e3, upper=1.2e4), "loads.pressure.size": Uniform(lower=1.2e3, upper=1.9e3)}
     )
     found = []
     with TemporaryDirectory() as folder:
