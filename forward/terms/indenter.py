@@ -111,6 +111,8 @@ class Indenter(Term):
         Between the side of a cone and its axis (degrees).
     tip
         Radius of curvature (m) of the tip of a cone; a twentieth of the depth by default.
+    friction
+        Coefficient of friction; only 0 is possible so far.
     penetration
         Largest penetration that is aimed at, relative to the depth.
     """
@@ -128,6 +130,7 @@ class Indenter(Term):
     axis: Direction | None = None
     angle: Annotated[float | None, Gt(0), Lt(90), Unit("°")] = None
     tip: Annotated[float | None, Gt(0), Unit("m")] = None
+    friction: Annotated[float, Ge(0)] = 0.0
     penetration: Annotated[float, Gt(0), Le(0.1)] = 1e-3
 
     @property
@@ -319,6 +322,8 @@ class Indenter(Term):
                 yield f"a tool with shape = '{self.shape}' needs {name}"
             if given and name not in (*needed, *allowed):
                 yield f"a tool with shape = '{self.shape}' has no {name}"
+        if self.friction:
+            yield f"contact with friction ({self.friction:g}) is not there yet, expected friction = 0"
         if self.edge is not None and self.radius is not None and self.edge > self.radius:
             yield f"its edge is rounder ({self.edge:g} m) than the tool (radius {self.radius:g} m)"
         if self.axis is not None and np.linalg.norm(np.cross(self.axis, self.direction)) < 1e-9 * np.linalg.norm(

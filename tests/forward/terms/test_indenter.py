@@ -224,6 +224,8 @@ def test_two_tools_squeeze_a_body_between_them():
         ({"at": (0.0, 0.0, 2 * SIDE)}, "does not reach 'z-max': at its depth, 0.019 m are left"),
         ({"depth": 0.03}, r"as deep as the body is thick there \(0.02 m\)"),
         ({"depth": -1e-3}, "greater than or equal to 0"),
+        ({"friction": -0.1}, "greater than or equal to 0"),
+        ({"friction": 0.2}, "friction .0.2. is not there yet, expected friction = 0"),
         ({"radius": None}, "a tool with shape = 'sphere' needs radius"),
         ({"edge": 1e-3}, "a tool with shape = 'sphere' has no edge"),
         ({"shape": "cylinder", "axis": (0.0, 0.0, 2.0)}, "lies along its direction"),
