@@ -33,8 +33,16 @@ def edges(corners: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1))
 
 
-def points(corners: FloatArray, near: FloatArray) -> FloatArray:
-    """Return points (n, 3) of facets (k, m, 3): corners and centres, and many of those near a point (3,)."""
+def points(corners: FloatArray, near: FloatArray, along: FloatArray) -> FloatArray:
+    """Return points (n, 3) of facets (k, m, 3): corners, centres, where a line pierces them, and many near a point.
+
+    Parameters
+    ----------
+    corners
+        The facets (m).
+    near, along
+        The point (3,) (m), and the direction (3,) of the line through it.
+    """
     centres = corners.mean(axis=1)
     close = np.linalg.norm(centres - near, axis=1) <= 1.5 * edges(corners)
     s, t = (part.ravel() for part in np.meshgrid(*[np.linspace(0, 1, FINE + 1)] * 2))
@@ -44,4 +52,15 @@ def points(corners: FloatArray, near: FloatArray) -> FloatArray:
         inside = s + t <= 1 + 1e-9
         weights = np.stack([1 - s - t, s, t], axis=1)[inside]
     fine = np.einsum("pk,nkx->npx", weights, corners[close]).reshape(-1, 3)
-    return np.concatenate([corners.reshape(-1, 3), centres, fine])
+    return np.concatenate([corners.reshape(-1, 3), centres, fine, _pierced(corners, near, along)])
+
+
+def _pierced(corners: FloatArray, start: FloatArray, along: FloatArray) -> FloatArray:
+    """Return where the line through a point (3,) along a direction (3,) pierces facets, divided into triangles."""
+    fan = [corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)]
+    a, b, c = np.moveaxis(np.concatenate(fan), 1, 0)
+    sides = np.stack([b - a, c - a, np.broadcast_to(-along, a.shape)], axis=2)
+    steep = np.abs(np.linalg.det(sides)) > 1e-12 * np.linalg.norm(sides, axis=1).prod(axis=1)
+    s, t, far = np.linalg.solve(sides[steep], (start - a[steep])[..., None])[..., 0].T
+    inside = (s >= -1e-9) & (t >= -1e-9) & (s + t <= 1 + 1e-9)
+    return np.asarray(start + far[inside, None] * along)

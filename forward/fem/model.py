@@ -41,6 +41,8 @@ from forward.solvers.stability import NOT_SCREENED, Screened, draw
 from forward.solvers.system import Found, Residual
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
+AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
+UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
 ENTERED = 5  # times the penetration that is aimed at
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
 
@@ -75,6 +77,7 @@ class HyperelasticModel(OneByOne):
         self.parameters = parameters
         self._materials = spec.materials(parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
+        self._extent = max(high - low for low, high in spec.body.bounds)
         self.equations = Discretisation(spec, comm, parameters)
         self.space = BodySpace(self.equations)
         self.differentiable = True
@@ -152,13 +155,23 @@ class HyperelasticModel(OneByOne):
         """Refuse an equilibrium in which the body enters a tool by far more than is aimed at."""
         equations = self.equations
         equations.set_state(found.state)
-        for label, penetration in equations.penetrations().items():
-            depth = equations.number(f"loads.{label}.depth")
-            (aim,) = (load.penetration for load in self.spec.loads if load.label == label)  # type: ignore[attr-defined]
-            if depth > 0 and penetration > ENTERED * aim * depth:
+        at_rest = equations.norm(found.state) <= AT_REST * self._extent
+        for load in (load for load in self.spec.loads if load.contact):
+            label, penetration = load.label, equations.penetrations()[load.label]
+            numbers = {name: equations.number(f"loads.{label}.{name}") for name in load.scalars}
+            depth = numbers["depth"]
+            if depth > 0 and penetration > ENTERED * load.penetration * depth:  # type: ignore[attr-defined]
                 message = (
                     f"the body enters the tool '{label}' by {penetration / depth:.2g} of its depth, where "
-                    f"{aim:g} is aimed at: it is stiffer than its constants as stated; lower loads.{label}.penetration"
+                    f"{load.penetration:g} is aimed at: "  # type: ignore[attr-defined]
+                    "pressures are far above those of the depth and the constants as stated (large strains, a stiffer "
+                    f"body, a coarse mesh); lower loads.{label}.penetration"
+                )
+                raise SolveError(message, work=equations.work)
+            if at_rest and load.entered(self.spec.body, numbers) > UNSEEN * depth:  # type: ignore[attr-defined]
+                message = (
+                    f"the tool '{label}' enters the body between the points at which contact is looked for: it is too "
+                    "sharp, or its depth too small, for the mesh; refine the mesh there"
                 )
                 raise SolveError(message, work=equations.work)
 

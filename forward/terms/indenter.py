@@ -221,12 +221,16 @@ class Indenter(Term):
                 found["tip"] = constant(SHARP * self._depth)
         return found
 
-    def gaps(self, points: FloatArray, depth: float | None = None) -> FloatArray:
-        """Return the signed distances (n,) of points (n, 3) (m), at its own depth or at another."""
-        numbers = {name: scalar.value for name, scalar in self.scalars.items()}
-        if depth is not None:
-            numbers["depth"] = depth
+    def gaps(self, points: FloatArray, **changed: float) -> FloatArray:
+        """Return the signed distances (n,) of points (n, 3) (m), with its own numbers or with others."""
+        numbers = {name: scalar.value for name, scalar in self.scalars.items()} | changed
         return np.asarray(self.gap(tools.NUMPY, list(points.T), numbers))
+
+    def entered(self, body: Body, numbers: Mapping[str, float]) -> float:
+        """How deep (m) the boundary of the body at rest is inside it, with these numbers."""
+        d = np.array(unit_vector(self.direction))
+        tip = np.array([numbers[axis] for axis in "xyz"])
+        return -float(self.gaps(points(facets(body, self.on), tip, d), **numbers).min())
 
     def potential(self, at: Place) -> Any:
         """Potential ∫ φ(g(X + u)) dS of the gap g, over the undeformed boundary."""
@@ -264,8 +268,8 @@ class Indenter(Term):
             yield "depth", f"as deep as the body is thick there ({extent:.3g} m), expected less", self.depth
             return
         corners = facets(body, self.on)
-        looked_at = points(corners, tip)
-        inside = -float(self.gaps(looked_at, 0.0).min())
+        looked_at = points(corners, tip, d)
+        inside = -float(self.gaps(looked_at, depth=0.0).min())
         if inside > max(SLACK * self.depth, tolerance(body) * SLACK):
             message = (
                 f"the tool starts inside the body, {inside:.3g} m deep at '{self.on}', expected it to touch at most"

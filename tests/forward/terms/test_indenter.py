@@ -189,8 +189,16 @@ def test_what_enters_the_tool_too_far_is_refused():
     model = spec.build(MPI.COMM_SELF, ("material.C1", "material.D1"))
     model.solve(np.array([C1, D1]))
     assert model.equations.penetrations()["indenter"] < 1e-3 * 1e-3
-    with pytest.raises(SolveError, match=r"the body enters the tool 'indenter' by 0\.0\d+ of its depth, where 0.001"):
+    with pytest.raises(SolveError, match=r"the body enters the tool 'indenter' by 0\.\d+ of its depth, where 0.001"):
         model.solve(50 * np.array([C1, D1]))
+
+
+@pytest.mark.fem
+def test_a_tool_between_the_points_that_are_looked_at_is_no_silent_zero():
+    """A needle that hits no quadrature point."""
+    needle = only("cone", angle=5.0, tip=1e-6, depth=2e-4, at=(7.1e-3, 6.3e-3, SIDE))
+    with pytest.raises(SolveError, match="enters the body between the points at which contact is looked for"):
+        body(needle).build(MPI.COMM_SELF, ()).solve(np.zeros(0))
 
 
 @pytest.mark.fem
