@@ -388,7 +388,7 @@ class Hyperelastic(ModelSpec):
         own, calibrating = own_estimate(self), finer(self)
         if calibrating is None:
             return own
-        return replace(own, calibration=calibrating.seconds, bytes=own.bytes + calibrating.bytes)
+        return replace(own, calibration=calibrating.seconds, calibration_bytes=calibrating.bytes)
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, and how many unknowns there are of which kind."""

@@ -235,8 +235,8 @@ class Estimate:
         What comes once for many, before the first (s): a factor, or what the steps are preconditioned by.
     bytes
         Memory.
-    calibration
-        What calibrates estimates, once (s); 0 where no finer mesh does.
+    calibration, calibration_bytes
+        What calibrates estimates, once (s), and its memory besides; 0 where no finer mesh does.
     alone
         Whether the factor of a reference and one of its own are never kept together, since both would be too large.
     """
@@ -246,6 +246,7 @@ class Estimate:
     once: float
     bytes: float
     calibration: float = 0.0
+    calibration_bytes: float = 0.0
     alone: bool = False
 
 

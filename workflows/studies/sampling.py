@@ -129,7 +129,7 @@ class Study(StudyKind):
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
         estimating = self.spec.mesh_error_cost() if self.estimates else None
-        return super().memory + (0.0 if estimating is None else estimating.bytes)
+        return super().memory + (0.0 if estimating is None else estimating.bytes + estimating.calibration_bytes)
 
     @property
     def growth(self) -> tuple[float, str]:

@@ -24,7 +24,7 @@ import numpy as np
 from forward.adapt import OF_ROUNDING, Adapt, largest_bytes
 from forward.machine import MIB
 from forward.model import FloatArray, SolveError
-from uq.accuracy.effects import DOUBT, UNCALIBRATED, with_mesh_errors
+from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
 from uq.estimators.moments import Z
 from uq.evaluation.checkpoint import Checkpoint
@@ -231,7 +231,7 @@ class Found:
         self.dataset = with_mesh_errors(dataset, inputs, centre, self.errors, told_of(study))
         self.doubts = doubts(self.dataset)
         errors = np.array([self.dataset[name].to_numpy() for name in ERRORS if name in self.dataset])
-        unknown = np.where(np.isfinite(self.errors.saturation) & self.errors.measured, DOUBT, UNCALIBRATED)
+        unknown = self.dataset["mesh_error_unknown"].to_numpy()
         self.close = np.nan_to_num(unknown * np.abs(errors)) if len(errors) else np.zeros_like(self.doubts)
 
 
