@@ -7,8 +7,8 @@ fields are those of the mesh itself, interpolated.
 
 Finer meshes are quadratic, with as many nodes where the specimen is linear, and never coarser than a few cells: the
 differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
-(docs/decisions/0017-mesh-error.md). Only the meshes of random fields on linear boxes are linear: with half the cells
-they could not hold the field.
+(docs/decisions/0017-mesh-error.md). Only where there are random fields cells are halved, and the other mesh is that of
+the specimen: a mesh that does not contain its vertices has another field.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def finer(spec: Specimen) -> Specimen:
 
 def graded(spec: Specimen) -> Specimen | None:
     """Return a specimen on a mesh that is graded as the finer one; None where it is graded so, or is not graded."""
-    if isinstance(spec.body, MeshFile):
+    if isinstance(spec.body, MeshFile) or spec.fields:
         return None
     found = _on(spec, 1.0)
     return None if found.body == spec.body else found
@@ -62,6 +62,8 @@ def share(spec: Specimen) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
     if isinstance(spec.body, MeshFile):
         return OF_LINEAR if spec.body.degree == 1 else HALVED
+    if spec.fields:
+        return HALVED
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
     times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
     # Displacements converge like h^(degree + 1) where meshes are graded as singular stresses want it.
@@ -77,11 +79,12 @@ def _on(spec: Specimen, times: float) -> Specimen:
         body = body.model_validate(body.model_dump(exclude={"contents"}) | QUADRATIC)
     elif isinstance(body, MeshFile):
         body = body.finer(times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+    elif spec.fields:
+        body = body.with_cells(2.0)
     else:
-        halve = linear and not spec.fields
-        body = body.finer(times / 2 if halve else times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+        body = body.finer(times / 2 if linear else times, tuple(dict.fromkeys(held)), HELD, BESIDE)
         cells = {"cells": tuple(max(n, LEAST[times]) for n in body.cells)}
-        body = body.model_validate(body.model_dump() | cells | (QUADRATIC if halve else {}))
+        body = body.model_validate(body.model_dump() | cells | (QUADRATIC if linear else {}))
     fields = (RandomField(of="stiffness", length=1.0, std=1.0, basis="nodes"),) if spec.fields else ()
     return spec.model_copy(update={"body": body, "fields": fields, "observed": ()})
 

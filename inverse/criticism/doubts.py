@@ -242,7 +242,7 @@ def mesh_corrected(
     if worst > EXTREME or uncertain > DECIDES:
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
     if len(nodes) and size > OF_FIELD:
-        why = "finer meshes see a field interpolated: what the data determine best may be off by many deviations"
+        why = "that is rough for a field: what the data determine best may be off by several deviations"
         short = "its mesh is too coarse for what the data determine best"
         return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
     return [Doubt("note", text, "")]

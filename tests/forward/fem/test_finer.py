@@ -188,14 +188,17 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     assert (same.body.cells, same.body.degree) == ((3, 3, 3), 2)
     assert same.body.grading == spec.body.grading
     assert share(Specimen.model_validate(CUBE)) == pytest.approx(1 / ((5 / 3) ** 3 - 1))
-    # As many nodes as linear cells that are smaller, but for fields, which half the cells could not hold.
+    # As many nodes as linear cells that are smaller; but meshes of fields contain the vertices of the field.
     many = CUBE["body"] | {"cells": [12, 12, 8], "quadrature_degree": 3}
     one, field = CUBE | {"body": many}, {**FIELD, "basis": "nodes"}
     found = [make(Specimen.model_validate(one)).body for make in (finer, graded)]
     assert [(body.cells, body.degree) for body in found] == [((9, 9, 6), 2), ((6, 6, 4), 2)]
     assert found[0].quadrature_degree is None
-    found = [make(Specimen.model_validate(one | {"fields": [field]})).body for make in (finer, graded)]
-    assert [(body.cells, body.degree) for body in found] == [((18, 18, 12), 1), ((12, 12, 8), 1)]
+    nested = Specimen.model_validate(one | {"fields": [field]})
+    assert (finer(nested).body.cells, finer(nested).body.degree) == ((24, 24, 16), 1)
+    assert finer(nested).body.grading == nested.body.grading
+    assert graded(nested) is None
+    assert share(nested) == HALVED
     two = Specimen.model_validate(CUBE | {"body": many | {"degree": 2, "quadrature_degree": None}})
     assert (finer(two).body.cells, finer(two).body.degree) == ((18, 18, 12), 2)
     assert share(two) == pytest.approx(1 / (1.5**3 - 1))
