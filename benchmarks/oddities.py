@@ -57,8 +57,25 @@ def _jump_on_slope(x: Any) -> Any:
     return x[:, 2] + np.where(np.real(x[:, 0] * x[:, 1]) > 0.67, 3.0, 0.0)
 
 
+def _largest(x: Any) -> Any:
+    return np.take_along_axis(x, np.real(x).argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _student(x: Any) -> Any:
+    """Return Student's t with five degrees of freedom, of six normals."""
+    return x[:, 0] / np.sqrt(1e-12 + (x[:, 1:] ** 2).mean(axis=1))
+
+
+def _outlier(x: Any) -> Any:
+    return x[:, 1] + np.where(np.real(x[:, 0]) < 0.01, 5.0, 0.0)
+
+
 def cases() -> tuple[Case, ...]:
     """Return the functions; the truth is what 2^18 points give where there is no closed form."""
+    return *_first(), *_tails()
+
+
+def _first() -> tuple[Case, ...]:
     e, none = np.exp(1), (np.inf, np.inf)
     normals, wide = _of(2, STANDARD), _of(2, LogNormal(mean=1.0, std=1.0))
     near = 1 / 1e-3 - 1 / 1.001 - np.log(1001) ** 2
@@ -102,6 +119,52 @@ def cases() -> tuple[Case, ...]:
         Case("fails where large", _pole_that_fails, _of(4)),
         Case("30 parameters", lambda x: x @ _fall(30) + x[:, 0] * x[:, 1] + np.sin(3 * x[:, 2]), _of(30)),
         Case("100 parameters", lambda x: np.exp(x @ _fall(100) / 3) + x[:, 0] * x[:, 50], _of(100)),
+    )  # fmt: skip
+
+
+def _tails() -> tuple[Case, ...]:
+    """Return functions with tails on one or both sides, ends, rare events and corners."""
+    normals, four, ten, two = (_of(d, STANDARD) for d in (2, 4, 10, 2))
+    narrow = LogNormal(mean=1.0, std=0.3)
+    return (
+        Case("exp(z)^2", lambda x: np.exp(2 * x[:, 0]) + x[:, 1], normals, exact=(
+            np.exp(2), (np.exp(4) * np.expm1(4) + 1) ** 0.5)),
+        Case("exp(0.7 z)", lambda x: np.exp(0.7 * x[:, 0]) + x[:, 1] / 2, normals, exact=(
+            np.exp(0.245), (np.exp(0.49) * np.expm1(0.49) + 0.25) ** 0.5)),
+        Case("sinh(z)", lambda x: np.sinh(x[:, 0]) + x[:, 1] / 2, normals, exact=(
+            0, (np.expm1(2) / 2 + 0.25) ** 0.5)),
+        Case("|z|^3", lambda x: np.where(np.real(x[:, 0]) < 0, -x[:, 0], x[:, 0]) ** 3 + x[:, 1], normals, exact=(
+            2 * (2 / np.pi) ** 0.5, (15 - 8 / np.pi + 1) ** 0.5)),
+        Case("z^3", lambda x: x[:, 0] ** 3 + x[:, 1], normals, exact=(0, 4.0)),
+        Case("z^4", lambda x: x[:, 0] ** 4 + x[:, 1], normals, exact=(3, 97**0.5)),
+        Case("z^2", lambda x: x[:, 0] ** 2 + x[:, 1] / 2, normals, exact=(1, 1.5)),
+        Case("sum of squares of 10", lambda x: (x**2).sum(axis=1), ten, exact=(10, 20**0.5)),
+        Case("product of normals", lambda x: x[:, 0] * x[:, 1], normals, exact=(0, 1)),
+        Case("product of four normals", lambda x: np.prod(x, axis=1), four, exact=(0, 1)),
+        Case("z exp(z')", lambda x: x[:, 0] * np.exp(x[:, 1]), two, exact=(0, np.exp(1))),
+        Case("exp(z z'/3)", lambda x: np.exp(x[:, 0] * x[:, 1] / 3), two, exact=(
+            (1 - 1 / 9) ** -0.5, ((1 - 4 / 9) ** -0.5 - 1 / (1 - 1 / 9)) ** 0.5)),
+        Case("Student, 5", _student, _of(6, STANDARD), exact=(0, (5 / 3) ** 0.5)),
+        Case("1/(1 + 100 z²)", lambda x: 1 / (1 + 100 * x[:, 0] ** 2) + x[:, 1] / 10, normals),
+        Case("largest of 10", _largest, ten),
+        Case("product of 10 log-normals", lambda x: np.prod(x, axis=1), _of(10, narrow), exact=(
+            1, (1.09**10 - 1) ** 0.5)),
+        Case("product of 30 log-normals", lambda x: np.prod(x, axis=1), _of(30, LogNormal(mean=1.0, std=0.1)), exact=(
+            1, (1.01**30 - 1) ** 0.5)),
+        Case("1/ω − ω'", lambda x: 1 / x[:, 0] - x[:, 1], _of(2, LogNormal(mean=1.0, std=0.7))),
+        Case("event, 1 %", _flat(lambda x: 1.0 * (x[:, 0] < 0.01)), _of(2)),
+        Case("outlier, 1 %", _outlier, _of(2)),
+        Case("sin(20 u)", lambda x: np.sin(20 * x[:, 0]), _of(1)),
+        Case("tan near its pole", lambda x: np.tan(1.55 * x[:, 0]) + x[:, 1], _of(2)),
+        Case("pole at a corner", lambda x: 1 / (0.02 + x.sum(axis=1)), _of(3)),
+        Case("−ln u", lambda x: -np.log(x[:, 0]) + x[:, 1], _of(2), exact=(1.5, (13 / 12) ** 0.5)),
+        Case("u^-0.3", lambda x: x[:, 0] ** -0.3 + x[:, 1], _of(2), exact=(
+            1 / 0.7 + 0.5, (1 / 0.4 - 1 / 0.49 + 1 / 12) ** 0.5)),
+        Case("u^-0.25 − v^-0.25", lambda x: x[:, 0] ** -0.25 - x[:, 1] ** -0.25, _of(2), exact=(
+            0, (2 * (2 - 16 / 9)) ** 0.5)),
+        Case("peak at an end", lambda x: np.exp(-40 * x[:, 0]) + x[:, 1] / 10, _of(2)),
+        Case("exp(6 u)", lambda x: np.exp(6 * x[:, 0]) * (1 + x[:, 1]), _of(2)),
+        Case("exp(3 sum of 4)", lambda x: np.exp(3 * x.sum(axis=1)), _of(4)),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, FloatArray
-from uq.estimators.tails import spread
+from uq.estimators.tails import influences, missed, spread
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 TAILS = 3.0  # mean square of influences over the square of their mean size from which there is a finding, for n = 64
 SPREAD = 0.7  # standard deviation of logarithms of 64 samples from which a log-normal is too heavy-tailed
 HOPELESS = (1.1, 4.0)  # the same, and as `TAILS`: from both on, nothing is known about what is beyond the samples
+MISSED = 0.1  # share of the variance beyond the samples, by how steeply the outermost ones rise
 WIDENS = 0.25  # `SPREAD` grows with n to this power
 GROWTH = 0.4  # `TAILS` grows with n to this power: more samples show more of a tail
 KURTOSIS = 4.4  # of 64 samples, from which there is a finding about a field
@@ -33,14 +34,13 @@ CENTRE = 6.0  # leave-one-out errors by which an expansion may be wrong at the m
 SEEN = 1e-3  # of the standard deviation: smaller errors there are not reported
 
 
-def influences(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the influence of each sample (n, m) on the variance, from samples of the first and the second moment."""
-    moved = second - 2 * first.mean(axis=0) * first
-    return np.asarray(moved - moved.mean(axis=0))
-
-
 def of_tails(
-    names: Sequence[str], values: FloatArray, relative: FloatArray, controlled: FloatArray | None = None
+    names: Sequence[str],
+    values: FloatArray,
+    relative: FloatArray,
+    controlled: FloatArray | None = None,
+    *,
+    expanded: bool = False,
 ) -> Iterator[Finding]:
     """Find the outputs whose standard deviation is determined by few samples.
 
@@ -66,11 +66,16 @@ def of_tails(
     controlled
         Influences (n, m) of the samples with their controls. The residuals of a good control have tails too, but
         intervals fail only at three times the κ.
+    expanded
+        Whether these controls are expansions, which continue beyond the samples.
     """
     n = len(values)
     yield from of_constants(names, values)
     deviations = values - values.mean(axis=0)
     plain = influences(deviations, deviations**2)
+    beyond = np.where((relative > MATTERS) & (not expanded), missed(plain), 0.0)
+    if controlled is not None:
+        beyond = np.maximum(beyond, missed(controlled))
     largest = TAILS * max(1.0, n / 64) ** GROWTH
     for i, name in enumerate(names):
         variance = deviations[:, i].var()
@@ -93,14 +98,46 @@ def of_tails(
                 f"{logarithmic:.2g}: few of them determine the standard deviation, and its 95 % interval may contain "
                 "the true value less often. Take more samples.",
             )
-        elif kappa > largest:
+        elif kappa > largest or beyond[i] > MISSED * variance:
             kurtosis = (deviations[:, i] ** 4).mean() / variance**2
+            kappa = max(kappa, _concentration(plain[:, i], variance))
             yield Finding(
                 "warning",
                 f"The standard deviation of {name} rests on few of its {n} samples, which count as {n / kappa:.0f} "
                 f"(their kurtosis is {kurtosis:.3g}): its 95 % interval may contain the true value less often, since "
                 "larger values may be missing. Take more samples.",
             )
+
+
+def of_differences(
+    names: Sequence[str], moved: Sequence[FloatArray], std: FloatArray, relative: FloatArray
+) -> Iterator[Finding]:
+    """Find the outputs whose standard deviation is determined by few samples of a difference between two meshes.
+
+    Parameters
+    ----------
+    names
+        Outputs.
+    moved
+        Influences (n, m) of the samples of every mesh, the coarsest first, which `of_tails` looks at.
+    std, relative
+        Standard deviations (m,) and their claimed relative errors.
+    """
+    errors = np.array([one.std(axis=0) / len(one) ** 0.5 for one in moved])
+    for level, one in enumerate(moved[1:], 1):
+        n, tails = len(one), missed(one)
+        largest = TAILS * max(1.0, n / 64) ** GROWTH
+        matters = (relative > MATTERS) & (errors[level] > errors.max(axis=0) / 2)
+        for i in np.flatnonzero(matters):
+            kappa = _concentration(one[:, i], std[i] ** 2)
+            if kappa > largest or tails[i] > MISSED * std[i] ** 2:
+                yield Finding(
+                    "warning",
+                    f"The standard deviation of {names[i]} rests on few of the {n} samples of the difference between "
+                    f"meshes {level - 1} and {level}, which count as {n / max(kappa, 1.0):.0f}: its 95 % interval may "
+                    "contain the true value less often, since larger differences may be missing. Take more samples, "
+                    "or a finer coarsest mesh.",
+                )
 
 
 def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:

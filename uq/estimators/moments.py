@@ -136,15 +136,24 @@ def term(first: FloatArray, second: FloatArray, controls: tuple[FloatArray, Floa
         Controls (n, …) of both, with expectation zero; their coefficients are 1, or 0 if they do not help.
     """
     n = len(first)
-    if controls is not None:
-        left = first - controls[0]
-        first = np.where(_helps(_scatter(left), _scatter(first), n), left, first)
-        moved = 2 * first.mean(axis=0) * first
-        left = second - controls[1]
-        second = np.where(_helps(_scatter(left - moved), _scatter(second - moved), n), left, second)
+    first, second = controlled(first, second, controls)
     m1, m2 = first.mean(axis=0), second.mean(axis=0)
     covariance = ((first - m1) * (second - m2)).sum(axis=0) / (n - 1)
     return Term(n, m1, m2, _scatter(first) / (n - 1), covariance, _scatter(second) / (n - 1))
+
+
+def controlled(
+    first: FloatArray, second: FloatArray, controls: tuple[FloatArray, FloatArray] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return samples (n, …) of both moments less their controls, where these help."""
+    if controls is None:
+        return first, second
+    n = len(first)
+    left = first - controls[0]
+    first = np.where(_helps(_scatter(left), _scatter(first), n), left, first)
+    moved = 2 * first.mean(axis=0) * first
+    left = second - controls[1]
+    return first, np.where(_helps(_scatter(left - moved), _scatter(second - moved), n), left, second)
 
 
 def combine(

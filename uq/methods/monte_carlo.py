@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
-from uq.estimators.doubts import influences, of_control, of_field_tails, of_tails
+from uq.estimators.doubts import of_control, of_field_tails, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
     POWERS,
@@ -24,7 +24,7 @@ from uq.estimators.moments import (
     monomials,
     quantiles,
 )
-from uq.estimators.tails import counted
+from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, merge
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
@@ -220,7 +220,15 @@ def _scalar_moments(
     predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
     variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
     found = estimate_from_samples(deviations, predictions, centre.middle, variance, *control)
-    return counted(found, inputs, values)
+    return counted(found, inputs, values, _influences(evaluations, centre, found))
+
+
+def _influences(evaluations: Evaluations, centre: Linearisation, found: Estimates) -> FloatArray:
+    """By how much each sample (n, m) that has an answer moves the variance, with the tangent as control."""
+    ok = evaluations.ok
+    first = evaluations.outputs[ok] - centre.middle
+    predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
+    return influences(first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2)
 
 
 def _field_moments(
@@ -283,11 +291,7 @@ def _dataset(
     if control is not None:
         if control[1] == "quadratic":
             add(dataset, *of_control(evaluate.outputs, "tangent", scalars))
-        first = values - centre.middle
-        predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
-        moved = influences(
-            first - scalars.coefficient * predicted, first**2 - scalars.second_coefficient * predicted**2
-        )
+        moved = _influences(evaluations, centre, scalars)
     add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
     if not ok.all():
         which = "plain estimates" if control else "all estimates"

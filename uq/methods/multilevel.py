@@ -16,7 +16,7 @@ Allotting samples, estimating differences and adding errors depend on each other
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,8 +24,22 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.model import FloatArray, ModelError, SolveError
-from uq.estimators.moments import ESTIMATES, Estimates, Moments, Term, combine, estimate, monomials, ratio, term
+from uq.estimators.doubts import of_differences, of_tails
+from uq.estimators.moments import (
+    ESTIMATES,
+    Estimates,
+    Moments,
+    Term,
+    combine,
+    controlled,
+    estimate,
+    monomials,
+    ratio,
+    term,
+)
+from uq.estimators.tails import beyond, unseen
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request
+from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.method import MESH
@@ -144,7 +158,7 @@ class MultilevelMonteCarlo(Amount):
                 break
             meshes.append(_Mesh(self, inputs, recorder, meshes[-1]))
         while True:
-            found = _Found.of(meshes)
+            found = _Found.of(inputs, meshes)
             reached = float(found.relative(found.total_error).max())
             left = self._left(recorder)
             allocation = _allocate(self, meshes, found, left)
@@ -191,7 +205,7 @@ class MultilevelMonteCarlo(Amount):
         single, telescoped = [mesh.single for mesh in meshes], found.by_mesh
         differences = [mesh.term for mesh in meshes]
         plain, kurtosis = np.array([mesh.plain_variance for mesh in meshes]), np.array([m.kurtosis for m in meshes])
-        controlled = np.array([t.variance for t in differences])
+        remaining = np.array([t.variance for t in differences])
         seconds = np.array([mesh.seconds_per_solve for mesh in meshes])
         consistency, shares = found.consistency, ratio(plain[1:], np.array([s.std**2 for s in single[1:]]))
         dataset = dataset.assign_coords(level=np.arange(len(meshes))).assign(
@@ -216,9 +230,9 @@ class MultilevelMonteCarlo(Amount):
                 "mesh_variance": (both, np.array([s.std**2 for s in single])),
                 "mesh_variance_ratio": (both, np.array([s.variance_ratio for s in single])),
                 "difference_mean": (both, np.array([m.offset + m.term.first for m in meshes])),
-                "difference_mean_error": (both, np.sqrt(controlled / np.array([[t.n] for t in differences]))),
+                "difference_mean_error": (both, np.sqrt(remaining / np.array([[t.n] for t in differences]))),
                 "difference_variance": (both, plain),
-                "difference_variance_ratio": (both, ratio(plain, controlled, empty=1.0)),
+                "difference_variance_ratio": (both, ratio(plain, remaining, empty=1.0)),
                 "difference_kurtosis": (both, kurtosis),
                 "consistency": (both, np.vstack([np.full_like(kurtosis[:1], np.nan), consistency])),
                 "points": (("sample", "parameter"), np.concatenate([mesh.points for mesh in meshes])),
@@ -229,6 +243,9 @@ class MultilevelMonteCarlo(Amount):
             }
         )
         dataset.attrs["stopped"] = stopped
+        moved, claimed = _influences(meshes), found.estimates.relative_std_error
+        add(dataset, *of_tails(evaluate.outputs, meshes[0].values, claimed, moved[0]))
+        add(dataset, *of_differences(evaluate.outputs, moved, found.estimates.std, claimed))
         notes = list(_notes(evaluate.outputs, consistency, kurtosis, shares, len(meshes)))
         failed, count = int((~dataset["ok"]).sum()), dataset.sizes["sample"]
         if failed:
@@ -373,6 +390,19 @@ class _Mesh:
         variance = np.einsum("mi,ij,mj->m", slopes, self._inputs.correlation, slopes)
         return outputs - self.centre.middle, self.centre.coordinates.of(points) @ slopes.T, variance
 
+    def influences(self, mean: FloatArray) -> FloatArray:
+        """By how much each sample (n, m) moves the variance on the finest mesh, with the mean (m,) of w there."""
+        first, second, *controls = self._moments()
+        c, d = controls
+        first, second = controlled(first, second, None if self._method.control == "none" else (c, d))
+        moved = second - 2 * mean * first
+        return np.asarray(moved - moved.mean(axis=0))
+
+    @property
+    def values(self) -> FloatArray:
+        """Outputs (n, m) on this mesh of the samples with an answer on both."""
+        return np.asarray(self.fine[self.ok])
+
     def _moments(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return w_l − w_{l−1}, the second moment's term, and their controls (n, m) with expectation zero."""
         points = self.points[self.ok]
@@ -439,9 +469,14 @@ class _Found:
     consistency: FloatArray
 
     @classmethod
-    def of(cls, meshes: Sequence[_Mesh]) -> _Found:
+    def of(cls, inputs: Inputs, meshes: Sequence[_Mesh]) -> _Found:
         terms = [mesh.term for mesh in meshes]
-        by_mesh = tuple(combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
+        *coarser, finest = (combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
+        moved = _influences(meshes)
+        tails = [beyond(finest, inputs, one) for one in moved]
+        first = np.maximum(tails[0], unseen(inputs, meshes[0].values) * finest.std)
+        error = np.linalg.norm([finest.std_error, first, *tails[1:]], axis=0)
+        by_mesh = (*coarser, replace(finest, std_error=error))
         differences = np.array([mesh.offset + t.first for mesh, t in zip(meshes, terms, strict=True)])[1:]
         std_differences = np.diff([e.std for e in by_mesh], axis=0)
         consistency = np.array([_consistency(*pair) for pair in pairwise(meshes)])
@@ -470,6 +505,12 @@ class _Found:
         """An error (…, m) over the mean, or over the standard deviation if that is larger."""
         scale = np.maximum(np.abs(self.estimates.mean), self.estimates.std)
         return ratio(error, np.broadcast_to(scale, error.shape))
+
+
+def _influences(meshes: Sequence[_Mesh]) -> list[FloatArray]:
+    """By how much each sample (n, m) of every mesh moves the variance on the finest one."""
+    mean = np.sum([mesh.term.first for mesh in meshes], axis=0)
+    return [mesh.influences(mean) for mesh in meshes]
 
 
 def _consistency(coarser: _Mesh, mesh: _Mesh) -> FloatArray:

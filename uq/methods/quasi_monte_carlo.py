@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import Finding, FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
-from uq.estimators.doubts import influences, of_control, of_field_tails, of_tails
+from uq.estimators.doubts import of_control, of_field_tails, of_tails
 from uq.estimators.moments import (
     ESTIMATES,
     Coefficient,
@@ -31,7 +31,7 @@ from uq.estimators.moments import (
     ratio,
     student,
 )
-from uq.estimators.tails import counted
+from uq.estimators.tails import beyond, counted, influences
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -39,7 +39,7 @@ from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond
+from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond_samples
 from uq.surrogates.taylor import Control, expansion, held_expansion, quadratic, tangent
 
 if TYPE_CHECKING:
@@ -188,7 +188,9 @@ class QuasiMonteCarlo(MonteCarlo):
         if self.control == "chaos":
             fitted = expanded or self._expand(inputs, evaluate, centre)
             control, held, start = expansion(fitted), held_expansion(inputs, fitted), fitted.prediction or start
-        samples = _Samples(self, inputs, evaluate, centre, control, held, start)
+        samples = _Samples(
+            self, inputs, evaluate, centre, control, held, start, None if fitted is None else fitted.rest
+        )
         last = self.limit // self.scrambles
         if goal is not None:
             left = max(goal.most - evaluate.solves, self.scrambles)
@@ -261,7 +263,7 @@ class QuasiMonteCarlo(MonteCarlo):
             add(dataset, *of_control(evaluate.outputs, self.control, scalars))
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
-        moved = samples.influences(scalars)
+        moved = samples.influences(scalars, samples.each)
         add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, moved))
         field = samples.field()
         if field is not None:
@@ -334,9 +336,10 @@ class _Samples:
         control: Control | None,
         held: Control | None,
         start: Start | None,
+        rest: FloatArray | None,
     ) -> None:
         self._method, self._inputs, self._evaluate = method, inputs, evaluate
-        self._centre, self._control, self._held, self._start = centre, control, held, start
+        self._centre, self._control, self._held, self._start, self._rest = centre, control, held, start, rest
         R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
         self._field_control = control if control is not None and len(control.state) else None
         self.each = 0
@@ -412,11 +415,12 @@ class _Samples:
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
         # A tangent grows no faster than a normal quantity; controls that grow faster tell what lies beyond the samples.
-        tails = counted(found, self._inputs, self.outputs[:, :each][ok])
-        if self._method.control not in ("quadratic", "chaos"):
+        moved = self.influences(found, each)
+        tails = counted(found, self._inputs, self.outputs[:, :each][ok], moved)
+        if moved is None or self._method.control == "tangent":
             return tails
         of_mean, of_std = self._unseen(each)
-        known = np.hypot(found.std_error, of_std)
+        known = np.hypot(found.std_error, np.maximum(of_std, beyond(found, self._inputs, moved)))
         return replace(
             found,
             mean_error=np.where(found.coefficient == 0, found.mean_error, np.hypot(found.mean_error, of_mean)),
@@ -427,18 +431,23 @@ class _Samples:
         """Errors (m,) of mean and standard deviation from regions without samples, where a polynomial is the control.
 
         With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
-        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there, with λ in proportion to that
-        at the samples, which have 1 − b of the variance. A tangent does not grow faster than what it stands for.
+        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there. λ is in proportion to that at
+        the samples, which have 1 − b of the variance; for the second moment, to which tails matter more, it is at
+        least the norm of what an expansion misses, by the samples of its fit. A tangent does not grow faster than what
+        it stands for.
         """
         control = self._control
         controls = self._controls(each)
         assert control is not None
         assert controls is not None
         ok = self.ok[:, :each]
-        outside, probability = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
+        outside, probability = beyond_samples(
+            self._inputs, control.features, control.outputs, self.points[:, :each][ok]
+        )
         left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
-        norm = left.std(axis=0) * np.sqrt(outside) / np.maximum(1 - outside, 1 / ok.sum())
-        return norm * np.sqrt(probability), norm
+        norm = left.std(axis=0) / np.maximum(1 - outside, 1 / ok.sum())
+        most = norm if self._rest is None else np.maximum(norm, self._rest)
+        return norm * np.sqrt(outside * probability), most * np.sqrt(outside)
 
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""
@@ -474,14 +483,14 @@ class _Samples:
         told = 2 * np.abs(whole - held) > np.maximum(np.abs(whole), np.abs(held))
         return np.asarray(np.where(told, whole**2 - held**2, 0.0).sum(axis=0) > 0)
 
-    def influences(self, found: Estimates) -> FloatArray | None:
-        """By how much each sample (n, m) that has an answer moves the variance, with controls."""
-        known = self._controls(self.each)
+    def influences(self, found: Estimates, each: int) -> FloatArray | None:
+        """By how much each of the first samples (n, m) that has an answer moves the variance, with controls."""
+        known = self._controls(each)
         if known is None:
             return None
-        ok = self.in_order(self.ok)
-        C, D = (self.in_order(control)[ok] for control in known[0])
-        first = self.in_order(self.outputs)[ok] - self._centre.outputs
+        ok = self.ok[:, :each]
+        C, D = (control[ok] for control in known[0])
+        first = self.outputs[:, :each][ok] - self._centre.outputs
         return influences(first - found.coefficient * C, first**2 - found.second_coefficient * D)
 
     def field_doubts(self, found: Estimates) -> Iterator[Finding]:

@@ -128,6 +128,8 @@ class Deviations:
         Of the state, from which the solver may start; None if the state was not requested.
     reach
         Lowest and highest coordinates (2, d) of the samples that were fitted.
+    rest
+        Norms (m,) of what the functions miss in the outputs, see `Regression.rest`; None if no parameter has a tail.
     """
 
     basis: Basis
@@ -137,6 +139,7 @@ class Deviations:
     ok: NDArray[np.bool_]
     prediction: StateExpansion | None
     reach: FloatArray
+    rest: FloatArray | None
 
 
 def fit_deviations(
@@ -169,7 +172,8 @@ def deviations(regression: Regression, evaluations: Evaluations, centre: Lineari
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
     t = regression.inputs.coordinates.of(data.points)
     reach = np.array([t.min(axis=0), t.max(axis=0)])
-    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach)
+    rest = Regression(inputs, candidates, largest, data, fit).rest()
+    return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest)
 
 
 @dataclass(frozen=True)
@@ -261,7 +265,7 @@ def relative_of_field(regression: Regression) -> float:
 
 
 def beyond_of_field(regression: Regression) -> float:
-    """Return the share of the variance of the fit to the field from where there are no samples, see `beyond`."""
+    """Return the share of the variance of the fit to the field from where no samples are, as `Regression.beyond`."""
     variances = _variances(regression.fit)
     return float(shares(variances @ regression.beyond, variances.sum()))
 

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, SolveError
-from uq.estimators.doubts import influences, of_constants, of_expansion, of_reach, of_tails
+from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_tails
 from uq.estimators.indices import Analysis, coefficient_moments, shares
 from uq.estimators.moments import Z, error_of_root, student
+from uq.estimators.tails import influences
 from uq.evaluation.evaluate import Evaluations
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -510,7 +511,7 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
 
-def beyond(
+def beyond_samples(
     inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, float]:
     """Share (m,) of the variance of an expansion (P, m) from tails beyond all points (n, d), and their probability."""
@@ -575,22 +576,24 @@ class Regression:
 
     def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
         """Return estimates from the coefficients, by output, with standard errors."""
-        return _estimates(self.fit, self.largest.indices, self.data, self._rest(), of)
+        return _estimates(self.fit, self.largest.indices, self.data, self.rest(), of)
 
-    def _rest(self) -> FloatArray | None:
+    def rest(self) -> FloatArray | None:
         """Return the norms (m,) of what the basis misses in outputs; None if no parameter has a tail.
 
         On a bounded range samples reach the ends, and the leave-one-out error shows what is missing. In tails they do
-        not: above all, the next power of a parameter with a tail is missing, and it grows beyond the samples. If the
-        residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r², then outputs
-        whose residuals have the sum of squares s² miss a function of norm s/r.
+        not: above all, the next power of a parameter with a tail is missing, or that after it, and it grows beyond the
+        samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
+        then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
         """
         tails = np.flatnonzero([marginal.support is None for marginal in self.inputs.marginals.values()])
         if not tails.size:
             return None
         basis, data = self.basis, self.data
-        powers = np.zeros((tails.size, basis.indices.shape[1]), dtype=np.int64)
-        powers[np.arange(tails.size), tails] = basis.indices[:, tails].max(axis=0) + 1
+        powers = np.zeros((2 * tails.size, basis.indices.shape[1]), dtype=np.int64)
+        which = np.arange(tails.size)
+        for more in (1, 2):  # an odd function has no next even power
+            powers[which + (more - 1) * tails.size, tails] = basis.indices[:, tails].max(axis=0) + more
         following, left = data.left(orthonormal(self.inputs, powers)), data.left(basis)
         rows = left.shape[0] * left.shape[1]
         q, _ = np.linalg.qr(left.reshape(rows, -1))
@@ -601,7 +604,7 @@ class Regression:
     @property
     def beyond(self) -> FloatArray:
         """Share (m,) of the variance of the fit that comes from where there are no samples."""
-        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
+        return beyond_samples(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
 
     @property
     def controlled(self) -> BoolArray:
@@ -622,6 +625,7 @@ class Regression:
                 self.data.values[:, which],
                 np.ones(which.size),
                 influences(first, second)[:, which],
+                expanded=True,
             )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from benchmarks import tails
+from benchmarks import oddities, tails
 from benchmarks.coverage import Case, Vectorised, measure
 from uq.estimators import tails as estimator
 from uq.findings import findings
@@ -109,3 +109,54 @@ def test_scrambles_that_agree_by_chance_claim_what_their_samples_do():
             assert data["mean_error"].item() == pytest.approx((shares[0] * (1 - shares[0]) / 127) ** 0.5, rel=1e-3)
             assert abs(data["std"].item() - (0.03 * 0.97) ** 0.5) < 2 * data["std_error"].item()
     assert agreed > 1
+
+
+# --- tails on both sides -------------------------------------------------------------------------------------------
+
+
+def test_what_squares_of_normal_samples_miss_is_covered_by_their_scatter():
+    for n in (64, 256, 1024):
+        z = stats.norm.ppf((np.arange(n) + 0.5) / n)[:, None]
+        assert estimator.missed(z**2 - 1).item() < 0.02
+        assert estimator.missed(z).item() == 0  # both sides cancel
+
+
+@pytest.mark.parametrize("n", [64, 256])
+def test_what_influences_miss_is_their_integral_beyond(n):
+    """Of sinh²(z), in excess of what the scatter of as many squares of normal samples covers."""
+    p = (np.arange(n) + 0.5) / n
+    v = np.sinh(stats.norm.ppf(p))[:, None] ** 2
+    a = stats.norm.isf(0.5 / n)
+    square = 2 * integrate.quad(lambda z: np.sinh(z) ** 2 * stats.norm.pdf(z), a, 12)[0]
+    normal = 2 * integrate.quad(lambda z: z**2 * stats.norm.pdf(z), a, 12)[0]
+    excess = square - normal / np.sqrt(2) * v.std()
+    assert 0.7 < estimator.missed(v).item() / excess < 1.6
+
+
+ODD = {case.name: case for case in oddities.cases()}
+
+
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        (QuasiMonteCarlo(samples=256, control="none", fields=False), "sinh(z)"),
+        (QuasiMonteCarlo(samples=256, fields=False), "exp(0.7 z)"),
+        (QuasiMonteCarlo(samples=64, control="chaos", fields=False), "5 - exp(z)"),
+        (QuasiMonteCarlo(samples=64, control="chaos", fields=False), "sinh(z)"),
+        (QuasiMonteCarlo(samples=256, control="none", fields=False), "u^-0.25 − v^-0.25"),
+        (Chaos(samples=16, fields=False), "sinh(z)"),
+        (Chaos(samples=64, gradients=False, fields=False), "sinh(z)"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.kind,
+)
+def test_misses_are_not_silent(method, name):
+    """Before, 17 to 75 % of these intervals missed the truth without a finding."""
+    assert measure(ODD[name], method, 50).silent[1] <= 0.12
+
+
+def test_bounded_parameters_and_good_controls_claim_no_more_than_before(monkeypatch):
+    case = Case("smooth", lambda x: np.exp(x[:, 0]) * (1 + x[:, 1]), Inputs({"a": UNIT, "b": UNIT}))
+    data = MonteCarlo(samples=64, fields=False).run(case.inputs, Vectorised(case))
+    monkeypatch.setattr(estimator, "missed", lambda moved: np.full(moved.shape[1], 1e9))
+    again = MonteCarlo(samples=64, fields=False).run(case.inputs, Vectorised(case))
+    assert again["std_error"].item() == data["std_error"].item()

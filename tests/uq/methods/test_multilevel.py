@@ -13,7 +13,8 @@ from forward.model import FunctionModel, SolveError
 from tests.launch import ROOT, TISSUQ, assert_same_bits, run, run_script
 from uq.estimators.moments import combine, estimate, monomials, term
 from uq.evaluation.evaluate import Evaluations, Recorder, Request, SerialEvaluate
-from uq.inputs.distributions import Uniform
+from uq.findings import findings
+from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points
 from uq.methods.multilevel import MultilevelMonteCarlo, bias, optimal, rate
@@ -288,6 +289,33 @@ def test_a_few_samples_that_make_the_variance_are_noticed():
     data = MultilevelMonteCarlo(samples=1000, pilot=1000, control="none").run(INPUTS, evaluate)
     assert (data["difference_kurtosis"][1:] > 100).all()
     assert "a few samples make most of the variance" in data.attrs["note"]
+
+
+def heavy(level):
+    """Two log-normals, or a heavy-tailed difference of the meshes of a light-tailed quantity."""
+    h = 0.5**level
+    return FunctionModel(
+        lambda p: [np.exp(p[0]) - np.exp(p[1]) + h * p[0], p[0] + h * np.exp(1.5 * p[1]), p[0] + h * p[1]],
+        ("a", "b"),
+        ("tails", "difference", "light"),
+    )
+
+
+def test_heavy_tails_on_a_mesh_or_between_two_are_told():
+    inputs = Inputs(dict.fromkeys("ab", Normal(mean=0.0, std=1.0)))
+    evaluate = SerialEvaluate(heavy(0), others=meshes(heavy(1), heavy(2)))
+    told = {"tails": 0, "difference": 0, "light": 0}
+    between = 0
+    for seed in range(12):
+        data = MultilevelMonteCarlo(samples=128, pilot=64, control="none", seed=seed).run(inputs, evaluate)
+        texts = [found.text for found in findings(data)]
+        for name in told:
+            told[name] += any(name in text.replace("the difference between", "") for text in texts)
+        between += any("difference between meshes 0 and 1" in text for text in texts)
+    assert told["tails"] >= 10
+    assert told["difference"] >= 10
+    assert between >= 8
+    assert told["light"] <= 2
 
 
 @pytest.mark.parametrize("control", CONTROLS)
