@@ -176,6 +176,7 @@ def methods() -> dict[str, Any]:
         "sensitivity 64": SensitivityMonteCarlo(samples=64, **plain),
         "sensitivity, optimal 64": SensitivityMonteCarlo(samples=64, coefficient="optimal", **plain),
         "qmc, none 64": QuasiMonteCarlo(samples=64, control="none", **plain),
+        "qmc, none 256": QuasiMonteCarlo(samples=256, control="none", **plain),
         "qmc, tangent 128": QuasiMonteCarlo(samples=128, **plain),
         "qmc, optimal 128": QuasiMonteCarlo(samples=128, coefficient="optimal", **plain),
         "qmc, quadratic 128": QuasiMonteCarlo(samples=128, control="quadratic", **plain),

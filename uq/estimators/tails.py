@@ -76,11 +76,11 @@ def counted(found: Found, inputs: Inputs, values: FloatArray, moved: FloatArray 
     if moved is None:
         deviations = values - values.mean(axis=0)
         moved = influences(deviations, deviations**2)
-    further = np.maximum(beyond(found, inputs, moved), unseen(inputs, values) * found.std)
+    further = np.maximum(of_influences(found, inputs, moved), unseen(inputs, values) * found.std)
     return replace(found, std_error=np.hypot(found.std_error, further))
 
 
-def beyond(found: Estimates, inputs: Inputs, moved: FloatArray) -> FloatArray:
+def of_influences(found: Estimates, inputs: Inputs, moved: FloatArray) -> FloatArray:
     """Return the error (m,) of standard deviations due to influences beyond those (n, m) of the samples.
 
     Zero if no parameter has a tail: samples then reach the ends.

@@ -259,7 +259,8 @@ class _Outlook:
         outside, _ = beyond(inputs, regression.basis.values, fit.coefficients, points)
         ways = []
         for way, of in left.items():
-            tails = of * np.sqrt(outside) if way == "chaos" else np.zeros_like(of)  # as quasi-Monte Carlo claims them
+            missing = regression.rest() if way == "chaos" else None
+            tails = np.zeros_like(of) if missing is None else missing * np.sqrt(outside)  # as that method claims them
             ways.append(cls(way, _samples(goal, estimates, of, tails)))
         return min(ways, key=lambda way: way.samples)
 

@@ -37,7 +37,7 @@ from uq.estimators.moments import (
     ratio,
     term,
 )
-from uq.estimators.tails import beyond, unseen
+from uq.estimators.tails import of_influences, unseen
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -473,7 +473,7 @@ class _Found:
         terms = [mesh.term for mesh in meshes]
         *coarser, finest = (combine(mesh.centre.middle, terms[: k + 1]) for k, mesh in enumerate(meshes))
         moved = _influences(meshes)
-        tails = [beyond(finest, inputs, one) for one in moved]
+        tails = [of_influences(finest, inputs, one) for one in moved]
         first = np.maximum(tails[0], unseen(inputs, meshes[0].values) * finest.std)
         error = np.linalg.norm([finest.std_error, first, *tails[1:]], axis=0)
         by_mesh = (*coarser, replace(finest, std_error=error))

@@ -31,7 +31,7 @@ from uq.estimators.moments import (
     ratio,
     student,
 )
-from uq.estimators.tails import beyond, counted, influences
+from uq.estimators.tails import counted, influences, of_influences
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -39,7 +39,7 @@ from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond_samples
+from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond
 from uq.surrogates.taylor import Control, expansion, held_expansion, quadratic, tangent
 
 if TYPE_CHECKING:
@@ -420,7 +420,7 @@ class _Samples:
         if moved is None or self._method.control == "tangent":
             return tails
         of_mean, of_std = self._unseen(each)
-        known = np.hypot(found.std_error, np.maximum(of_std, beyond(found, self._inputs, moved)))
+        known = np.hypot(found.std_error, np.maximum(of_std, of_influences(found, self._inputs, moved)))
         return replace(
             found,
             mean_error=np.where(found.coefficient == 0, found.mean_error, np.hypot(found.mean_error, of_mean)),
@@ -441,9 +441,7 @@ class _Samples:
         assert control is not None
         assert controls is not None
         ok = self.ok[:, :each]
-        outside, probability = beyond_samples(
-            self._inputs, control.features, control.outputs, self.points[:, :each][ok]
-        )
+        outside, probability = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
         left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
         norm = left.std(axis=0) / np.maximum(1 - outside, 1 / ok.sum())
         most = norm if self._rest is None else np.maximum(norm, self._rest)

@@ -172,7 +172,7 @@ def deviations(regression: Regression, evaluations: Evaluations, centre: Lineari
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
     t = regression.inputs.coordinates.of(data.points)
     reach = np.array([t.min(axis=0), t.max(axis=0)])
-    rest = Regression(inputs, candidates, largest, data, fit).rest()
+    rest = regression.rest()
     return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest)
 
 

@@ -511,7 +511,7 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
 
-def beyond_samples(
+def beyond(
     inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, float]:
     """Share (m,) of the variance of an expansion (P, m) from tails beyond all points (n, d), and their probability."""
@@ -604,7 +604,7 @@ class Regression:
     @property
     def beyond(self) -> FloatArray:
         """Share (m,) of the variance of the fit that comes from where there are no samples."""
-        return beyond_samples(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
+        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
 
     @property
     def controlled(self) -> BoolArray:
