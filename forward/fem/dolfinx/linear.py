@@ -165,11 +165,11 @@ class DirectSolver:
         self._factorised = status >= 0
         if self._factorised:
             return
+        needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
+        self._renew()  # or else PETSc would report this failure for ever
         if status == SINGULAR:
             message = "the stiffness is singular"
             raise SolveError(message)
-        needed = self._ksp.pc.getFactorMatrix().getMumpsInfog(16)  # by its analysis, on the rank that needs most
-        self._renew()  # or else PETSc would report this failure for ever
         if status in TOO_LITTLE_ROOM or status in TOO_LITTLE_MEMORY:
             have = headroom()
             message = (

@@ -268,3 +268,13 @@ def test_words():
     words = body(tool()).loads[0].words({name: f"<{name}>" for name in body(tool()).loads[0].scalars})
     expected = "indenter on z-max: rigid sphere, radius <radius>; moved by <depth> along (0, 0, -1)"
     assert words.startswith(expected)
+
+
+@pytest.mark.fem
+def test_a_singular_stiffness_is_not_remembered():
+    """MUMPS has failed once; the next factorisation is another one."""
+    model = body(only("plane")).build(MPI.COMM_SELF, ())
+    before = model.solve(np.zeros(0)).outputs
+    with pytest.raises(SolveError, match="singular"):
+        model.equations.factorise(np.full(model.equations.size, np.nan))
+    np.testing.assert_allclose(model.solve(np.zeros(0)).outputs, before, rtol=1e-9, atol=1e-15)
