@@ -99,16 +99,19 @@ def _told(
     sizes = goal.sizes(found["mean"].to_numpy(), found["std"].to_numpy())
     row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
     meshes = [] if before is None else before["meshes"]
+    never = told_of(study).never
+    known = before is None or all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
     return {
         "tolerance": goal.tolerance,
         "reached": float(goal.tolerance * parts["total"][row, column]),
-        "kept": bool((parts["total"] <= 1).all()),
+        "kept": known and bool((parts["total"] <= 1).all()),
         "worst": {"output": names[column], "of": IN_WORDS[ESTIMATED[row]]},
         "shares": {source: float(parts[source][row, column]) for source in SOURCES},
         "method": chosen["method"],
         "reasons": [*([_of_mesh(before)] if before is not None else []), *chosen["reasons"]],
         "mesh": {
             "unknowns": study.spec.unknowns,
+            "estimated": known and before is not None,
             "tried": [{name: one[name] for name in TRIED} for one in meshes],
         }
         if study.spec.meshed
@@ -195,7 +198,7 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
         f"accuracy.tolerance = {told['tolerance']:g} is not reached: {of} is known to {told['reached']:.2g} "
         f"(of the tolerance: {taken})."
     )
-    if shares["mesh"] > 1 - shares["solver"]:
+    if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
         why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
     else:
         why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."

@@ -196,7 +196,7 @@ def test_estimates_that_contradict_each_other_are_said():
 @pytest.mark.unit
 def test_memory_ends_refinement():
     # Room for a few more cells, but not for those that it takes.
-    study = asked(1e-2, "accuracy.memory=12")
+    study = asked(1e-2, "accuracy.memory=50")
     assert study.estimates
     seen, model = [mesh(study, 50.0)], study.model
     for _ in range(5):
@@ -206,7 +206,7 @@ def test_memory_ends_refinement():
         study = study.of(model)
         seen.append(mesh(study, 0.8 * seen[-1].share))
     assert model is None
-    assert "accuracy.memory = 12 MiB" in why
+    assert "accuracy.memory = 50 MiB" in why
 
 
 # --- whole studies ---------------------------------------------------------------------------------------------------
@@ -339,7 +339,7 @@ def test_memory_for_refined_meshes_is_looked_at_before(monkeypatch):
 
 @pytest.mark.fem
 def test_what_is_not_reached_is_said(tmp_path):
-    settings = [*COARSE, "accuracy={tolerance=1e-4, solves=16, memory=3}", "model.body.degree=1"]
+    settings = [*COARSE, "accuracy={tolerance=1e-4, solves=16, memory=16}", "model.body.degree=1"]
     study = load(TINY, settings)
     assert study.estimates
     study.run(tmp_path / "out")
@@ -347,7 +347,7 @@ def test_what_is_not_reached_is_said(tmp_path):
     assert not summary["accuracy"]["kept"]
     texts = [one["text"] for one in summary["findings"] if "is not reached" in one["text"]]
     assert len(texts) == 1
-    assert "accuracy.memory = 3 MiB" in texts[0]
+    assert "accuracy.memory = 16 MiB" in texts[0]
 
 
 @pytest.mark.unit

@@ -29,6 +29,8 @@ class Tolerance(Section):
             f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {told['reached']:.2g}, no other less well.",
             tone="lead" if told["kept"] else "warning",
         )
+        if told["mesh"] is not None and not told["mesh"]["estimated"]:
+            yield Text("The error of the mesh is not known, and not counted.", tone="warning")
         yield Pictures([Picture.drawn(plots.tolerance_bars(told), "What each error takes of the tolerance.")])
         seconds = results.summary.get("accuracy_seconds", {})
         costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
