@@ -30,6 +30,7 @@ BIASED, WRONG = (
     2.0,
 )  # shift by the mesh, in posterior deviations: intervals of 95 % still hold 92 %; they hold half
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
+FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
 OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
 GRID = np.linspace(-40.0, 40.0, 8001)
 
@@ -238,7 +239,8 @@ def mesh_corrected(
         f"errors of the data, and makes up to {uncertain:.2g} of these deviations"
     )
     if not settled:
-        return [Doubt("warning", f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
+        severity: Severity = "error" if worst > WRONG and size > FAR else "warning"
+        return [Doubt(severity, f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
     if worst > EXTREME or uncertain > DECIDES:
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
     if len(nodes) and size > OF_FIELD:

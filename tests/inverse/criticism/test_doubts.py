@@ -141,6 +141,8 @@ def test_a_corrected_mesh_is_a_note_unless_it_decides():
         (doubt,) = mesh_corrected(error, **given)
         assert doubt.severity == "warning"
         assert "take a finer one" in doubt.text
+    (doubt,) = mesh_corrected(10 * error, shifts, {"x": 0.3}, none, settled=False)
+    assert doubt.severity == "error"
     # Of a field, what the data determine best is wrong where vertices are not.
     for size, severity in ((0.2, "note"), (0.5, "warning")):
         (doubt,) = mesh_corrected(np.full(9, size), {"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4), settled=True)

@@ -253,7 +253,7 @@ def test_a_body_is_refined_until_all_errors_are_within_the_tolerance(tmp_path):
 
 @pytest.mark.fem
 def test_tetrahedra_are_refined_where_errors_arise(tmp_path):
-    settings = [*COARSE, "accuracy.tolerance=0.05", "model.body.cell=tetrahedron", "model.body.size=[0.2, 0.1, 0.1]"]
+    settings = [*COARSE, "accuracy.tolerance=0.02", "model.body.cell=tetrahedron", "model.body.size=[0.2, 0.1, 0.1]"]
     study = load(TINY, settings)
     found = study.run(tmp_path / "whole" / "out")
     told = json.loads(found.attrs["accuracy"])

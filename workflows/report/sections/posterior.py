@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from forward.words import named, number, with_error
-from inverse.data.curves import steps_of
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from inverse.data.curves import Steps
+    from forward.spec import ModelSpec
     from workflows.studies.inversion import InversionStudy
 
 DIRECTIONS = 10  # that a table lists
@@ -58,7 +57,7 @@ class Posterior(Section):
             yield posterior(one, units)
             if _words(one) is OUTPUTS:
                 yield measurements(one)
-                yield from _curves(one, steps_of(results.study.model))
+                yield from _curves(one, results.study.model)
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one, before, units)])
             names = [str(name) for name in one.parameter.values if name != "noise"]
             alone = [[_shown(of["alone_std"].sel(parameter=name), 2) for name in names] for of in each_case(one)]
@@ -234,8 +233,11 @@ def measurements(one: xr.Dataset) -> Table:
     return Table(("output", "measured", "predicted", "residual over its error"), rows)
 
 
-def _curves(one: xr.Dataset, steps: Steps | None) -> Iterator[Block]:
+def _curves(one: xr.Dataset, spec: ModelSpec) -> Iterator[Block]:
     """Draw measured curves over a path."""
+    from inverse.data.curves import steps_of
+
+    steps = steps_of(spec)
     seen = {str(case).rpartition(".")[0] for case in one.case.values}
     names = [name for name in steps.units if name in seen] if steps is not None else []
     if steps is not None and names:
