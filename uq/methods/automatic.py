@@ -256,7 +256,7 @@ class _Outlook:
             linear = centre.middle + inputs.coordinates.of(data.points) @ centre.output_slopes.T
             left["tangent"] = np.minimum((data.values - linear).std(axis=0), std)
         points = inputs.points(sobol_points(0, 0, 0, SOME, len(inputs.names)))
-        outside, _ = beyond(inputs, regression.basis.values, fit.coefficients, points)
+        outside = beyond(inputs, regression.basis.values, fit.coefficients, points).share
         ways = []
         for way, of in left.items():
             missing = regression.rest() if way == "chaos" else None

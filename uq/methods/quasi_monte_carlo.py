@@ -431,21 +431,21 @@ class _Samples:
         """Errors (m,) of mean and standard deviation from regions without samples, where a polynomial is the control.
 
         With the share b of its variance σ² from there, and the norm λ of what it leaves, ∫(f² − C²) over it is at most
-        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there. λ is in proportion to that at
-        the samples, which have 1 − b of the variance; for the second moment, to which tails matter more, it is at
-        least the norm of what an expansion misses, by the samples of its fit. A tangent does not grow faster than what
-        it stands for.
+        about 2λ√b σ, and ∫(f − C) at most about λ√(bp), p the probability of being there, or less where there are many
+        parameters (`Beyond`). λ is in proportion to that at the samples, which have 1 − b of the variance; for the
+        second moment, to which tails matter more, it is at least the norm of what an expansion misses, by the samples
+        of its fit. A tangent does not grow faster than what it stands for.
         """
         control = self._control
         controls = self._controls(each)
         assert control is not None
         assert controls is not None
         ok = self.ok[:, :each]
-        outside, probability = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
+        outside, of_mean = beyond(self._inputs, control.features, control.outputs, self.points[:, :each][ok])
         left = self.outputs[:, :each][ok] - self._centre.outputs - controls[0][0][ok]
         norm = left.std(axis=0) / np.maximum(1 - outside, 1 / ok.sum())
         most = norm if self._rest is None else np.maximum(norm, self._rest)
-        return norm * np.sqrt(outside * probability), most * np.sqrt(outside)
+        return norm * of_mean, most * np.sqrt(outside)
 
     def _controls(self, each: int) -> tuple[Pair, Pair] | None:
         """Return the controls C and D (R, n, m) of the first points of every scramble, and E[C] and E[D] (m,)."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,7 @@ CLOSE = 0.03  # relative leave-one-out error above which the tails of the sample
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 NOTHING = 0.8  # the same, above which a fit tells nothing about which parameters matter
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
+COMMON = 2  # parameters of which what is missed in their tails adds up
 PATIENCE = 30  # functions selected without a gain before the selection ends
 
 
@@ -511,18 +513,40 @@ def _unseen_samples(fit: Fit, largest: IntArray, data: Data) -> tuple[FloatArray
     return mean + fit.unseen, square + f**2 - (f - fit.unseen) ** 2, offset
 
 
+class Beyond(NamedTuple):
+    """What an expansion has where no samples are.
+
+    Attributes
+    ----------
+    share
+        Of its variance (m,).
+    mean
+        √(b p) (m,), with the share b of the variance and the probability p of these places: a bound of the mean over
+        them, over the norms. It adds up what is missed of all parameters as if it had one sign; where these are many,
+        of `COMMON` of them, and no sign is common to the others.
+    """
+
+    share: FloatArray
+    mean: FloatArray
+
+
 def beyond(
     inputs: Inputs, functions: Callable[[FloatArray], FloatArray], coefficients: FloatArray, points: FloatArray
-) -> tuple[FloatArray, float]:
-    """Share (m,) of the variance of an expansion (P, m) from tails beyond all points (n, d), and their probability."""
+) -> Beyond:
+    """Return what an expansion (P, m) has in tails beyond all points (n, d)."""
+    m = coefficients.shape[1]
     tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
     if not tails.any():
-        return np.zeros(coefficients.shape[1]), 0.0
+        return Beyond(np.zeros(m), np.zeros(m))
     drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(tails)))
-    outside = (((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails).any(axis=1)
+    each = ((drawn < points.min(axis=0)) | (drawn > points.max(axis=0))) & tails
+    outside = each.any(axis=1)
     values = functions(drawn) @ coefficients
     squares = (values - values.mean(axis=0)) ** 2
-    return shares(squares[outside].sum(axis=0), squares.sum(axis=0)), float(outside.mean())
+    total = squares.sum(axis=0)
+    share = shares(squares[outside].sum(axis=0), total)
+    apart = COMMON * each.mean(axis=0) @ shares(each.T.astype(float) @ squares, total)
+    return Beyond(share, np.sqrt(np.minimum(share * outside.mean(), apart)))
 
 
 @dataclass(frozen=True)
@@ -604,7 +628,7 @@ class Regression:
     @property
     def beyond(self) -> FloatArray:
         """Share (m,) of the variance of the fit that comes from where there are no samples."""
-        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points)[0]
+        return beyond(self.inputs, self.basis.values, self.fit.coefficients, self.data.points).share
 
     @property
     def controlled(self) -> BoolArray:

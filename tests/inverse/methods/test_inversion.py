@@ -628,7 +628,7 @@ def test_starters(tmp_path):
 
 
 def shipped(name, out, code):
-    done = run(None, TISSUQ, "run", ROOT / "configs" / f"{name}.toml", "--out", out)
+    done = run(None, TISSUQ, "run", ROOT / "configs" / f"{name}.toml", "--out", out, timeout=1500)
     assert done.returncode == code, done.stderr
     return xr.load_dataset(out / "results.nc", engine="h5netcdf")
 
