@@ -8,6 +8,7 @@ import numpy as np
 
 from forward.fem.calibration import FinerMesh
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
+from forward.fem.space import gather_each, scatter_each
 from forward.model import (
     FloatArray,
     Guess,
@@ -122,14 +123,12 @@ class PathSpace:
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) on the first rank."""
-        parts = [self._one.gather(part) for part in np.split(rows, len(self._model.steps), axis=1)]
-        whole = [part for part in parts if part is not None]
-        return np.concatenate(whole, axis=1) if whole else None
+        spaces = [step.space for step in self._model.steps]
+        return gather_each(spaces, np.split(rows, len(spaces), axis=1))
 
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U)."""
-        parts = np.split(rows, len(self._model.steps), axis=1)
-        return np.concatenate([self._one.scatter(part) for part in parts], axis=1)
+        return scatter_each([step.space for step in self._model.steps], rows)
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d); collective."""

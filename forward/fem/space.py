@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,3 +73,15 @@ class BodySpace:
     def variance_kept(self) -> dict[str, float]:
         """Fraction of the variance of each random field that its modes make."""
         return {field.field.label: field.kept for field in self._equations.fields}
+
+
+def gather_each(spaces: Sequence[BodySpace], parts: Sequence[FloatArray]) -> FloatArray | None:
+    """Collect states of several bodies, each (k, U_local), side by side (k, U) on the first rank; collective."""
+    whole = [found for space, part in zip(spaces, parts, strict=True) if (found := space.gather(part)) is not None]
+    return np.concatenate(whole, axis=1) if whole else None
+
+
+def scatter_each(spaces: Sequence[BodySpace], rows: FloatArray) -> FloatArray:
+    """Take this rank's part (k, U_local) of states (k, U) of several bodies with equally many unknowns."""
+    parts = np.split(rows, len(spaces), axis=1)
+    return np.concatenate([space.scatter(part) for space, part in zip(spaces, parts, strict=True)], axis=1)

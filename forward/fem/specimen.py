@@ -22,7 +22,7 @@ from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
 from forward.fem.saturation import factors, typical
-from forward.fem.space import BodySpace
+from forward.fem.space import BodySpace, gather_each, scatter_each
 from forward.model import (
     FloatArray,
     Guess,
@@ -200,16 +200,11 @@ class SpecimenSpace:
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U), case after case, on the first rank."""
-        model = self._model
-        parts = [case.space.gather(part) for case, part in zip(model.models, model.states(rows), strict=True)]
-        whole = [part for part in parts if part is not None]
-        return np.concatenate(whole, axis=1) if whole else None
+        return gather_each([case.space for case in self._model.models], self._model.states(rows))
 
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U)."""
-        models = self._model.models
-        parts = np.split(rows, len(models), axis=1)  # all cases have equally many unknowns
-        return np.concatenate([case.space.scatter(part) for case, part in zip(models, parts, strict=True)], axis=1)
+        return scatter_each([case.space for case in self._model.models], rows)
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), which all cases share; collective."""

@@ -126,4 +126,4 @@ class MeasuredSolution:
     def saturation(self) -> Saturation | None:
         """Calibrate estimates of the error of the mesh; None without a mesh."""
         found = self.solution.saturation()
-        return None if found is None else replace(found, outputs=found.outputs[self.which])
+        return None if found is None else found.of(self.which)
