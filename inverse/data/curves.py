@@ -16,7 +16,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.observations import DataError, Table
+from inverse.data.table import DataError, Table
 from inverse.data.units import factor, split_head
 
 CLOSE = 1e-6  # of the largest number: rows this near to a step are at it

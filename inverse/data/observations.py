@@ -11,7 +11,6 @@ Most of the module describes what may be wrong with a table, each mistake with i
 
 from __future__ import annotations
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +26,7 @@ from forward.model import FloatArray
 from forward.settings import nearest, one_line
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
+from inverse.data.table import DataError, others, read_table
 
 TABLES = (".csv", ".txt")
 MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
@@ -34,14 +34,6 @@ POSITION, MOTION, ERRORS = ("x", "y", "z"), ("ux", "uy", "uz"), ("sigma_x", "sig
 COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
 SAME = 1e-9  # of the extent of all points: distance within which points coincide
 TRUTH = "truth."
-
-
-class DataError(ValueError):
-    """Data that cannot be used; each argument is one line: the place, what was found and what was expected."""
-
-    def __str__(self) -> str:
-        """All mistakes, a line each."""
-        return "\n".join(self.args)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +130,7 @@ class Observations:
             where = ", ".join(f"{x:g}" for x in self.places[worst])
             mistakes.append(
                 f"{self.labels[worst]}: ({where}) lies {distance[worst]:.3g} m outside the body, expected at most "
-                f"data.tolerance = {tolerance:.4g} m{_others(far.size - 1)}"
+                f"data.tolerance = {tolerance:.4g} m{others(far.size - 1)}"
             )
         if mistakes:
             raise DataError(*mistakes)
@@ -301,71 +293,6 @@ def read(path: Path, cases: Sequence[str], unit: float = 1.0) -> Observations:
     return found
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of comma-separated values.
-
-    Attributes
-    ----------
-    remarks
-        Its lines that begin with #, without that.
-    columns
-        Their names.
-    rows
-        The cells of each column, row by row.
-    lines
-        Numbers of the lines of the rows.
-    """
-
-    remarks: tuple[str, ...]
-    columns: tuple[str, ...]
-    rows: list[dict[str, str]]
-    lines: list[int]
-
-
-def read_table(path: Path) -> Table:
-    """Read a table; its first line that is not a remark names the columns, and empty rows do not count.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is empty, or a row has other cells than there are columns.
-    """
-    name = path.name
-    try:
-        # Office programs write a byte order mark at the beginning.
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{name}: not a text file in UTF-8") from None
-    except OSError as error:
-        raise DataError(f"{name}: cannot be read: {error.strerror}") from None
-    remarks = tuple(line.lstrip("# ") for line in lines if line.startswith("#"))
-    numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
-    reader = csv.reader((line for _, line in numbered), skipinitialspace=True)
-    try:
-        cells = [(numbered[reader.line_num - 1][0], [cell.strip() for cell in row]) for row in reader]
-    except csv.Error as error:
-        raise DataError(f"{name}: line {numbered[reader.line_num - 1][0]}: {error}, expected commas") from None
-    cells = [(n, row) for n, row in cells if any(row)]
-    if not cells:
-        raise DataError(f"{name}: empty, expected a line with the names of columns, and rows")
-    (first, head), *rest = cells
-    other = next((sign for sign in (";", "\t") if len(head) == 1 and sign in head[0]), None)
-    if other is not None:
-        raise DataError(f"{name}: line {first}: columns with {other!r} between them, expected commas")
-    twice = next((column for column in head if head.count(column) > 1), None)
-    if twice is not None:
-        raise DataError(f"{name}: line {first}: several columns '{twice}', expected different names")
-    if not rest:
-        raise DataError(f"{name}: no rows, expected some below the names of the columns")
-    odd = [(n, len(row)) for n, row in rest if len(row) != len(head)]
-    if odd:
-        n, count = odd[0]
-        more = _others(len(odd) - 1)
-        raise DataError(f"{name}: line {n}: {count} cells, expected {len(head)}, one for each column{more}")
-    return Table(remarks, tuple(head), [dict(zip(head, row, strict=True)) for _, row in rest], [n for n, _ in rest])
-
-
 def _mistakes(found: Observations, name: str) -> list[str]:
     mistakes = []
     for number, case in enumerate(found.cases):
@@ -375,7 +302,7 @@ def _mistakes(found: Observations, name: str) -> list[str]:
     bad = np.flatnonzero((found.sigma <= 0).any(axis=1))
     if bad.size:
         value = found.sigma[bad[0]][found.sigma[bad[0]] <= 0][0]
-        mistakes.append(f"{found.labels[bad[0]]}: sigma = {value:g}, expected more than 0{_others(bad.size - 1)}")
+        mistakes.append(f"{found.labels[bad[0]]}: sigma = {value:g}, expected more than 0{others(bad.size - 1)}")
     step = SAME * float(np.ptp(found.places, axis=0).max() or 1.0)
     keys = np.column_stack([np.round(found.places / step), found.case])
     _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -389,7 +316,7 @@ def _mistakes(found: Observations, name: str) -> list[str]:
         one, other = twice[0]
         mistakes.append(
             f"{found.labels[other]}: the point of {found.labels[one].rpartition(': ')[2]} again in load case "
-            f"'{found.cases[found.case[other]]}', expected each once{_others(len(twice) - 1)}"
+            f"'{found.cases[found.case[other]]}', expected each once{others(len(twice) - 1)}"
         )
     return mistakes
 
@@ -420,13 +347,13 @@ def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
         bad = [i for i, v in enumerate(values) if v is None or math.isinf(v) or (needed and math.isnan(v))]
         if bad:
             given = rows[bad[0]][column]
-            mistakes.append(f"{labels[bad[0]]}: {column} is {given!r}, expected a number{_others(len(bad) - 1)}")
+            mistakes.append(f"{labels[bad[0]]}: {column} is {given!r}, expected a number{others(len(bad) - 1)}")
         numbers[column] = unit * np.array([math.nan if v is None else v for v in values])
     given_cases = [row["case"] if "case" in columns else cases[0] for row in rows]
     strange = [i for i, case in enumerate(given_cases) if case not in cases]
     if strange:
         word = given_cases[strange[0]]
-        more = _others(len(strange) - 1)
+        more = others(len(strange) - 1)
         mistakes.append(f"{labels[strange[0]]}: unknown load case '{word}'; {nearest(word, cases)}{more}")
     if mistakes:
         raise DataError(*mistakes)
@@ -504,7 +431,3 @@ def _number(text: str) -> float | None:
 def _assignment(line: str) -> tuple[str, str]:
     name, _, value = line.removeprefix(TRUTH).partition("=")
     return name.strip(), value.strip().strip('"')
-
-
-def _others(count: int) -> str:
-    return f" (and {count} more)" if count else ""

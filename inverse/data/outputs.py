@@ -21,7 +21,8 @@ from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.curves import Steps, as_rows
 from inverse.data.neighbours import Neighbours, neighbours
-from inverse.data.observations import TRUTH, DataError, read_table
+from inverse.data.observations import TRUTH
+from inverse.data.table import DataError, read_table
 
 COLUMNS = ("output", "value", "sigma")
 

@@ -17,7 +17,8 @@ from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
 from forward.specimen import Specimen
-from inverse.data.observations import DataError, distinct, files
+from inverse.data.observations import distinct, files
+from inverse.data.table import DataError
 from inverse.methods.invert import Invert, names_of
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs

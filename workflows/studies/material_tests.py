@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
-from inverse.data.observations import DataError, Table, read_table
+from inverse.data.table import DataError, Table, read_table
 from workflows.config.mistakes import StudyError, lines
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")

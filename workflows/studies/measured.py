@@ -14,7 +14,8 @@ from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
 from forward.settings import Settings
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.observations import DataError, Observations, read
+from inverse.data.observations import Observations, read
+from inverse.data.table import DataError
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body

@@ -16,8 +16,8 @@ from forward.settings import Settings, nearest
 from forward.spec import MODELS, ModelSpec
 from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.observations import DataError
 from inverse.data.outputs import OutputData, read_outputs, stated
+from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy

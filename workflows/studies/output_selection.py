@@ -19,8 +19,8 @@ from forward.words import named
 from inverse.criticism.comparison import Data
 from inverse.data.curves import steps_of
 from inverse.data.measured_model import MeasuredModel
-from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs, stated
+from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.studies.material_tests import WHOLE
 from workflows.studies.model_selection import ModelSelection, Positive

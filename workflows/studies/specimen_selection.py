@@ -17,7 +17,8 @@ from forward.settings import Settings
 from forward.spec import ModelSpec
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Data
-from inverse.data.observations import DataError, read
+from inverse.data.observations import read
+from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE

@@ -7,8 +7,8 @@ import pytest
 
 from forward.path import Path as Steps
 from inverse.data.curves import steps_of
-from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs
+from inverse.data.table import DataError
 from inverse.data.units import factor, split_head
 
 SPEC = Steps.model_validate(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from forward.bodies.geometry import Block, Box
-from inverse.data.observations import DataError, distinct, files, read
+from inverse.data.observations import distinct, files, read
+from inverse.data.table import DataError
 
 pytestmark = pytest.mark.unit
 

@@ -8,8 +8,8 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
-from inverse.data.observations import DataError
 from inverse.data.outputs import read_outputs, stated
+from inverse.data.table import DataError
 from tests.launch import run_script
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError

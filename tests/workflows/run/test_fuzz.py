@@ -11,7 +11,8 @@ import tomli_w
 from pydantic import ValidationError
 
 from forward.bodies.mesh_file import MeshFile
-from inverse.data.observations import DataError, read
+from inverse.data.observations import read
+from inverse.data.table import DataError
 from tests.forward.bodies.test_mesh_file import box, numbered
 from tests.fuzz import damaged_bytes, damaged_table, mutations
 from workflows.__main__ import main

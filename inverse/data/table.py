@@ -1,0 +1,85 @@
+"""Tables of comma-separated values, and what may be wrong with data."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class DataError(ValueError):
+    """Data that cannot be used; each argument is one line: the place, what was found and what was expected."""
+
+    def __str__(self) -> str:
+        """All mistakes, a line each."""
+        return "\n".join(self.args)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of comma-separated values.
+
+    Attributes
+    ----------
+    remarks
+        Its lines that begin with #, without that.
+    columns
+        Their names.
+    rows
+        The cells of each column, row by row.
+    lines
+        Numbers of the lines of the rows.
+    """
+
+    remarks: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: list[dict[str, str]]
+    lines: list[int]
+
+
+def read_table(path: Path) -> Table:
+    """Read a table; its first line that is not a remark names the columns, and empty rows do not count.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is empty, or a row has other cells than there are columns.
+    """
+    name = path.name
+    try:
+        # Office programs write a byte order mark at the beginning.
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{name}: not a text file in UTF-8") from None
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read: {error.strerror}") from None
+    remarks = tuple(line.lstrip("# ") for line in lines if line.startswith("#"))
+    numbered = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
+    reader = csv.reader((line for _, line in numbered), skipinitialspace=True)
+    try:
+        cells = [(numbered[reader.line_num - 1][0], [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise DataError(f"{name}: line {numbered[reader.line_num - 1][0]}: {error}, expected commas") from None
+    cells = [(n, row) for n, row in cells if any(row)]
+    if not cells:
+        raise DataError(f"{name}: empty, expected a line with the names of columns, and rows")
+    (first, head), *rest = cells
+    other = next((sign for sign in (";", "\t") if len(head) == 1 and sign in head[0]), None)
+    if other is not None:
+        raise DataError(f"{name}: line {first}: columns with {other!r} between them, expected commas")
+    twice = next((column for column in head if head.count(column) > 1), None)
+    if twice is not None:
+        raise DataError(f"{name}: line {first}: several columns '{twice}', expected different names")
+    if not rest:
+        raise DataError(f"{name}: no rows, expected some below the names of the columns")
+    odd = [(n, len(row)) for n, row in rest if len(row) != len(head)]
+    if odd:
+        n, count = odd[0]
+        more = others(len(odd) - 1)
+        raise DataError(f"{name}: line {n}: {count} cells, expected {len(head)}, one for each column{more}")
+    return Table(remarks, tuple(head), [dict(zip(head, row, strict=True)) for _, row in rest], [n for n, _ in rest])
+
+
+def others(count: int) -> str:
+    """Say how many more there are of the same mistake."""
+    return f" (and {count} more)" if count else ""
