@@ -1,12 +1,14 @@
-"""Evaluations and solves of a model by one rank group, which stores what it has solved."""
+"""Evaluations, solves and derivatives of a model by one rank group, which stores what it has computed."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import h5py
 import numpy as np
 
 from forward.model import (
@@ -14,18 +16,27 @@ from forward.model import (
     ForwardModel,
     Guess,
     InadmissibleError,
+    MeshError,
     NodalSpace,
     OneByOne,
+    Saturation,
     Solution,
     SolveError,
+    Stability,
+    Work,
     gathered,
     scattered,
 )
+from uq.evaluation.checkpoint import HEAD
 from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, Request, merge
+from uq.evaluation.hdf5 import creation, image, in_memory
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from uq.evaluation.checkpoint import Checkpoint
 
+T = TypeVar("T")
 BLOCKS = 16  # into which a request is cut: an interruption costs at most one of them
 LEAST = 4  # points in a block, unless a request has fewer
 
@@ -126,10 +137,34 @@ class _Solved:
 
 
 @dataclass(frozen=True)
-class KeptModel(OneByOne):
-    """A model in one rank group whose states are stored: the solver starts from a state on disk, and ends there.
+class _Derived:
+    """What determines derivatives at a solution."""
 
-    A stored state meets the tolerance already, so that the solution is the same. Collective over the group.
+    solved: _Solved
+    of: str
+    along: FloatArray
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Derivatives on disk."""
+
+    values: FloatArray
+
+    def image(self, note: str) -> bytes:
+        """Return the bytes of an HDF5 file."""
+        with in_memory(creation(HEAD)) as file:
+            file["rows"] = self.values
+            file.attrs["note"] = note
+            return image(file)
+
+
+@dataclass(frozen=True)
+class KeptModel(OneByOne):
+    """A model in one rank group whose solutions are stored, with the derivatives that were asked of them.
+
+    What is on disk is not computed again, failures included; for what is not, the solver starts from the stored state,
+    which meets the tolerance already, so that the solution is the same. Collective over the group.
 
     Parameters
     ----------
@@ -141,7 +176,7 @@ class KeptModel(OneByOne):
     Attributes
     ----------
     keys
-        Names of the solves so far.
+        Names of the solves and derivatives so far.
     """
 
     model: ForwardModel
@@ -171,46 +206,132 @@ class KeptModel(OneByOne):
         """Whether solutions have derivatives."""
         return self.model.differentiable
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
-        """Return the solution at parameters (d,), from its state if that is stored; errors as for the model."""
-        key = self.checkpoint.key(_Solved(self.label, np.asarray(parameters)))
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> KeptSolution:
+        """Return the solution at parameters (d,), the stored one if there is one; errors as for the model."""
+        solved = _Solved(self.label, np.array(parameters))
+        key = self.checkpoint.key(solved)
         self.keys.append(key)
-        kept = None
-        if self.group.rank == 0 and self.checkpoint.has(key):
-            kept = self.checkpoint.load(key)
-        kept = self.group.bcast(kept)
-        if kept is not None:
-            self._note(kept)
-            return self.model.solve(parameters, replace(guess or Guess(), state=scattered(self.model, kept.fields)[0]))
+        block = self._read(key, self.checkpoint.load)
+        if block is None:
+            return self._solved(solved, key, guess)
+        self._note(block)
+        for failure in block.failures:
+            refused = InadmissibleError if failure.inadmissible else SolveError
+            work, stability = Work(*block.work[0].tolist()), Stability(block.stability[0])
+            raise refused(failure.reason, failure.history, work, stability)
+        state = scattered(self.model, block.fields)[0]
+        return KeptSolution(
+            self, solved, block, state, lambda: self.model.solve(parameters, replace(guess or Guess(), state=state))
+        )
+
+    def _solved(self, solved: _Solved, key: str, guess: Guess | None) -> KeptSolution:
+        """Solve, and store what was found."""
         begin = time.process_time()
         try:
-            solution = self.model.solve(parameters, guess)
+            solution = self.model.solve(solved.parameters, guess)
         except SolveError as error:
-            self._note(_failed(self.outputs, error, time.process_time() - begin))
+            self._keep(key, _failed(self.outputs, error, time.process_time() - begin))
             raise
         seconds = np.array([time.process_time() - begin])
         whole = gathered(self.model, np.asarray(solution.state)[None])
         work = solution.work.as_array()[None]
         residual, converged = np.array([solution.residual]), np.array([solution.converged])
-        outputs = np.asarray(solution.outputs)[None]
+        outputs = np.array(solution.outputs)[None]
         known = np.array([solution.stability], dtype=np.int8)
         state = np.zeros((0, 0)) if whole is None else whole
         block = Evaluations(
-            np.asarray(parameters)[None], outputs, None, (), seconds, work, residual, converged, known, state
+            solved.parameters[None], outputs, None, (), seconds, work, residual, converged, known, state
         )
+        self._keep(key, block)
+        return KeptSolution(self, solved, block, solution.state, lambda: solution)
+
+    def derived(self, what: _Derived, find: Callable[[], FloatArray], *, states: bool = False) -> FloatArray:
+        """Return derivatives, the stored ones if there are any; those of `states` (k, U_local) are distributed."""
+        key = self.checkpoint.key(what)
+        self.keys.append(key)
+        kept = self._read(key, lambda key: _rows(self.checkpoint.path(key)))
+        if kept is not None:
+            return scattered(self.model, kept) if states else kept
+        rows = find()
+        whole = gathered(self.model, rows) if states else rows
+        if self.group.rank == 0 and whole is not None:
+            self.checkpoint.save(key, _Rows(whole))
+        return rows
+
+    def _read(self, key: str, load: Callable[[str], T]) -> T | None:
+        here = self.group.rank == 0 and self.checkpoint.has(key)
+        found: T | None = self.group.bcast(load(key) if here else None)
+        return found
+
+    def _keep(self, key: str, block: Evaluations) -> None:
         if self.group.rank == 0:
             self.checkpoint.save(key, block)
         self._note(block)
-        return solution
 
     def _note(self, block: Evaluations) -> None:
         self.log.append(replace(block, points=np.zeros((1, 0)), fields=np.zeros((0, 0))))
 
     def forget(self) -> None:
-        """Remove the states, once their results are stored."""
+        """Remove states and derivatives, once their results are stored."""
         if self.group.rank == 0:
             self.checkpoint.drop(self.keys)
         self.keys.clear()
+
+
+class KeptSolution:
+    """A solution as it is stored; its model solves for it only where a derivative is asked that is not.
+
+    Parameters
+    ----------
+    kept, solved, block
+        The model, what determines the solution, and what is stored of it.
+    state
+        This rank's part (U_local,) of the state.
+    solve
+        Returns the solution of the model itself.
+    """
+
+    def __init__(
+        self, kept: KeptModel, solved: _Solved, block: Evaluations, state: FloatArray, solve: Callable[[], Solution]
+    ) -> None:
+        self._kept, self._solved, self._solve = kept, solved, solve
+        self.outputs, self.state = block.outputs[0], state
+        self.residual, self.converged = float(block.residuals[0]), bool(block.converged[0])
+        self.stability, self.work = Stability(block.stability[0]), Work(*block.work[0].tolist())
+
+    @cached_property
+    def _solution(self) -> Solution:
+        return self._solve()
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
+        what = _Derived(self._solved, "tangent", np.asarray(direction))
+        return self._kept.derived(what, lambda: self._solution.tangent(direction))
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
+        what = _Derived(self._solved, "adjoint", np.asarray(weights))
+        return self._kept.derived(what, lambda: self._solution.adjoint(weights))
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state (U_local,) along a `direction` (d,), or of k of them."""
+        what = _Derived(self._solved, "state tangent", np.asarray(direction))
+        rows = self._kept.derived(what, lambda: np.atleast_2d(self._solution.state_tangent(direction)), states=True)
+        return rows if np.ndim(direction) == 2 else rows[0]
+
+    def mesh_error(self) -> MeshError | None:
+        """Estimate the error of the mesh."""
+        return self._solution.mesh_error()
+
+    def saturation(self) -> Saturation | None:
+        """Calibrate estimates of the error of the mesh."""
+        return self._solution.saturation()
+
+
+def _rows(path: Path) -> FloatArray:
+    """Derivatives from a file whose checksum was verified."""
+    with h5py.File(path, "r") as file:
+        return np.asarray(file["rows"][()])
 
 
 def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:

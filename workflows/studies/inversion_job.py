@@ -22,7 +22,7 @@ from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
-from workflows.studies.finer import FINER, finer_meshes, solved_by, solved_on
+from workflows.studies.finer import FINER, finer_meshes, solved_by
 from workflows.studies.inversion import Inversion, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MethodJob, TasksJob
@@ -171,12 +171,17 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
     invert_field = _inverting_field(study, made) if study.field else None
 
+    def look(name: str, model: ForwardModel) -> Finer:
+        """Solve on finer meshes, which are no solves of the model."""
+        kept = KeptEvaluate(model, ensemble.group, checkpoint, f"{name}/{FINER}", lambda done, failed: None)
+        solving.append(kept)
+        return solved_by(kept)
+
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         observed = made.observing(number)
-        there = made.finer(observed)
-        finer = _solved(there, solved_on)
+        finer = _solved(made.finer(observed), partial(look, names[number]))
         if invert_field is not None:
             states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
             solving.append(states)
