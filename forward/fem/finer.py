@@ -1,21 +1,23 @@
-"""A specimen on finer meshes: what error its own mesh makes of what is observed.
+"""A body on finer meshes: what error its own mesh makes of what is observed.
 
 Cells are smaller everywhere, and smaller still at the faces that are held, where stresses are singular along the rim: a
-mesh that is refined equally shares most of the error there. The same grading with as many cells as the specimen has
+mesh that is refined equally shares most of the error there. The same grading with as many cells as the body has
 tells how fast the error falls, from which follows what the finer mesh still misses (`forward.extrapolated`). Random
 fields are those of the mesh itself, interpolated.
 
-Finer meshes are quadratic, with as many nodes where the specimen is linear, and never coarser than a few cells: the
+Finer meshes are quadratic, with as many nodes where the body is linear, and never coarser than a few cells: the
 differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
-(docs/decisions/0017-mesh-error.md). Only where there are random fields cells are halved, and the other mesh is that of
-the specimen: a mesh that does not contain its vertices has another field.
+(docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are halved, and graded as those of the body: the
+edge of the contact may be anywhere. Where there are random fields cells are halved too, and the other mesh is that of
+the body: a mesh that does not contain its vertices has another field.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,38 +29,46 @@ from forward.extrapolated import HALVED, Begun, Extrapolated
 from forward.model import FloatArray, Guess, ModelError, OneByOne, SolveError
 
 if TYPE_CHECKING:
+    from forward.fem.model import FiniteElementSolution, HyperelasticModel
+    from forward.fem.path import PathModel, PathSolution
     from forward.fem.specimen import SpecimenModel, SpecimenSolution
-    from forward.model import MeshError, Saturation, Stability, Work
+    from forward.hyperelastic import Hyperelastic
+    from forward.model import ForwardModel, MeshError, Saturation, Stability, Work
     from forward.specimen import Specimen
 
-TIMES = 1.5  # cells along an edge, over those of the specimen
+    AnyBody = Hyperelastic | Specimen
+    AnyModel = HyperelasticModel | PathModel | SpecimenModel
+    AnySolution = FiniteElementSolution | PathSolution | SpecimenSolution
+
+TIMES = 1.5  # cells along an edge, over those of the body
 LEAST = {TIMES: 5, 1.0: 3}  # cells along an edge of the finer and of the coarser mesh
+OF_TOUCHED = 1.6  # order with which errors fall where a tool touches
 OF_LINEAR = 0.1  # what quadratic cells of the same size still miss, over what they add to linear ones
 QUADRATIC = {"degree": 2, "quadrature_degree": None}
 HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
-def finer(spec: Specimen) -> Specimen:
-    """Return a specimen on a finer mesh, with one field of values at the vertices in place of those on its stiffness.
+def finer(spec: AnyBody) -> Any:
+    """Return a body on a finer mesh, with fields of values at the vertices in place of its random fields.
 
     Raises
     ------
     ModelError
-        If it has none, with the reason.
+        If there is none, with the reason.
     """
     return _on(spec, TIMES)
 
 
-def graded(spec: Specimen) -> Specimen | None:
-    """Return a specimen on a mesh that is graded as the finer one; None where it is graded so, or is not graded."""
+def graded(spec: AnyBody) -> Any | None:
+    """Return a body on a mesh that is graded as the finer one; None where it is graded so, or is not graded."""
     if isinstance(spec.body, MeshFile) or spec.fields:
         return None
     found = _on(spec, 1.0)
     return None if found.body == spec.body else found
 
 
-def share(spec: Specimen) -> float:
+def share(spec: AnyBody) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
     if isinstance(spec.body, MeshFile):
         return OF_LINEAR if spec.body.degree == 1 else HALVED
@@ -67,35 +77,55 @@ def share(spec: Specimen) -> float:
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
     times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
     # Displacements converge like h^(degree + 1) where meshes are graded as singular stresses want it.
-    return float(1 / (times ** (fine.degree + 1) - 1))
+    return float(1 / (times ** (OF_TOUCHED if _touched(spec) else fine.degree + 1) - 1))
 
 
-def _on(spec: Specimen, times: float) -> Specimen:
-    if any(field.of != "stiffness" for field in spec.fields):
-        raise ModelError("its density is a random field")
-    held = [face for case in spec.cases for face in (*case.clamp, *(item.on for item in case.displacements))]
+def held(spec: AnyBody) -> tuple[str, ...]:
+    """Return the boundaries where a body is held, in any load case: by planes of symmetry and rollers it is not."""
+    moved = [item.on for case in _cases(spec) for item in case.displacements if len(item.components) > 1]
+    return tuple(dict.fromkeys([*(face for case in _cases(spec) for face in case.clamp), *moved]))
+
+
+def _touched(spec: AnyBody) -> bool:
+    """Whether a tool is pressed against the body, in any load case."""
+    return any(load.contact for case in _cases(spec) for load in case.loads)
+
+
+def _cases(spec: Any) -> tuple[Any, ...]:
+    return getattr(spec, "cases", (spec,))
+
+
+def _on(spec: AnyBody, times: float) -> Any:
+    if not hasattr(spec, "body"):
+        raise ModelError(f"a model of kind '{spec.kind}' has no body that could be meshed again")
     body, linear = spec.body, spec.body.degree == 1
     if isinstance(body, MeshFile) and linear:
         body = body.model_validate(body.model_dump(exclude={"contents"}) | QUADRATIC)
     elif isinstance(body, MeshFile):
-        body = body.finer(times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+        body = body.finer(times, held(spec), HELD, BESIDE)
     elif spec.fields:
         body = body.with_cells(2.0)
     else:
-        body = body.finer(times / 2 if linear else times, tuple(dict.fromkeys(held)), HELD, BESIDE)
+        if _touched(spec):  # the edge of the contact decides, wherever that is
+            body = body.with_cells((2.0 if times > 1 else 1.0) / (2 if linear else 1))
+        else:
+            body = body.finer(times / 2 if linear else times, held(spec), HELD, BESIDE)
         cells = {"cells": tuple(max(n, LEAST[times]) for n in body.cells)}
         body = body.model_validate(body.model_dump() | cells | (QUADRATIC if linear else {}))
-    fields = (RandomField(of="stiffness", length=1.0, std=1.0, basis="nodes"),) if spec.fields else ()
-    return spec.model_copy(update={"body": body, "fields": fields, "observed": ()})
+    of = dict.fromkeys(field.of for field in spec.fields)
+    fields = tuple(RandomField(of=what, length=1.0, std=1.0, basis="nodes") for what in of)
+    # Linear cells have displacements only, quadratic ones pressures too where they need them.
+    found = spec.model_copy(update={"body": body, "fields": fields, **({"formulation": "auto"} if linear else {})})
+    return found.model_copy(update={"observed": ()} if hasattr(spec, "observed") else {"adapt": None})
 
 
-def extrapolated(model: SpecimenModel, start: FloatArray | None = None) -> FinerMeshes:
-    """Return a specimen on finer meshes; these are made when they are first solved on.
+def extrapolated(model: AnyModel, start: FloatArray | None = None) -> FinerMeshes:
+    """Return a body on finer meshes; these are made when they are first solved on.
 
     Parameters
     ----------
     model
-        The specimen.
+        The body: a specimen, or one with outputs.
     start
         Parameters (d,) that are solved for first.
 
@@ -104,49 +134,57 @@ def extrapolated(model: SpecimenModel, start: FloatArray | None = None) -> Finer
     ModelError
         If there is no finer mesh of it.
     """
-    beside = graded(model.spec)
+    fine, beside = finer(model.spec), graded(model.spec)
     coarse = None if beside is None else OtherMesh(model, beside)
-    return FinerMeshes(OtherMesh(model, finer(model.spec)), coarse, share(model.spec), start)
+    return FinerMeshes(model, OtherMesh(model, fine), coarse, share(model.spec), start)
 
 
 class FinerMeshes:
-    """A specimen on finer meshes.
+    """A body on finer meshes.
 
     Parameters
     ----------
+    own
+        On its own mesh.
     fine, coarse
-        On the finest, and on the other one; None where that is the mesh of the specimen.
+        On the finest, and on the other one; None where that is its own.
     share, start
         As of `Extrapolated`.
     """
 
-    def __init__(self, fine: OtherMesh, coarse: OtherMesh | None, share: float, start: FloatArray | None) -> None:
-        self.fine, self.coarse, self.share, self.start = fine, coarse, share, start
+    def __init__(
+        self, own: AnyModel, fine: OtherMesh, coarse: OtherMesh | None, share: float, start: FloatArray | None
+    ) -> None:
+        self.own, self.fine, self.coarse, self.share, self.start = own, fine, coarse, share, start
         self._begun: list[Begun | None] = []
 
     def observing(self, observed: SpecimenModel) -> Extrapolated:
-        """Return the model of what is `observed` of the specimen; collective when it is first solved."""
+        """Return the model of what is `observed` of a specimen; collective when it is first solved."""
         coarse = observed if self.coarse is None else self.coarse.observing(observed)
         return Extrapolated(self.fine.observing(observed), coarse, self.share, self.start, self._begun)
 
+    def restricted(self, to: Callable[[ForwardModel], ForwardModel] = lambda model: model) -> Extrapolated:
+        """Return the model of its outputs, or of those that a function restricts it to; as `observing`."""
+        return Extrapolated(to(self.fine), to(self.coarse or self.own), self.share, self.start, self._begun)
+
 
 class OtherMesh(OneByOne):
-    """A specimen on another mesh, as a model of the parameters that it has on its own.
+    """A body on another mesh, as a model of the parameters that it has on its own.
 
     Parameters
     ----------
     model
-        The specimen on its own mesh.
+        The body on its own mesh.
     spec
         The same on the other one, as `finer` returns it.
     """
 
-    def __init__(self, model: SpecimenModel, spec: Specimen) -> None:
+    def __init__(self, model: AnyModel, spec: Any) -> None:
         self.spec = spec
         self.parameters, self.outputs = model.parameters, model.outputs
         self.differentiable, self.space = True, None
         self._own = model
-        self._made: list[SpecimenModel] = []  # shared by all that observe
+        self._made: list[AnyModel] = []  # shared by all that observe
         self._observed: SpecimenModel | None = None
 
     def observing(self, observed: SpecimenModel) -> OtherMesh:
@@ -157,17 +195,19 @@ class OtherMesh(OneByOne):
         return other
 
     @property
-    def _mesh(self) -> SpecimenModel:
+    def _mesh(self) -> AnyModel:
         if not self._made:
             numbers = tuple(self._own.parameters[i] for i in self._scalars)
-            model = self.spec.build(self._own.models[0].equations.comm, (*numbers, *self.spec.coefficients))
-            self._made.append(model)
+            self._made.append(self.spec.build(self._own.equations.comm, (*numbers, *self.spec.coefficients)))
         return self._made[0]
 
     @cached_property
-    def _model(self) -> SpecimenModel:
-        observed = self._own if self._observed is None else self._observed
-        return self._mesh.observing(observed.places, observed.axes.tolist(), observed.cases.tolist())
+    def _model(self) -> AnyModel:
+        mesh: Any = self._mesh
+        if not hasattr(mesh, "observing"):
+            return self._mesh
+        observed: Any = self._own if self._observed is None else self._observed
+        return cast("SpecimenModel", mesh.observing(observed.places, observed.axes.tolist(), observed.cases.tolist()))
 
     @cached_property
     def _scalars(self) -> list[int]:
@@ -176,12 +216,14 @@ class OtherMesh(OneByOne):
 
     @cached_property
     def _interpolation(self) -> tuple[NDArray[np.int64], FloatArray]:
-        """Vertices (n, k) of the specimen's mesh around each vertex of the other one, and weights (n, k)."""
-        vertices = self._own.vertices
+        """Vertices (n, k) of the body's mesh around each vertex of the other one, and weights (n, k)."""
+        from forward.fem.layout import vertices_of  # not before there is a mesh: this module is what `check` asks too
+
+        vertices = vertices_of(self._own.equations)
         cells, _ = vertices.cells()
         if cells.shape[1] == 8:
             cells = cells[:, VTK_TO_TENSOR]
-        found = locate(vertices.coordinates[cells], self._mesh.vertices.coordinates)
+        found = locate(vertices.coordinates[cells], vertices_of(self._mesh.equations).coordinates)
         return cells[found.cells], shapes(found.local, cells.shape[1])
 
     def values(self, points: FloatArray) -> FloatArray:
@@ -189,13 +231,17 @@ class OtherMesh(OneByOne):
         scalars = points[:, self._scalars]
         if not self.spec.fields:
             return scalars
+        from forward.fem.space import log_factor
+
         around, weights = self._interpolation
-        (field,) = self.spec.fields
-        log = self._own.log_fields(points)[:, around]
-        return np.concatenate([scalars, (weights * log).sum(axis=2) - field.on(self.spec.body).offset], axis=1)
+        found = [scalars]
+        for field in self.spec.fields:
+            log = log_factor(self._own, points, field.of)[:, around]
+            found.append((weights * log).sum(axis=2) - field.on(self.spec.body).offset)
+        return np.concatenate(found, axis=1)
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> OtherSolution:
-        """Solve at parameters (d,) of the specimen on its own mesh; collective.
+        """Solve at parameters (d,) of the body on its own mesh; collective.
 
         Raises
         ------
@@ -212,7 +258,7 @@ class OtherMesh(OneByOne):
 class OtherSolution:
     """A solution on another mesh, with derivatives by the parameters on the own one."""
 
-    def __init__(self, model: OtherMesh, solution: SpecimenSolution) -> None:
+    def __init__(self, model: OtherMesh, solution: AnySolution) -> None:
         self._model, self._solution = model, solution
         self.outputs, self.state = solution.outputs, solution.state
         self.residual, self.converged = solution.residual, solution.converged

@@ -90,6 +90,11 @@ class Layout:
         return self.nodes()[local], kind
 
 
+def vertices_of(equations: Any) -> Layout:
+    """Return the vertices of a mesh in the canonical order, and its cells; collective."""
+    return Layout(spaces.scalar_space(equations.mesh, 1), equations.comm)
+
+
 def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
     """Return sorted coordinates (N, 3) of all nodes of a space, and canonical numbers: by global number, and ours."""
     parts = comm.allgather(spaces.node_coordinates(space))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,3 +86,23 @@ def scatter_each(spaces: Sequence[BodySpace], rows: FloatArray) -> FloatArray:
     """Take this rank's part (k, U_local) of states (k, U) of several bodies with equally many unknowns."""
     parts = np.split(rows, len(spaces), axis=1)
     return np.concatenate([space.scatter(part) for space, part in zip(spaces, parts, strict=True)], axis=1)
+
+
+def log_factor(model: Any, points: FloatArray, of: str) -> FloatArray:
+    """Return ln (n, N) of the random factor on a quantity at the vertices, on every rank; collective.
+
+    Parameters
+    ----------
+    model
+        A body, a path or a specimen.
+    points
+        Parameters (n, d).
+    of
+        "stiffness" or "density": the factor is the product of all random fields that multiply it.
+    """
+    found = np.zeros((len(points), model.spec.body.vertex_count))
+    labels = [field.label for field in model.spec.fields if field.of == of]
+    if labels:
+        factors = model.equations.comm.bcast(model.space.factors(points, 1))
+        found += sum(np.log(factors[label]) for label in labels)
+    return found

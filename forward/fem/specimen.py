@@ -19,10 +19,10 @@ from forward.bodies.geometry import AXES
 from forward.fem.dolfinx import spaces
 from forward.fem.enriched import Enriched, relative
 from forward.fem.equations import Discretisation
-from forward.fem.layout import Layout
+from forward.fem.layout import Layout, vertices_of
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
 from forward.fem.saturation import factors, typical
-from forward.fem.space import BodySpace, gather_each, scatter_each
+from forward.fem.space import BodySpace, gather_each, log_factor, scatter_each
 from forward.model import (
     FloatArray,
     Guess,
@@ -131,23 +131,22 @@ class SpecimenModel(OneByOne):
             ]
         return self._enriched_observations[degree]
 
+    @property
+    def equations(self) -> Discretisation:
+        """Those of the first case; all share the mesh."""
+        return self.models[0].equations
+
     @cached_property
     def vertices(self) -> Layout:
         """The vertices of the mesh in the canonical order, and its cells; collective when first used."""
-        equations = self.models[0].equations
-        return Layout(spaces.scalar_space(equations.space.mesh, 1), equations.comm)
+        return vertices_of(self.equations)
 
     def log_fields(self, points: FloatArray) -> FloatArray:
         """Return ln (n, N) of the random factor on the stiffness at the vertices at parameters (n, d); collective.
 
         The factor is the product of all random fields; on every rank.
         """
-        model = self.models[0]
-        found = np.zeros((len(points), self.spec.body.vertex_count))
-        if self.spec.fields:
-            factors = model.equations.comm.bcast(self.space.factors(points, 1))
-            found += sum(np.log(factors[field.label]) for field in self.spec.fields if field.of == "stiffness")
-        return found
+        return log_factor(self, points, "stiffness")
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> SpecimenSolution:
         """Find the equilibria of all cases at `parameters` (d,), as `HyperelasticModel.solve` does; collective.

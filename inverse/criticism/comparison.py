@@ -380,10 +380,10 @@ def _meshes(
     meshes: Mapping[Pair, MeshFound],
     std: FloatArray,
 ) -> dict[str, tuple[Any, Any]]:
-    """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations `std`."""
+    """What a finer mesh adds to the data, over the noise, to ln Z, and to unknowns, over their deviations."""
     shape = (len(names), len(data_groups))
     whys, added, fixed = np.full(shape, "", dtype=object), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
-    shift, errors = np.full(std.shape, np.nan), []
+    shift, left, errors = np.full(std.shape, np.nan), np.full(std.shape, np.nan), []
     for g, (group, data) in enumerate(data_groups.items()):
         error = np.full((len(names), len(data.tests)), np.nan)
         for k, name in enumerate(names):
@@ -391,7 +391,8 @@ def _meshes(
             whys[k, g], added[k, g] = found.why, found.log_evidence
             error[k, : len(found.error)] = found.error
             columns = [parameters.index(p) for p in posteriors[name, group].inputs.names]
-            shift[k, g, columns], fixed[k, g] = found.shift, found.corrected and found.settled
+            shift[k, g, columns], left[k, g, columns] = found.shift, found.left
+            fixed[k, g] = found.corrected and found.settled
         errors.append(error)
     dims = ("model", "group")
     return {
@@ -401,6 +402,7 @@ def _meshes(
         "mesh_log_evidence": (dims, added),
         "mesh_error": (("model", "output"), np.concatenate(errors, axis=1)),
         "mesh_shift": ((*dims, "parameter"), shift),
+        "mesh_left": ((*dims, "parameter"), left),
     }
 
 

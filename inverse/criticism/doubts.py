@@ -241,13 +241,18 @@ def mesh_corrected(
     if not settled:
         severity: Severity = "error" if worst > WRONG and size > FAR else "warning"
         return [Doubt(severity, f"{text}. The correction has not settled: {ADVICE}", "its mesh error has not settled")]
-    if worst > EXTREME or uncertain > DECIDES:
+    if decides(worst, uncertain):
         return [Doubt("warning", f"{text}. It decides on the result: {ADVICE}", "the correction of its mesh decides")]
     if len(nodes) and size > OF_FIELD:
         why = "that is rough for a field: what the data determine best may be off by several deviations"
         short = "its mesh is too coarse for what the data determine best"
         return [Doubt("warning", f"{text}. But {why}, single vertices less so; {ADVICE}", short)]
     return [Doubt("note", text, "")]
+
+
+def decides(shift: Any, left: Any) -> Any:
+    """Whether a correction of the mesh decides on a result, by its largest shift and what is uncertain of it."""
+    return (shift > EXTREME) | (left > DECIDES)
 
 
 def _moves(shifts: Mapping[str, float], nodes: FloatArray) -> tuple[str, float]:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import ForwardModel
+    from inverse.criticism.doubts import Doubt
     from uq.inputs.distributions import Distribution
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.selection import Comparison
@@ -160,16 +161,28 @@ def doubts_of_selection(
         ]
         found += criticism.strangers(residual, np.zeros(len(residual)), labels, heavy=False, remedy="")
         if "mesh_checked" in dataset:
-            shifts = dict(zip(names, of["mesh_shift"].sel(parameter=names).to_numpy().tolist(), strict=True))
-            error, why = rows["mesh_error"].sel(model=best).to_numpy(), str(of["mesh_why"].item())
-            none = np.zeros(0)
-            if bool(of["mesh_corrected"]):
-                found += criticism.mesh_corrected(error, shifts, {}, none, settled=True)
-            else:
-                found += criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, none)
+            found += _doubts_of_mesh(dataset, best, group)
         where = f"{best} in {group}" if dataset.sizes["group"] > 1 else best
         said += [Finding(doubt.severity, f"{where}: {doubt.text}.") for doubt in found]
     return said + _doubts_of_meshes(dataset, best)
+
+
+def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Doubt]:
+    """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
+    from inverse.criticism import doubts as criticism
+
+    of = dataset.sel(model=model, group=group)
+    here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
+    error = of["mesh_error"].to_numpy()[here]
+    names = [str(name) for name in dataset.parameter.values]
+    shifts, left = (
+        {name: value for name, value in zip(names, of[key].to_numpy().tolist(), strict=True) if np.isfinite(value)}
+        for key in ("mesh_shift", "mesh_left")
+    )
+    if bool(of["mesh_corrected"]):
+        return criticism.mesh_corrected(error, shifts, left, np.zeros(0), settled=True)
+    why = str(of["mesh_why"].item())
+    return criticism.mesh_too_coarse(bool(of["mesh_checked"]), why, error, shifts, np.zeros(0))
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
@@ -186,6 +199,14 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
         for model in map(str, dataset.model.values)
         for one in [dataset.isel(group=0).sel(model=model)]
         if model != best and not bool(one["mesh_checked"])
+    ]
+    said += [
+        Finding(doubt.severity, f"{model}: {doubt.text}.")
+        for model in map(str, dataset.model.values)
+        for group in map(str, dataset.group.values)
+        if model != best and bool(dataset["mesh_corrected"].sel(model=model, group=group))
+        for doubt in _doubts_of_mesh(dataset, model, group)
+        if doubt.severity != "note"
     ]
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
@@ -210,13 +231,14 @@ def with_right_derivatives(dataset: xr.Dataset, wrong: Collection[str]) -> xr.Da
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
-    """Trust no evidence whose mesh was not looked at, or whose ln Z it moves or may move and is not corrected."""
-    from inverse.criticism.doubts import certain
+    """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
+    from inverse.criticism.doubts import certain, decides
 
     if "mesh_checked" not in dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
-    known = dataset["mesh_corrected"] | certain(dataset["mesh_log_evidence"], shift)
+    mended = dataset["mesh_corrected"] & ~decides(shift, dataset["mesh_left"].max("parameter"))
+    known = mended | (~dataset["mesh_corrected"] & certain(dataset["mesh_log_evidence"], shift))
     return dataset.assign(trusted=dataset["trusted"] & known)
 
 

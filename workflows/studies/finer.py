@@ -3,41 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.model import SolveError
+from forward.settings import one_line
 from inverse.criticism.finer import Finer, Solved
+from inverse.data.measured_model import MeasuredModel
 from uq.evaluation.evaluate import Request
 
 if TYPE_CHECKING:
     from forward.fem.finer import FinerMeshes
-    from forward.fem.specimen import SpecimenModel
     from forward.model import FloatArray, ForwardModel
     from uq.evaluation.evaluate import Evaluate
 
 FINER = "finer mesh"  # in names of models
 
 
-def finer_meshes(model: SpecimenModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
-    """Return a specimen on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+def finer_meshes(model: Any, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+    """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
     from forward.fem.finer import extrapolated
 
     try:
         return extrapolated(model, start), ""
     except ValueError as error:  # a mesh that is not divided, or would be too large
-        return None, str(error)
+        return None, one_line(str(error))
 
 
 def once_on_finer_meshes(make: Callable[[], ForwardModel], start: FloatArray) -> ForwardModel:
-    """Return the model on finer meshes of a specimen."""
+    """Return the model on finer meshes of a specimen, or of the measured outputs of a body."""
     from forward.fem.finer import extrapolated
     from forward.fem.specimen import SpecimenModel
 
-    specimen = make()
-    assert isinstance(specimen, SpecimenModel)
-    return extrapolated(specimen, start).observing(specimen)
+    own: Any = make()
+    if isinstance(own, SpecimenModel):
+        return extrapolated(own, start).observing(own)
+    assert isinstance(own, MeasuredModel)
+    measured = own.which
+    body: Any = own.model
+    return extrapolated(body, start).restricted(lambda model: MeasuredModel(model, measured))
 
 
 def solved_on(model: ForwardModel) -> Finer:

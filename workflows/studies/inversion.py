@@ -33,7 +33,7 @@ from workflows.config.priors import (
 )
 from workflows.config.report import Report
 from workflows.studies.measured import DataFiles, DataSet, read_measurement
-from workflows.studies.predictions import meshes_of
+from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -156,10 +156,13 @@ class InversionStudy(StudyKind):
             return other.model_validate(blocks).with_data(folder)
         return Inversion.model_validate(blocks).with_data(folder)
 
-    @property
-    def specs(self) -> tuple[ModelSpec, ...]:
-        """The model."""
-        return (self.model,)
+    def _with_finer(self, spec: Any) -> tuple[ModelSpec, ...]:
+        """A model, and the same on the finer meshes that it is looked at on."""
+        looked = has_mesh(spec) and self.method.treatment is not None
+        try:
+            return spec, *(meshes_of(spec) if looked else ())
+        except ValueError:  # there are none, which is said elsewhere
+            return (spec,)
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -317,10 +320,7 @@ class Inversion(InversionStudy):
     @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The specimen, and the same on the finer meshes that it is looked at on."""
-        try:
-            return self.model, *(meshes_of(self.specimen) if self.method.treatment is not None else ())
-        except ValueError:  # there are none, which is said elsewhere
-            return (self.model,)
+        return self._with_finer(self.specimen)
 
     def measured(self, number: int) -> Components:
         """Return a data set that can be used."""

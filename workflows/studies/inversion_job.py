@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
 from forward.external.derivatives import contradicted
-from forward.extrapolated import HALVED, Extrapolated
 from forward.model import FloatArray, ForwardModel, SolveError
-from forward.settings import one_line
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
@@ -27,6 +25,7 @@ from workflows.studies.inversion import Inversion, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.output_inversion import OutputInversion, derivable
+from workflows.studies.predictions import has_mesh
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -90,31 +89,25 @@ class _Outputs:
 
     study: OutputInversion
     model: ForwardModel
-    fine: Callable[[], ForwardModel]
+    there: There
     vertices: None = None
     look: None = None
 
     @classmethod
     def of(cls, study: OutputInversion, ensemble: Ensemble) -> _Outputs:
-        names = study.inputs.names
-        fine = cache(lambda: study.spec.refined(1).build(ensemble.group, names))
-        return cls(study, study.spec.build(ensemble.group, names), fine)
+        model = study.spec.build(ensemble.group, study.inputs.names)
+        if not has_mesh(study.spec):
+            return cls(study, model, None)
+        meshes, why = _meshes(study, model, study.inputs.mean)
+        return cls(study, model, (None if meshes is None else meshes.restricted(), why))
 
     def observing(self, number: int) -> ForwardModel:
         """Return the model: the data tell which of its outputs were measured."""
         return self.model
 
     def finer(self, observed: ForwardModel) -> There:
-        """Return the same model on the mesh whose cells are halved, and on its own."""
-        if not self.study.spec.meshed:
-            return None
-        if self.study.method.treatment is None:
-            return None, self.study.method.unchecked
-        try:
-            self.study.spec.refined(1)
-        except ValueError as error:  # a mesh that is not divided, or would be too large
-            return None, one_line(str(error))
-        return Extrapolated(self.fine(), self.model, HALVED, self.study.inputs.mean), ""
+        """Return the same outputs on finer meshes."""
+        return self.there
 
 
 @dataclass(frozen=True)
@@ -138,9 +131,7 @@ class _Specimen:
             return study.stiffness(vertices[0], points) + model.log_fields(points)
 
         start = np.zeros(len(names)) if study.field else study.inputs.mean
-        method = study.method
-        meshes, why = finer_meshes(model, start) if method.treatment is not None else (None, method.unchecked)
-        return cls(study, model, vertices, look, meshes, why)
+        return cls(study, model, vertices, look, *_meshes(study, model, start))
 
     def observing(self, number: int) -> SpecimenModel:
         """Return the model of the displacements of a data set; errors as for every model."""
@@ -155,10 +146,17 @@ class _Specimen:
         return None if self.meshes is None else self.meshes.observing(cast("SpecimenModel", observed)), self.why
 
 
+def _meshes(study: InversionStudy, model: ForwardModel, start: FloatArray) -> tuple[FinerMeshes | None, str]:
+    """Return a body on finer meshes, which are first solved on at `start` (d,), or why there are none."""
+    if study.method.treatment is None:
+        return None, study.method.unchecked
+    return finer_meshes(model, start)
+
+
 def _judged(study: InversionStudy, made: _Made, found: xr.Dataset) -> xr.Dataset:
     """Add what is to be said of the results; on rank 0."""
     found = judged(found, study)
-    if isinstance(made, _Outputs) and not study.model.meshed:
+    if isinstance(made, _Outputs) and not has_mesh(study.model):
         add(found, *contradicted(made.model, study.inputs.mean, study.inputs.std))
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from workflows.config.priors import ranges
-from workflows.studies.predictions import LOOKS, NOT_ASKED, duration, formulation, mesh_check, times_of
+from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
     from workflows.studies.inversion import Inversion
@@ -76,8 +76,9 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
         d = len(study.inputs.names)
         seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4)
         if method.treatment is not None:
-            seconds += LOOKS * 8**2 * cost.textbook
-            lines.append(f"mesh check  about {LOOKS} solves of about {8 * spec.unknowns:,} unknowns")
+            once, checked = mesh_check(spec)
+            seconds += once
+            lines.append(f"mesh check  {checked}")
         else:
             lines.append(f"mesh check  {NOT_ASKED}")
         lines.append(f"time        about {duration(seconds)} for each on 1 core (rough)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from forward.fem.finer import finer
 from forward.scalars import Mistake
-from forward.settings import Settings
+from forward.settings import Settings, one_line
 from forward.spec import ModelSpec
 from inverse.criticism.comparison import Candidate
 from inverse.methods.selection import SelectSpecimens
@@ -23,6 +24,7 @@ from workflows.config.mistakes import StudyError, lines, refused
 from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
 from workflows.config.report import Report
 from workflows.studies.material_tests import WHOLE
+from workflows.studies.predictions import has_mesh, mesh_check, meshes_of
 from workflows.studies.selection import Comparison
 
 if TYPE_CHECKING:
@@ -150,6 +152,45 @@ class ModelSelection(Comparison):
         }
 
     @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The models of all candidates, and the finer meshes that they are looked at on."""
+        return *self.of_candidates.values(), *(fine for several in self._finer for fine in several)
+
+    @property
+    def memory(self) -> float:
+        """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
+        return _bytes(self.of_candidates.values()) + max((_bytes(several) for several in self._finer), default=0.0)
+
+    @property
+    def _finer(self) -> list[tuple[Any, ...]]:
+        """The finer meshes of each candidate that is looked at on some."""
+        return [meshes_of(one) for name, one in self.of_candidates.items() if not self.unchecked.get(name, "none")]
+
+    @cached_property
+    def unchecked(self) -> dict[str, str]:
+        """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
+        if not any(has_mesh(spec) for spec in self.of_candidates.values()):
+            return {}
+        return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
+
+    def _unchecked(self, spec: Any) -> str:
+        if self.method.treatment is None:
+            return self.method.unchecked
+        if not has_mesh(spec):
+            return f"a model of kind '{spec.kind}' has no mesh"
+        try:
+            finer(spec)
+        except ValueError as error:  # a mesh that is not divided, or would be too large
+            return one_line(str(error))
+        return ""
+
+    @property
+    def mesh_checks(self) -> list[tuple[float, str]]:
+        """Processor time (s) of the solves on finer meshes of each candidate, and what is solved."""
+        checked: list[Any] = [one for one in self.of_candidates.values() if has_mesh(one)]
+        return [mesh_check(one) for one in checked]
+
+    @property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for the models."""
         return tuple(dict.fromkeys(module for spec in self.of_candidates.values() for module in spec.modules))
@@ -216,6 +257,13 @@ class ModelSelection(Comparison):
     @abstractmethod
     def unobserved(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what was measured that a model does not have."""
+
+
+def _bytes(specs: Iterable[Any]) -> float:
+    found = 0.0
+    for cost in (one.cost() for one in specs):
+        found += 0.0 if cost is None else cost.bytes
+    return found
 
 
 def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -137,6 +137,11 @@ class OutputInversion(InversionStudy):
         return (self.spec,)
 
     @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model, and the same on the finer meshes that it is looked at on."""
+        return self._with_finer(self.spec)
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs of the model."""
         return tuple(output.name for output in self.model.returned)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
-from forward.extrapolated import HALVED, Extrapolated
 from forward.registry import OfKind
 from forward.scalars import Mistake
-from forward.settings import Settings, one_line
+from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from forward.words import named
 from inverse.criticism.comparison import Data
@@ -136,27 +134,6 @@ class OutputSelection(ModelSelection):
         return _SPEC.validate_python(dict(block))
 
     @property
-    def specs(self) -> tuple[ModelSpec, ...]:
-        """The models of all candidates."""
-        return tuple(self.of_candidates.values())
-
-    @cached_property
-    def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
-        if not any(spec.meshed for spec in self.of_candidates.values()):
-            return {}
-        return {name: self._unchecked(spec) for name, spec in self.of_candidates.items()}
-
-    def _unchecked(self, spec: ModelSpec) -> str:
-        if self.method.treatment is None:
-            return self.method.unchecked
-        try:
-            spec.refined(1)
-        except ValueError as error:  # without a mesh, with one that is not divided, or that would be too large
-            return one_line(str(error))
-        return ""
-
-    @property
     def data_groups(self) -> dict[str, Data]:
         """Data by group; outputs are tests, whose data are told apart by their number."""
         names = self.data.names
@@ -190,14 +167,7 @@ class OutputSelection(ModelSelection):
 
     def build(self, name: str, group: str, comm: Any = None) -> ForwardModel:
         """Make the model of a candidate; collective."""
-        return self._measured(name, self.of_candidates[name], comm)
-
-    def build_finer(self, name: str, make: Callable[[], ForwardModel], comm: Any = None) -> ForwardModel:
-        """Make the same on a mesh with halved cells, and on its own; collective."""
-        fine = self._measured(name, self.of_candidates[name].refined(1), comm)
-        return Extrapolated(fine, make(), HALVED, self.models[name].inputs.mean)
-
-    def _measured(self, name: str, spec: ModelSpec, comm: Any) -> ForwardModel:
+        spec = self.of_candidates[name]
         model = spec.build(comm, tuple(self.candidates[name].parameters))
         derivable(model, spec.kind)
         return MeasuredModel(model, tuple(model.outputs.index(output) for output in self.data.names))

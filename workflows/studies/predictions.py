@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.finer import finer, graded
@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from forward.fem.cost import Times
     from forward.fem.locking import Decision
     from forward.spec import ModelSpec
-    from forward.specimen import Specimen
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
 NOT_ASKED = "not requested: no result will be called trusted"
@@ -32,8 +31,13 @@ def formulation(decision: Decision) -> str:
 LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and at the corrected one
 
 
-def meshes_of(spec: Specimen) -> tuple[Specimen, ...]:
-    """Return a specimen on the finer meshes that it is looked at on, where these are known before a run.
+def has_mesh(spec: ModelSpec) -> bool:
+    """Whether a model has a mesh."""
+    return spec.meshed or hasattr(spec, "body")
+
+
+def meshes_of(spec: Any) -> tuple[Any, ...]:
+    """Return a body on the finer meshes that it is looked at on, where these are known before a run.
 
     Raises
     ------
@@ -46,15 +50,15 @@ def meshes_of(spec: Specimen) -> tuple[Specimen, ...]:
     return (finer(spec),) if beside is None else (finer(spec), beside)
 
 
-def mesh_check(spec: Specimen) -> tuple[float, str]:
+def mesh_check(spec: Any) -> tuple[float, str]:
     """Predict the processor time (s) of solves on finer meshes, and say what is solved."""
     try:
         if isinstance(spec.body, MeshFile):  # divided in a run; a factor grows faster than the mesh
-            unknowns, once = 8 * spec.unknowns, 8**2 * sum(times_of(spec.loaded(case)).textbook for case in spec.cases)
+            unknowns, once = 8 * spec.unknowns, 8**2 * times_of(spec).textbook
         else:
             fine = meshes_of(spec)
             unknowns = fine[0].unknowns
-            once = sum(times_of(one.loaded(case)).textbook for one in fine for case in one.cases)
+            once = sum(times_of(one).textbook for one in fine)
     except ValueError as error:
         return 0.0, f"not possible: {error}; no result will be called trusted"
     longest = duration(HOPELESS * once)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import AXES, Vector, tolerance
-from forward.fem.finer import finer
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import ModelSpec
@@ -23,7 +22,6 @@ from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE
 from workflows.studies.model_selection import ModelSelection, Positive, changed
-from workflows.studies.predictions import mesh_check, meshes_of
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
@@ -160,33 +158,6 @@ class SpecimenSelection(ModelSelection):
         }
 
     @property
-    def specs(self) -> tuple[Specimen, ...]:
-        """The specimens of all candidates, and the finer meshes that they are looked at on."""
-        checked = [specimen for name, specimen in self.of_candidates.items() if not self.unchecked[name]]
-        return *self.of_candidates.values(), *(fine for one in checked for fine in meshes_of(one))
-
-    @property
-    def memory(self) -> float:
-        """Memory (bytes) of a group of ranks: of all candidates, and of the finer meshes of one of them at a time."""
-        own = list(self.of_candidates.values())
-        checked = [one for name, one in self.of_candidates.items() if not self.unchecked[name]]
-        return _bytes(own) + max((_bytes(meshes_of(one)) for one in checked), default=0.0)
-
-    @cached_property
-    def unchecked(self) -> dict[str, str]:
-        """Why each candidate is not checked on a finer mesh; empty if it is."""
-        return {name: self._unchecked(specimen) for name, specimen in self.of_candidates.items()}
-
-    def _unchecked(self, specimen: Specimen) -> str:
-        if self.method.treatment is None:
-            return self.method.unchecked
-        try:
-            finer(specimen)
-        except ValueError as error:  # a mesh that is not divided, or would be too large
-            return str(error)
-        return ""
-
-    @property
     def data_groups(self) -> dict[str, Data]:
         """Data by group; load cases are tests, whose data are distinguished by their number."""
         data, cases = self.data, list(dict.fromkeys(self.data.cases))
@@ -198,11 +169,6 @@ class SpecimenSelection(ModelSelection):
             counted[case] += 1
         sigma = None if data.sigma is None else np.array(data.sigma)
         return {WHOLE: Data(np.array(data.measured), sigma, data.cases, np.array(at), np.array(data.places), kinds)}
-
-    @property
-    def mesh_checks(self) -> list[tuple[float, str]]:
-        """Processor time (s) of the solve on a finer mesh of each candidate, and what is solved."""
-        return [mesh_check(one) for one in self.of_candidates.values()]
 
     @property
     def _axes(self) -> Any:
@@ -250,7 +216,3 @@ class SpecimenSelection(ModelSelection):
         strange = next((case for case in self.data.cases if case not in known), None)
         if strange is not None:
             yield ("cases",), f"no load case '{strange}', of which there are data", known
-
-
-def _bytes(specs: Sequence[Specimen]) -> float:
-    return sum(cost.bytes for cost in (one.cost() for one in specs) if cost is not None)

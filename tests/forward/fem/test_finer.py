@@ -9,7 +9,8 @@ from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile, contents, divided
 from forward.extrapolated import HALVED
-from forward.fem.finer import OF_LINEAR, OtherMesh, extrapolated, finer, graded, share
+from forward.fem.finer import OF_LINEAR, OtherMesh, extrapolated, finer, graded, held, share
+from forward.hyperelastic import Hyperelastic
 from forward.model import ModelError
 from forward.specimen import Specimen
 from tests.meshes import box, numbered
@@ -177,6 +178,14 @@ CUBE = {
     "observed": [{"on": "z-max"}],
 }
 FIELD = {"of": "stiffness", "length": 0.6, "std": 0.4}
+PRESSED = {
+    "body": {"kind": "box", "size": (1.0, 1.0, 1.0), "cells": (3, 3, 3), "degree": 1},
+    "material": {"kind": "mooney-rivlin", "C1": 1e4, "C2": 0.0, "D1": 2e6},
+    "clamp": ["x-min"],
+    "displacements": [{"on": "y-min", "y": 0.0}],
+    "outputs": [{"name": "u", "kind": "max-displacement", "component": "x"}],
+    "loads": [{"kind": "traction", "on": "x-max", "direction": [1, 0, 0], "size": 900}],
+}
 
 
 def test_meshes_are_graded_to_the_faces_that_are_held():
@@ -209,8 +218,57 @@ def test_meshes_are_graded_to_the_faces_that_are_held():
     fields = [{**FIELD, "basis": "modes", "modes": 3}, {**FIELD, "of": "density", "basis": "modes", "modes": 3}]
     heavy = {"kind": "gravity", "direction": (0, 0, -1), "density": 1000}
     cases = [{**CUBE["cases"][0], "loads": [*CUBE["cases"][0]["loads"], heavy]}]
-    with pytest.raises(ModelError, match="density is a random field"):
-        finer(Specimen.model_validate(CUBE | {"cases": cases, "fields": fields}))
+    both = finer(Specimen.model_validate(CUBE | {"cases": cases, "fields": fields})).fields
+    assert [(one.of, one.basis) for one in both] == [("stiffness", "nodes"), ("density", "nodes")]
+
+
+def test_bodies_with_outputs_have_finer_meshes_too():
+    """Thin cells at what is held, but not at planes of symmetry; where a tool touches, cells are halved."""
+    spec = Hyperelastic.model_validate(PRESSED)
+    assert held(spec) == ("x-min",)
+    found = [make(spec).body for make in (finer, graded)]
+    assert [(body.cells, body.degree) for body in found] == [((5, 5, 5), 2), ((3, 3, 3), 2)]
+    assert found[0].grading == dict.fromkeys(spec.body.boundaries, 4.0) | {"x-min": 8.0, "x-max": 1.0}
+    assert [finer(spec).formulation, finer(spec).mixed] == ["auto", True]  # which linear cells cannot be
+    tool = {
+        "kind": "indenter",
+        "shape": "plane",
+        "on": "x-max",
+        "at": [1, 0, 0],
+        "direction": [-1, 0, 0],
+        "depth": 0.01,
+    }
+    many = PRESSED["body"] | {"cells": [8, 6, 6]}
+    touched = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many})
+    assert [make(touched).body.cells for make in (finer, graded)] == [(8, 6, 6), (4, 3, 3)]
+    two = Hyperelastic.model_validate(PRESSED | {"loads": [tool], "body": many | {"degree": 2}})
+    assert (finer(two).body.cells, finer(two).body.grading, graded(two)) == ((16, 12, 12), {}, None)
+    assert share(two) == pytest.approx(HALVED, rel=0.03)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("kind", ["specimen", "outputs"])
+def test_fields_of_both_kinds_are_carried_to_another_mesh(kind):
+    """Exactly, to a mesh that is the same: outputs and derivatives, modes of a stiffness and of a density."""
+    heavy = {"kind": "gravity", "direction": (1, 0, -1), "density": 100}
+    case = CUBE["cases"][0] | {"loads": [*CUBE["cases"][0]["loads"], heavy]}
+    fields = [{**FIELD, "modes": 2}, {**FIELD, "of": "density", "modes": 1}]
+    points = [{"on": "z-max"}] if kind == "specimen" else [{"name": "u", "kind": "max-displacement", "component": "x"}]
+    if kind == "specimen":
+        spec = Specimen.model_validate(CUBE | {"cases": [case], "fields": fields, "observed": points})
+    else:
+        acting = {name: case[name] for name in ("clamp", "loads")}
+        body = {name: CUBE[name] for name in ("body", "material")}
+        spec = Hyperelastic.model_validate(body | acting | {"fields": fields, "outputs": points})
+    model = spec.build(MPI.COMM_SELF, ("material.mu", *spec.coefficients))
+    there = OtherMesh(model, finer(spec).model_copy(update={"body": spec.body}))
+    point = np.array([1.1e4, 0.8, -0.5, 1.2])
+    own, other = model.solve(point), there.solve(point)
+    np.testing.assert_allclose(other.outputs, own.outputs, rtol=1e-6, atol=1e-8)
+    directions = np.diag([1e3, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(other.tangent(directions), own.tangent(directions), rtol=1e-5, atol=1e-9)
+    weights = np.ones(len(own.outputs))
+    np.testing.assert_allclose(other.adjoint(weights), own.adjoint(weights), rtol=1e-5)
 
 
 def test_linear_cells_of_a_file_are_looked_at_as_quadratic_ones(tmp_path):

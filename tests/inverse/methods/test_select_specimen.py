@@ -28,6 +28,7 @@ from workflows.config.study import dump, load, parse
 from workflows.report.sections.finer_meshes import meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
+from workflows.studies.findings_selection import doubts_of_selection, trusted_on_meshes
 from workflows.studies.finer import solved_on
 from workflows.studies.predictions import meshes_of
 from workflows.studies.specimen_selection import SpecimenSelection
@@ -209,6 +210,18 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     )
     apart = abs(np.diff(plain["log_evidence"].values.ravel())).item()
     assert abs(np.diff(found["log_evidence"].values.ravel())).item() < 0.5 * apart
+    # What is uncertain of that is said; a candidate on whose evidence the correction decides is not trusted.
+    inputs = {name: candidate.inputs for name, candidate in it.candidates.items()}
+    assert (found["mesh_left"] > 0.01).all()
+    said = [one.text for one in doubts_of_selection(found, inputs, None)]
+    assert any("makes up to" in text and "makes up to 0 of" not in text for text in said)
+    second = int(found["probability"].argmin())
+    far = found.assign(trusted=xr.ones_like(found["trusted"]), mesh_shift=found["mesh_shift"].copy())
+    far["mesh_shift"][second] = 25.0
+    assert trusted_on_meshes(far)["trusted"].values[second].item() is False
+    assert trusted_on_meshes(far)["trusted"].values[1 - second].item() is True
+    texts = [one.text for one in doubts_of_selection(far, inputs, None) if "It decides on the result" in one.text]
+    assert [text.partition(":")[0] for text in texts] == [str(found["model"].values[second])]
 
 
 def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatch):
