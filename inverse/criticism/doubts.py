@@ -216,6 +216,18 @@ def mesh_too_coarse(
     return [Doubt(severity, f"{text}. The mesh is too coarse for the noise: {ADVICE}", short)]
 
 
+def not_estimable(names: Sequence[str]) -> list[Doubt]:
+    """Doubt data of outputs, by name, whose error of the mesh nothing tells."""
+    if not names:
+        return []
+    listed = ", ".join(names)
+    text = (
+        f"what the mesh does to {listed} is not known: largest stresses and pressures and areas of contact follow "
+        "single cells, and finer meshes show no limit of them; leave them out, or give them larger errors"
+    )
+    return [Doubt("warning", text, f"the error of the mesh in {listed} is not known")]
+
+
 def mesh_corrected(
     error: FloatArray, shifts: Mapping[str, float], left: Mapping[str, float], nodes: FloatArray, *, settled: bool
 ) -> list[Doubt]:

@@ -85,6 +85,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         found.append(criticism.Doubt("note", moved, ""))
     if "mesh_checked" not in one:
         return found
+    found += criticism.not_estimable(study.not_estimable(number))
     shifts = dict(zip(names, one["mesh_shift"].to_numpy().tolist(), strict=True))
     nodes = one["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in one else np.zeros(0)
     why, error = str(one["mesh_why"].item()), one["mesh_error"].to_numpy()[seen]

@@ -191,6 +191,10 @@ class InversionStudy(StudyKind):
         """Say of each datum of a data set where it stands."""
         raise NotImplementedError
 
+    def not_estimable(self, number: int) -> tuple[str, ...]:
+        """Names of what was measured in a data set whose error of the mesh nothing tells: of displacements none."""
+        return ()
+
     def read(self, path: Path) -> Any:
         """Read a file of data.
 

@@ -22,6 +22,7 @@ from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
 from workflows.studies.measured import DataSet
+from workflows.studies.predictions import never_estimable
 from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
@@ -159,6 +160,10 @@ class OutputInversion(InversionStudy):
     def labels(self, number: int) -> list[str]:
         """Say of each datum of a data set where it stands."""
         return self.measured(number).data_labels()
+
+    def not_estimable(self, number: int) -> tuple[str, ...]:
+        """Names of the measured outputs of a body whose error of the mesh nothing tells."""
+        return never_estimable(self.model, self.measured(number).names)
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is inverted, and how long that will take."""

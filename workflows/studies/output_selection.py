@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
+from forward.model import Finding
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from forward.words import named
 from inverse.criticism.comparison import Data
+from inverse.criticism.doubts import not_estimable
 from inverse.data.curves import steps_of
 from inverse.data.measured_model import MeasuredModel
 from inverse.data.outputs import read_outputs, stated
@@ -23,6 +25,7 @@ from workflows.config.mistakes import StudyError
 from workflows.studies.material_tests import WHOLE
 from workflows.studies.model_selection import ModelSelection, Positive
 from workflows.studies.output_inversion import derivable
+from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
     from forward.model import ForwardModel
@@ -132,6 +135,16 @@ class OutputSelection(ModelSelection):
     def spec_of(cls, block: Mapping[str, Any]) -> ModelSpec:
         """Return the model that a block describes; errors as of every comparison."""
         return _SPEC.validate_python(dict(block))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings before anything is solved, of measured outputs too whose error of the mesh nothing tells."""
+        never = (never_estimable(spec, self.data.names) for spec in self.of_candidates.values())
+        names = tuple(dict.fromkeys(name for several in never for name in several))
+        if not names or not self.unchecked:
+            return super().findings
+        doubts = not_estimable(names)
+        return *super().findings, *(Finding(one.severity, f"{one.text[0].upper()}{one.text[1:]}.") for one in doubts)
 
     @property
     def data_groups(self) -> dict[str, Data]:

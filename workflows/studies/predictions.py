@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
@@ -34,6 +35,12 @@ LOOKS = 4  # solves on finer meshes: at the mean of the prior, at the mode, and 
 def has_mesh(spec: ModelSpec) -> bool:
     """Whether a model has a mesh."""
     return spec.meshed or hasattr(spec, "body")
+
+
+def never_estimable(spec: ModelSpec, names: Collection[str]) -> tuple[str, ...]:
+    """Return those outputs of a body, of some by their names, of which no error of a mesh can be estimated."""
+    outputs = spec.returned if has_mesh(spec) else ()
+    return tuple(one.name for one in outputs if one.name in names and not getattr(one, "estimable", True))
 
 
 def meshes_of(spec: Any) -> tuple[Any, ...]:

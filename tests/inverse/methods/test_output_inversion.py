@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 
+from inverse.criticism.doubts import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from tests.launch import run_script
@@ -229,6 +230,18 @@ def test_outputs_of_a_body(tmp_path):
     # Linear cells of half the size told 0.7 of it.
     assert one["mesh_error"].item() == pytest.approx(error, rel=0.03)
     assert error > 5
+
+
+def test_outputs_that_follow_single_cells_are_named(tmp_path):
+    """Of a body, where one was measured: no finer mesh tells what a largest stress tends to."""
+    text = BAR.replace("outputs = [\n", 'outputs = [\n    { name = "peak", kind = "max-von-mises" },\n')
+    (tmp_path / "bar.toml").write_text(text)
+    assert load(tmp_path / "bar.toml").not_estimable(0) == ()
+    (tmp_path / "bar.toml").write_text(text.replace("ux = 0.03 }", "ux = 0.03, peak = 2e3 }"))
+    study = load(tmp_path / "bar.toml")
+    assert study.not_estimable(0) == ("peak",)
+    (doubt,) = not_estimable(study.not_estimable(0))
+    assert (doubt.severity, doubt.short) == ("warning", "the error of the mesh in peak is not known")
 
 
 def test_studies_are_written_down(folder, capsys):

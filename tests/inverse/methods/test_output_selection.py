@@ -175,6 +175,16 @@ noise = { relative = 0.05 }
 """
 
 
+def test_outputs_that_follow_single_cells_are_named(tmp_path):
+    text = BARS.replace("outputs = [", 'outputs = [{ name = "peak", kind = "max-von-mises" }, ', 1)
+    (tmp_path / "bars.toml").write_text(text)
+    assert not any("peak" in one.text for one in load(tmp_path / "bars.toml").findings)
+    (tmp_path / "bars.toml").write_text(text.replace("outputs = { ", "outputs = { peak = 2e3, "))
+    (finding,) = (one for one in load(tmp_path / "bars.toml").findings if "peak" in one.text)
+    assert finding.severity == "warning"
+    assert finding.text.startswith("What the mesh does to peak is not known")
+
+
 @pytest.mark.fem
 def test_bodies_are_looked_at_on_finer_meshes(tmp_path):
     (tmp_path / "bars.toml").write_text(BARS)
