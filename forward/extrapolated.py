@@ -74,9 +74,16 @@ class Extrapolated(OneByOne):
             Where one of them has no answer.
         """
         if self.start is not None and not self.begun:
-            here = self._begin(self.start)
-            if here is not None and np.array_equal(parameters, self.start):
-                return here
+            at_start = np.array_equal(parameters, self.start)
+            try:
+                here = self._begin(self.start)
+            except SolveError:
+                self.begun.append(None)
+                if at_start:
+                    raise
+            else:
+                if at_start:
+                    return here
         guesses: list[Guess | None] = [None, None]
         if self.start is not None and self.begun and self.begun[0] is not None:
             step = parameters - self.start
@@ -86,14 +93,10 @@ class Extrapolated(OneByOne):
         )
         return ExtrapolatedSolution(self, fine, coarse)
 
-    def _begin(self, start: FloatArray) -> ExtrapolatedSolution | None:
+    def _begin(self, start: FloatArray) -> ExtrapolatedSolution:
         """Solve at the start, once, and keep the states with their derivatives."""
         d = len(start)
-        try:
-            found = ExtrapolatedSolution(self, self.fine.solve(start), self.coarse.solve(start))
-        except SolveError:
-            self.begun.append(None)
-            return None
+        found = ExtrapolatedSolution(self, self.fine.solve(start), self.coarse.solve(start))
         few = d <= TANGENTS and self.differentiable
         both = (found.fine, found.coarse)
         kept = tuple((one.state, one.state_tangent(np.eye(d)) if few else np.zeros((d, 0))) for one in both)

@@ -36,7 +36,7 @@ import numpy as np
 
 from forward.model import FloatArray, Guess, ReferenceSolution, SolveError
 from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy, worth
+from inverse.criticism.weights import effective_sample_size, enough, normalised, pareto_shape, trustworthy, worth
 from inverse.fields.field_posterior import Point
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode
@@ -496,7 +496,7 @@ def verdict_on_few(gaussian: Laplace, found: Evidence, test: ResidualTest, chain
         return Verdict("laplace", found.why)
     said = worth(found.pareto_k, found.ess, len(found.log_weights))
     if not found.trusted:
-        return _by_chains(said, chains)
+        return _by_chains(said, chains, enough(found.ess, len(found.log_weights)))
     w, x = found.weights, found.density.x
     mean, width = w @ x, np.sqrt(np.diag(gaussian.covariance))
     shift = float(np.abs((mean - gaussian.mode) / width).max())
@@ -542,11 +542,11 @@ def verdict_on_field(
     if found is None:
         assert chains is not None
         if not chains.mixed or values is None:
-            return _by_chains("no weighted samples", chains)
+            return _by_chains("no weighted samples", chains, 0)
         return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.ess, _said(chains))
     said = worth(found.pareto_k, found.ess, len(found.log_weights))
     if not found.trusted:
-        return _by_chains(said, chains)
+        return _by_chains(said, chains, enough(found.ess, len(found.log_weights)))
     return _compared(gaussian, found.mean, found.std, found.ess, said)
 
 
@@ -573,9 +573,9 @@ def _objection(converged: bool, test: ResidualTest) -> Verdict | None:
     return None
 
 
-def _by_chains(worth: str, chains: Chains | None) -> Verdict:
+def _by_chains(worth: str, chains: Chains | None, samples: int) -> Verdict:
     if chains is None:
-        return Verdict("neither", f"{worth}; take more samples, or run chains")
+        return Verdict("neither", f"{worth}; take method.samples = {samples}, or run chains (method.chains)")
     said = _said(chains)
     if chains.mixed:
         return Verdict("corrected", f"{worth}, but chains agree: {said}")

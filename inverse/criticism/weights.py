@@ -15,6 +15,7 @@ from forward.model import FloatArray
 TRUSTED = 0.7  # k̂ up to which weights can be trusted
 ALIKE = 0.8  # effective share above which weights are practically equal
 FEWEST = 20.0  # effective sample size below which weights say nothing
+MORE = 4.0  # times the points
 RULE = (
     f"Weights are to be trusted where they are worth {FEWEST:.0f} points or more, and k̂ is {TRUSTED:g} or less or more "
     f"than {100 * ALIKE:.0f} % of the points count."
@@ -42,6 +43,15 @@ def worth(pareto_k: float, ess: float, count: int) -> str:
     """Say in words how good the weights of `count` points are."""
     shape = "∞" if np.isinf(pareto_k) else f"{pareto_k:.2f}"
     return f"weights worth {ess:.0f} of {count} points, k̂ = {shape}"
+
+
+def enough(ess: float, count: int) -> int:
+    """Return how many points to try where the weights of `count` points cannot be trusted, a multiple of 32.
+
+    Four times as many, since points that are drawn from what the others have told become better too, or as many as
+    would be worth enough if they did not.
+    """
+    return int(32 * np.ceil(count * max(MORE, FEWEST / max(ess, 1.0)) / 32))
 
 
 def resampled(weights: FloatArray, count: int, seed: int) -> NDArray[np.intp]:

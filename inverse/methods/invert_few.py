@@ -26,7 +26,7 @@ from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.invert import Invert
-from inverse.methods.mesh_correction import corrected_few, of_the_mean
+from inverse.methods.mesh_correction import before_few, corrected_few
 from inverse.methods.record import (
     ENDS,
     TRUST,
@@ -158,7 +158,7 @@ def _invert(
     d = len(inputs.names)
     with suppress(SolveError):  # or else every solve begins at zero
         posterior = replace(posterior, start=start(inputs.mean))
-    before = _before(posterior, finer, say) if finer is not None and method.treatment is not None else None
+    before = before_few(posterior, finer, say) if finer is not None and method.treatment is not None else None
     searched = laplace(posterior, starts=method.starts, seed=method.seed)
     gaussian, mesh = searched, None
     posterior = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d]))
@@ -294,17 +294,3 @@ def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Reco
     scale = s[:, None] * posterior.whitening.sigma
     gaps = posterior.whitening((outputs - posterior.data) / scale)
     return {"draw": draws, "draw_log_likelihood": -posterior.errors.minus_log(gaps) - np.log(scale)}
-
-
-def _before(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -> float:
-    """Hold the error of the mesh at the mean of the prior against the noise, before the search; its size."""
-    point = posterior.inputs.mean
-    look, _ = finer.look(point)
-    own = posterior.evaluate(Request(point[None], start=posterior.start))
-    if look is None or own.failures:
-        return np.nan
-    which = slice(None) if posterior.which is None else list(posterior.which)
-    error = (look.outputs - own.outputs[0])[which] / posterior.sigma
-    size = float(np.sqrt((error**2).mean()))
-    say(of_the_mean(size, float(np.abs(error).max())))
-    return size

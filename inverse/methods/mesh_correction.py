@@ -19,6 +19,7 @@ from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, para
 from inverse.data.approximation_error import OF_DATUM, ApproximationError, Places, uncertain
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
+from uq.evaluation.evaluate import Request
 
 if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior
@@ -70,6 +71,23 @@ def of_the_mean(size: float, largest: float) -> str:
     words = f"at the mean of the prior the error of the mesh is {size:.2g} standard deviations of the noise"
     done = "it will be looked at again at the mode, and corrected where it exceeds a fifth"
     return f"{words} (root mean square; at most {largest:.2g}); {done}"
+
+
+def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -> float:
+    """Hold the error of the mesh at the mean of the prior against the noise, before the search; its size.
+
+    NaN where there is no answer there.
+    """
+    point = posterior.inputs.mean
+    look, _ = finer.look(point)
+    own = posterior.evaluate(Request(point[None], start=posterior.start))
+    if look is None or own.failures:
+        return np.nan
+    which = slice(None) if posterior.which is None else list(posterior.which)
+    error = (look.outputs - own.outputs[0])[which] / posterior.sigma
+    size = float(np.sqrt((error**2).mean()))
+    say(of_the_mean(size, float(np.abs(error).max())))
+    return size
 
 
 def error_of(

@@ -24,7 +24,7 @@ from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
-from inverse.methods.mesh_correction import MeshTreatment, Treatment, corrected_few
+from inverse.methods.mesh_correction import MeshTreatment, Treatment, before_few, corrected_few
 from uq.evaluation.evaluate import Evaluate
 from uq.inputs.distributions import Distribution
 from uq.surrogates.linearisation import linearise
@@ -130,6 +130,7 @@ class Select(Settings):
         evaluate: Callable[[str, str], Evaluate],
         free: Callable[[str, str], Evaluate] | None = None,
         finer: Callable[[str, str], Finer] | None = None,
+        say: Callable[[str], None] = lambda line: None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -145,6 +146,8 @@ class Select(Settings):
             The same without cost, for nested sampling.
         finer
             The same on a finer mesh; by default there are no meshes.
+        say
+            Shows the user a line before the search of each candidate.
 
         Returns
         -------
@@ -161,6 +164,8 @@ class Select(Settings):
         for name, group in pairs:
             one = started(posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group)))
             look = None if finer is None else (finer(name, group), _places(data_groups[group]))
+            if look is not None and self.treatment is not None:
+                before_few(one, look[0], lambda line, name=name: say(f"{name}: {line}"))  # type: ignore[misc]
             posteriors[name, group], stated[name, group], found = self._assess(one, (name, group), look)
             if found is not None:
                 meshes[name, group] = found

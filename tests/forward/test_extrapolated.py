@@ -39,7 +39,10 @@ def test_outputs_and_derivatives_are_those_of_the_limit():
 
 
 def test_a_start_without_an_answer_is_none():
+    tried = []
+
     def fails(p):
+        tried.append(p[0])
         if p[0] == 1.0:
             message = "not there"
             raise SolveError(message)
@@ -49,3 +52,8 @@ def test_a_start_without_an_answer_is_none():
     np.testing.assert_allclose(model.solve(POINT).outputs, MODEL.solve(POINT).outputs)
     with pytest.raises(SolveError, match="not there"):
         model.solve(np.array([1.0, 1.0]))
+    tried.clear()
+    first = Extrapolated(FunctionModel(fails, NAMES, ("y", "z")), on(0.3), 0.8, np.array([1.0, 1.0]))
+    with pytest.raises(SolveError, match="not there"):
+        first.solve(np.array([1.0, 1.0]))
+    assert tried == [1.0]  # a search without an answer takes minutes, and is not repeated

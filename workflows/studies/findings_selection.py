@@ -97,26 +97,28 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
             said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
-    doubtful = _doubtful(dataset, order)
+    doubtful, samples = _doubtful(dataset, order)
     if doubtful:
-        text = f"Evidences not to be trusted: {', '.join(doubtful)}; more points may help (method.samples)."
+        text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."
         said.append(Finding("warning", text))
     return said
 
 
-def _doubtful(dataset: xr.Dataset, order: list[str]) -> list[str]:
-    """Evidences that cannot be trusted, each with the quality of its weights."""
-    from inverse.criticism.weights import worth
+def _doubtful(dataset: xr.Dataset, order: list[str]) -> tuple[list[str], int]:
+    """Evidences that cannot be trusted, each with the quality of its weights, and how many points may be enough."""
+    from inverse.criticism.weights import enough, worth
 
-    found = []
+    found, samples = [], 0
     for model in order:
         for group in dataset.group.values:
             one = dataset.sel(model=model, group=group)
             if not bool(one["trusted"]):
                 where = f"{model} in {group}" if dataset.sizes["group"] > 1 else model
                 count = int(np.isfinite(one["point"].to_numpy()).any(axis=-1).sum())
-                found.append(f"{where} ({worth(float(one['tail']), float(one['effective']), count)})")
-    return found
+                ess = float(one["effective"])
+                found.append(f"{where} ({worth(float(one['tail']), ess, count)})")
+                samples = max(samples, enough(ess, count))
+    return found, samples
 
 
 def doubts_of_selection(

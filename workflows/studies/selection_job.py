@@ -49,7 +49,7 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
                 return Finer(None, why[name])
             return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
-        return study.method.run(study.models, study.data_groups, recorded, free, finer if why else None)
+        return study.method.run(study.models, study.data_groups, recorded, free, finer if why else None, ensemble.say)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)

@@ -19,6 +19,7 @@ from inverse.criticism.chains import (
     weigh_field,
 )
 from inverse.criticism.predictive import examine, examine_few, summary
+from inverse.criticism.weights import enough
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -234,7 +235,8 @@ def test_verdicts_on_few_parameters():
     lost = verdict_on_few(replace(gaussian, converged=False), found, test)
     assert (lost.trust, lost.why) == ("neither", "the search for the mode did not converge")
     uneven = replace(found, pareto_k=0.9, ess=30.0)
-    assert "run chains" in verdict_on_few(gaussian, uneven, test).why
+    assert "take method.samples = 1024, or run chains" in verdict_on_few(gaussian, uneven, test).why
+    assert [enough(6, 64), enough(1.2, 64), enough(19, 40)] == [256, 1088, 160]
     short = chains_of_few(posterior, gaussian, lengths=replace(FEW, draws=10, burn=5))
     assert "have not mixed" in verdict_on_few(gaussian, uneven, test, short).why
     long = chains_of_few(posterior, found, lengths=replace(FEW, draws=600, thin=2, chains=8))

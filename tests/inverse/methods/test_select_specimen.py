@@ -195,13 +195,17 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     it = load(study, ["method.noise.absolute=0.02", "method.samples=64"])
     coarse = {name: it.build(name, "all", MPI.COMM_SELF) for name in it.candidates}
     finer = {name: extrapolated(model, np.array([1e3])).observing(model) for name, model in coarse.items()}
+    lines = []
     found = it.method.run(
         it.models,
         it.data_groups,
         lambda name, _: SerialEvaluate(coarse[name]),
         finer=lambda name, _: solved_on(finer[name]),
+        say=lines.append,
     )
     assert found["mesh_corrected"].all()
+    before = "at the mean of the prior the error of the mesh is"
+    assert [line.startswith(f"{name}: {before}") for name, line in zip(it.candidates, lines, strict=True)] == [True] * 2
     plain = it.method.model_copy(update={"mesh_error": "report"}).run(
         it.models,
         it.data_groups,
