@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
+
+if TYPE_CHECKING:
+    from forward.spec import ModelSpec
+    from workflows.config.blocks import Correlation
 
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
 LEAST = 0.5  # smallest probability of admissible constants
@@ -65,6 +70,24 @@ def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mist
     said = f"; at the medians, {objection}" if objection is not None else ""
     message = f"{100 * (1 - inputs.admitted):.3g} % of the values are impossible{said}"
     yield ("parameters",), message, list(materials.names)
+
+
+def mistakes_of_priors(
+    spec: ModelSpec,
+    parameters: Mapping[str, Distribution],
+    correlations: Sequence[Correlation],
+    inputs: Callable[[], Inputs],
+) -> Iterator[Mistake]:
+    """Find priors, by paths, that do not fit a model or each other; `inputs` makes the random parameters of them."""
+    materials = spec.materials(parameters)
+    yield from mistakes_of_parameters(spec.scalars, parameters, () if materials is None else materials.names)
+    try:
+        found = inputs()
+    except ValueError as error:
+        yield ("correlations",), str(error), [c.model_dump() for c in correlations]
+    else:
+        if materials is not None:
+            yield from mistakes_of_materials(found.within(materials), materials)
 
 
 def findings_of_materials(inputs: Inputs, where: str = "") -> Iterator[Finding]:

@@ -27,8 +27,7 @@ from workflows.config.mistakes import StudyError, refused
 from workflows.config.priors import (
     findings_of_materials,
     mistakes_of_factor,
-    mistakes_of_materials,
-    mistakes_of_parameters,
+    mistakes_of_priors,
     ranges,
 )
 from workflows.config.report import Report
@@ -244,21 +243,12 @@ class InversionStudy(StudyKind):
             if find_spec(package) is None:
                 message = f"needs {package}, which is not installed: pip install {package}"
                 yield ("method", "chains"), message, self.method.chains
-        materials = self.model.materials(self.parameters)
-        constants = () if materials is None else materials.names
-        yield from mistakes_of_parameters(self.model.scalars, self.parameters, constants)
+        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         yield from mistakes_of_factor(self.method.noise, "method", "noise")
         for name, value in self.data.truth.items():
             if name not in self.model.scalars:
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            if materials is not None:
-                yield from mistakes_of_materials(inputs, materials)
 
 
 class Inversion(InversionStudy):

@@ -23,7 +23,7 @@ from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import refused
-from workflows.config.priors import mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.config.priors import mistakes_of_priors, ranges
 from workflows.config.report import Report
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration, formulation, times_of
@@ -112,17 +112,7 @@ class SynthesisStudy(StudyKind):
             if field.basis == "nodes":
                 message = "values at the vertices are not independent, expected 'modes' or 'noise'"
                 yield ("model", "fields", i, "basis"), message, field.basis
-        materials = self.model.materials(self.parameters)
-        yield from mistakes_of_parameters(
-            self.model.scalars, self.parameters, () if materials is None else materials.names
-        )
-        try:
-            inputs = self.inputs
-        except ValueError as error:
-            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
-        else:
-            if materials is not None:
-                yield from mistakes_of_materials(inputs.within(materials), materials)
+        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
 
 
 class Synthesis(SynthesisStudy):
