@@ -203,7 +203,7 @@ class Between:
 
     def slopes(self, point: FloatArray, outputs: FloatArray, tangents: FloatArray) -> FloatArray:
         """Return the derivatives (d, q) of these along the parameters at a point (d,), from outputs and tangents."""
-        found = self.basis.derivatives(point[None, :])[0] / self.basis.coordinates.steps(point)[:, None]
+        found = self.basis.coordinates.tangents(self.basis.derivatives(point[None, :])[0].T, point).T
         if self.follows is None:
             return np.asarray(found)
         values = self.basis.values(point[None, :])[0]

@@ -77,6 +77,13 @@ def coefficient_moments(coefficients: FloatArray, indices: NDArray[np.int64]) ->
     }
 
 
+def moments(coefficients: FloatArray, indices: NDArray[np.int64]) -> dict[str, FloatArray]:
+    """Mean and standard deviation (…) of coefficients (…, P): what dependent parameters have too."""
+    constant = (indices == 0).all(axis=1)
+    varying = coefficients[..., ~constant]
+    return {"mean": coefficients[..., constant].sum(axis=-1), "std": np.sqrt((varying**2).sum(axis=-1))}
+
+
 def shares(parts: FloatArray, variance: FloatArray | float) -> FloatArray:
     """Parts over a variance; 0 where that is 0."""
     variance = np.asarray(variance)

@@ -460,6 +460,11 @@ def quantiles(values: FloatArray, probabilities: tuple[float, ...]) -> Quantiles
     return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), len(values)), Z)
 
 
+def quantiles_worth(values: FloatArray, probabilities: tuple[float, ...], worth: float) -> Quantiles:
+    """Quantiles of values (n, m), with the intervals of as many independent samples as they are worth."""
+    return _between(values, np.array(probabilities), np.full((len(probabilities), values.shape[1]), worth), Z)
+
+
 def quantiles_from_replicates(
     values: FloatArray, replicate: NDArray[np.int64], probabilities: tuple[float, ...]
 ) -> Quantiles:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import h5py
+import numpy as np
 
 if TYPE_CHECKING:
     import xarray as xr
 
 File = h5py.File
+OTHER = "_nc4_non_coord_"  # before the name of a variable that has the name of a dimension
 
 
 def in_memory(creation: Any = None) -> h5py.File:
@@ -83,3 +86,34 @@ def holds(path: Path, group: str) -> bool:
     """Whether a file has a group."""
     with h5py.File(path, "r") as file:
         return group in file
+
+
+class Variable(NamedTuple):
+    """A variable of a netCDF file: numbers or texts, and the names of their dimensions."""
+
+    values: Any
+    dims: tuple[str, ...]
+
+
+def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dict[str, Any]]:
+    """Return the variables of a netCDF-4 file and the texts and numbers that it has as attributes, without xarray.
+
+    If the file has such a group, they are those of the group.
+
+    Raises
+    ------
+    OSError
+        If it is no HDF5 file.
+    """
+    with h5py.File(io.BytesIO(content), "r") as file:
+        part = file[group] if group and isinstance(file.get(group), h5py.Group) else file
+        found = {}
+        for name, one in part.items():
+            if not isinstance(one, h5py.Dataset) or b"not a netCDF variable" in bytes(one.attrs.get("NAME", b"")):
+                continue
+            dims = tuple(Path(dim[0].name).name if len(dim) else "" for dim in one.dims)
+            texts = h5py.check_string_dtype(one.dtype) is not None
+            values = one.asstr()[()] if texts else one[()]
+            coordinate = h5py.h5ds.is_scale(one.id) and np.ndim(values) == 1  # its own dimension
+            found[name.removeprefix(OTHER)] = Variable(values, (name,) if coordinate else dims)
+        return found, dict(part.attrs)

@@ -1,11 +1,11 @@
-"""The random parameters of a study: marginal distributions, independent or joined by a Gaussian copula."""
+"""The random parameters of a study: marginal distributions, independent or joined by a Gaussian copula, and draws."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution
-from uq.inputs.sampling import sobol_points
+from uq.inputs.sampling import random_points, sobol_points
+
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
 
 CORNERS = 12  # number of parameters up to which all corners of a box are checked
 FARTHEST = 6.0  # standard deviations: the probability beyond is 2e-9
 POINTS = 2**16
+LARGEST_DEGREE = 1000
 
 
 class Restriction(Protocol):
@@ -38,27 +42,35 @@ class Inputs:
     Parameters
     ----------
     marginals
-        Distribution of each parameter by name; the order is that of the parameter vectors.
+        Distribution of each parameter by name; the order is that of the parameter vectors. Those of `draws` follow.
     correlations
         Correlations ρ of the Gaussian copula by pairs of names: two standard normal variables with correlation ρ are
         mapped through the marginals. Other pairs are uncorrelated.
-
     admissible
         Where the model is defined. Densities are restricted to it by dividing by `admitted`; points are not restricted.
+    draws
+        Parameters of which there are draws, dependent as these are, and independent of the others.
 
     Raises
     ------
     ValueError
-        If the correlations have unknown names or do not form a positive definite matrix.
+        If the correlations have unknown names, or names of draws, or do not form a positive definite matrix.
     """
 
     marginals: dict[str, Distribution]
     correlations: tuple[tuple[str, str, float], ...] = ()
     admissible: Restriction | None = field(default=None, compare=False)
+    draws: Draws | None = None
 
     def __post_init__(self) -> None:
+        if self.draws is not None:
+            own = {name: one for name, one in self.marginals.items() if name not in self.draws.names}
+            object.__setattr__(self, "marginals", own | self.draws.marginals)
         for a, b, rho in self.correlations:
             for name in (a, b):
+                if self.draws is not None and name in self.draws.names:
+                    message = f"correlation of '{name}', of which there are draws: they have correlations of their own"
+                    raise ValueError(message)
                 if name not in self.marginals:
                     message = f"correlation of '{name}', expected one of: {', '.join(self.names)}"
                     raise ValueError(message)
@@ -79,8 +91,19 @@ class Inputs:
 
     @property
     def independent(self) -> bool:
-        """Whether no two parameters are correlated."""
-        return not any(rho for *_, rho in self.correlations)
+        """Whether no two parameters are correlated, or given by the same draws."""
+        return not any(rho for *_, rho in self.correlations) and len(self.joint) < 2
+
+    @property
+    def joint(self) -> range:
+        """Places of the parameters that are given by draws."""
+        d = len(self.marginals)
+        return range(d, d) if self.draws is None else range(d - len(self.draws.names), d)
+
+    @property
+    def largest_degree(self) -> int:
+        """Largest degree of polynomials that the parameters tell apart: without limit, unless there are few draws."""
+        return LARGEST_DEGREE if self.draws is None else self.draws.largest_degree
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -96,7 +119,7 @@ class Inputs:
     def _columns(self) -> dict[Distribution, list[int]]:
         """Positions of the parameters of each distribution."""
         columns: dict[Distribution, list[int]] = {}
-        for i, marginal in enumerate(self.marginals.values()):
+        for i, marginal in enumerate(list(self.marginals.values())[: self.joint.start]):
             columns.setdefault(marginal, []).append(i)
         return columns
 
@@ -114,12 +137,21 @@ class Inputs:
     def coordinates(self) -> Coordinates:
         """The arguments of polynomials that approximate outputs."""
         centre, scale = np.array([m.of_coordinate for m in self.marginals.values()]).reshape(-1, 2).T
-        return Coordinates(np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale)
+        mixing = None
+        if self.draws is not None:
+            mixing = np.eye(len(self.marginals))
+            mixing[self.joint.start :, self.joint.start :] = self.draws.mixing
+        return Coordinates(
+            np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale, mixing
+        )
 
     @cached_property
     def correlation(self) -> FloatArray:
-        """Correlation (d, d) of the coordinates, by Gauss–Hermite quadrature for correlated pairs."""
+        """Correlation (d, d) of the coordinates, by Gauss–Hermite quadrature for correlated pairs; draws have none."""
         correlation = np.eye(len(self.marginals))
+        if self.draws is not None:
+            correlation[: self.joint.start, : self.joint.start] = self._own.correlation
+            return correlation
         nodes, weights = np.polynomial.hermite_e.hermegauss(64)  # type: ignore[no-untyped-call]
         weights = weights / weights.sum()
         marginals, d = list(self.marginals.values()), len(self.marginals)
@@ -138,6 +170,9 @@ class Inputs:
 
     def points(self, uniforms: FloatArray) -> FloatArray:
         """Map points (n, d) of the open unit cube to points (n, d) of the parameters."""
+        if self.draws is not None:
+            own, of_draws = np.split(uniforms, [self.joint.start], axis=1)
+            return np.hstack([self._own.points(own), self.draws.points(of_draws)])
         if not self.correlations:
             points = np.empty_like(uniforms)
             for marginal, columns in self._columns.items():  # many parameters have few distributions
@@ -147,6 +182,21 @@ class Inputs:
 
         return self.from_normals(ndtri(uniforms))[0]
 
+    def random(self, seed: int | tuple[int, ...], start: int, stop: int) -> FloatArray:
+        """Return the random points number `start` to `stop` (stop − start, d) of a seed.
+
+        Draws of equal weight come in turn, each once before any comes twice.
+        """
+        points = self.points(random_points(seed, start, stop, len(self.names)))
+        if self.draws is not None and self.draws.equal:
+            points[:, self.joint.start :] = self.draws.in_turn(seed, start, stop)
+        return points
+
+    @cached_property
+    def _own(self) -> Inputs:
+        """The parameters that have distributions of their own."""
+        return Inputs(dict(list(self.marginals.items())[: self.joint.start]), self.correlations)
+
     def from_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map independent standard normal coordinates x (n, d) to the parameters ω (n, d).
 
@@ -154,7 +204,15 @@ class Inputs:
         -------
         tuple of numpy.ndarray
             ω, and the derivatives ∂ω_i/∂x_j (n, d, d).
+
+        Raises
+        ------
+        ValueError
+            If parameters are given by draws: no smooth map leads there.
         """
+        if self.draws is not None:
+            message = f"{', '.join(self.draws.names)}: draws are not a smooth function of normal variables"
+            raise ValueError(message)
         factor = np.linalg.cholesky(self._copula)
         columns = zip(self.marginals.values(), (normals @ factor.T).T, strict=True)
         values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
@@ -183,6 +241,11 @@ class Inputs:
         """
         if self.admissible is None or not self.admissible.names:
             return 1.0
+        if self.draws is not None:
+            own = self._own.points(
+                sobol_points(0, 0, 0, len(self.draws.values), len(self.marginals))[:, : self.joint.start]
+            )
+            return float(self.draws.weights @ self.allowed(np.hstack([own, self.draws.values])))
         names = [name for name in self.names if name in self.admissible.names]
         pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)
         few = Inputs({name: self.marginals[name] for name in names}, pairs)

@@ -136,7 +136,7 @@ class Automatic(Method):
         """Expand until the claims are those of the goal, or something else takes less."""
         gradients = evaluate.differentiable
         plain: Control = "tangent" if gradients else "none"
-        if not inputs.independent:
+        if inputs.correlations:
             return _Pilot(plain, "there are no expansions in parameters that are correlated")
         chaos = self._chaos(inputs, goal)
         trail: list[tuple[int, float]] = []

@@ -24,7 +24,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.stopping import Amount
-from uq.surrogates.basis import gauss, orthonormal
+from uq.surrogates.basis import Basis, gauss, orthonormal
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
@@ -127,6 +127,8 @@ class Chaos(Amount):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why an expansion in these parameters is impossible, or None."""
+        if inputs.draws is not None and self.fit == "projection":
+            return "parameters given by draws have no Gauss rules, expected method.fit = 'regression'"
         return objection(inputs, self.kind)
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
@@ -221,7 +223,7 @@ class Chaos(Amount):
 
 def objection(inputs: Inputs, kind: str) -> str | None:
     """Say why a method of this kind cannot expand in these parameters, or None."""
-    if not inputs.independent:
+    if inputs.correlations:
         return f"polynomial chaos needs independent parameters, expected no correlations for method.kind = '{kind}'"
     return None
 
@@ -307,7 +309,7 @@ def expansion_dataset(
     coefficients = _among(terms, fit.chosen.which, fit.coefficients)
     dataset = dataset.assign_coords(quantile=list(method.quantiles)).assign(
         {
-            **{name: (by_pair if name.startswith("sobol") else by_output, v) for name, v in estimates.items()},
+            **{name: (by_pair if v.ndim > 1 else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
             "points": (("sample", "parameter"), evaluations.points),
             "values": (("sample", "output"), evaluations.outputs),
@@ -325,6 +327,7 @@ def expansion_dataset(
             "range_upper": (("parameter",), upper),
         }
     )
+    dataset = dataset.assign(_of_joint(basis))
     if method.quantiles:
         dataset = dataset.assign(_distribution(method, regression))
     add(dataset, *regression.doubts(evaluate.outputs))
@@ -346,6 +349,17 @@ def expansion_dataset(
             "extrapolates them to where the model has no answer"
         )
     return dataset
+
+
+def _of_joint(basis: Basis) -> dict[str, tuple[tuple[str, ...], Any]]:
+    """Return what else is needed to evaluate functions of draws."""
+    if basis.joint is None:
+        return {}
+    return {
+        "coordinate_mixing": (("parameter", "coordinate"), basis.coordinates.mixing),
+        "joint_index": (("function", "joint_parameter"), basis.joint.indices),
+        "joint_inverse": (("joint_product", "function"), basis.joint.inverse),
+    }
 
 
 def _distribution(method: Report, regression: Regression) -> dict[str, tuple[tuple[str, ...], FloatArray]]:
@@ -436,5 +450,9 @@ def _field_estimates(
         ),
         "field_loo_error": ((), relative_of_field(regression)),
         "node_loo_error": (("node",), np.sqrt(shares(*by_node))),
-        **{f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()},
+        **(
+            {f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()}
+            if regression.inputs.independent
+            else {}
+        ),
     }

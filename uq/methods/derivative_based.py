@@ -116,6 +116,8 @@ class DerivativeBased(Amount):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why the bounds do not hold for these parameters, or None."""
+        if inputs.draws is not None:
+            return "draws have no densities, which bounds on Sobol' indices need, expected method.kind = 'chaos'"
         if not inputs.independent:
             return (
                 "bounds on Sobol' indices need independent parameters, expected no correlations for "

@@ -83,6 +83,11 @@ class Method(Settings):
         """What the planned solves are for, if they decide how many more there are; otherwise empty."""
         return ""
 
+    @property
+    def in_turn(self) -> bool:
+        """Whether it takes draws of equal weight in turn (`Inputs.random`)."""
+        return False
+
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
         """Return the models that it solves besides that of the study, by the names for `Evaluate.on`.
 
@@ -106,7 +111,7 @@ class Method(Settings):
         objection = self.objection(inputs)
         if objection is not None:
             given = [{"between": (a, b), "value": value} for a, b, value in inputs.correlations]
-            yield ("correlations",), objection, given
+            yield (("correlations",), objection, given) if given else (("method", "kind"), objection, self.kind)
 
     def with_sources(self, read: Callable[[str], xr.Dataset]) -> Self:
         """Return the method with the results of other studies that it names, once they are read."""

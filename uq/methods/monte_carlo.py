@@ -29,7 +29,6 @@ from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, mer
 from uq.findings import add
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import random_points
 from uq.methods.stopping import Amount
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 
@@ -79,6 +78,11 @@ class MonteCarlo(Amount):
     def stream(self) -> tuple[Any, ...] | None:
         """Random points."""
         return ("random",)
+
+    @property
+    def in_turn(self) -> bool:
+        """It takes each draw once before any twice."""
+        return True
 
     def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         """Sample and estimate.
@@ -182,7 +186,7 @@ def _sample(
     target = min(limit, FIRST_ROUND) if method.open_ended or goal is not None else limit
     count = 0
     while True:
-        points = inputs.points(random_points(method.seed, count, target, len(inputs.names)))
+        points = inputs.random(method.seed, count, target)
         rounds.append(evaluate(Request(points, fields=fields, start=centre.prediction)))
         count = target
         evaluations = merge(rounds)

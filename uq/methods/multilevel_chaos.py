@@ -100,6 +100,9 @@ class MultilevelChaos(Amount):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why an expansion in these parameters is impossible, or None."""
+        if self.order > inputs.largest_degree:
+            most = inputs.largest_degree
+            return f"the draws tell polynomials up to degree {most} apart, expected at most that as method.order"
         return objection(inputs, self.kind)
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:

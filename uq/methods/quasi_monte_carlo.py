@@ -119,6 +119,11 @@ class QuasiMonteCarlo(MonteCarlo):
         """Number of samples to which the control variate is fitted."""
         return max(0, samples - self.limit)
 
+    @property
+    def in_turn(self) -> bool:
+        """Sobol' points lead to draws by their weights."""
+        return False
+
     def stream(self) -> tuple[Any, ...] | None:
         """Scrambled Sobol' points."""
         return "sobol", self.scrambles
@@ -134,7 +139,7 @@ class QuasiMonteCarlo(MonteCarlo):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters do not allow the control, or None."""
-        if self.control == "chaos" and not inputs.independent:
+        if self.control == "chaos" and inputs.correlations:
             return (
                 "polynomial chaos needs independent parameters, expected no correlations for method.control = 'chaos'"
             )

@@ -157,6 +157,11 @@ class Sobol(Amount):
 
     def objection(self, inputs: Inputs) -> str | None:
         """Say why these parameters have no Sobol' indices, or None."""
+        if len(inputs.joint) > 1:
+            return (
+                "parameters given by the same draws depend on each other and have no Sobol' indices, expected "
+                "method.kind = 'chaos', which gives their Shapley effects"
+            )
         if not inputs.independent:
             return "Sobol' indices need independent parameters, expected no correlations for method.kind = 'sobol'"
         return None

@@ -1,9 +1,12 @@
-"""Orthonormal polynomials of independent random parameters, and their derivatives.
+"""Orthonormal polynomials of random parameters, and their derivatives.
 
 They are polynomials of standardised coordinates t, of parameters or their logarithms (`uq.inputs.coordinates`), so that
 derivatives along t are "per standard deviation". The orthonormal polynomials of t satisfy √β_{k+1} p_{k+1} =
 (t − α_k) p_k − √β_k p_{k−1} (W. Gautschi, Orthogonal Polynomials (2004), section 1.3); p_0 = 1 and p_1 = t. Basis
 functions are products ψ_a(t) = Π_i p_{a_i}(t_i) for a set of multi-indices a.
+
+Of parameters given by draws, the products of Hermite polynomials of their coordinates are made orthonormal in the
+measure of the draws, degree by degree (`Joint`); ψ_a is one of these times the product of the other parameters'.
 """
 
 from __future__ import annotations
@@ -11,9 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations, permutations
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +26,57 @@ from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
+
 IntArray = NDArray[np.int64]
+TOLD = 1e-9  # share of the norm of a function above which draws tell it apart from others
 Real = TypeVar("Real", float, FloatArray)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Polynomials of k dependent coordinates, orthonormal in the measure of their draws.
+
+    Attributes
+    ----------
+    members
+        Places (k,) of the coordinates among all.
+    indices
+        Degrees (Q, k), in the order in which products are made orthonormal.
+    inverse
+        Upper triangular (Q, Q): orthonormal functions are products of polynomials (n, Q) times it.
+    """
+
+    members: IntArray
+    indices: IntArray
+    inverse: FloatArray
+
+    @classmethod
+    def of(cls, draws: Draws, members: IntArray, indices: IntArray) -> Joint:
+        """Make products with these degrees (Q, k), which begin with zeros, orthonormal; redundant ones become 0."""
+        tables = [hermite(t, int(indices.max(initial=1))) for t in draws.coordinates.T]
+        columns = np.sqrt(draws.weights)[:, None] * _products(tables, indices)
+        r = np.linalg.qr(columns, mode="r")[: len(indices)]
+        diagonal = np.zeros(len(indices))
+        diagonal[: len(r)] = np.diag(r)
+        # What draws do not tell apart from functions of lower degree is no function of its own.
+        told = np.abs(diagonal) > TOLD * np.linalg.norm(columns, axis=0)
+        inverse = np.zeros((len(indices), len(indices)))
+        part = np.linalg.qr(columns[:, told], mode="r")
+        inverse[np.ix_(told, told)] = np.linalg.inv(part) * np.sign(np.diag(part))
+        return cls(members, indices, inverse)
+
+    def number(self, indices: IntArray) -> IntArray:
+        """Return which functions (P,) have the degrees of multi-indices (P, d) of all parameters."""
+        numbers = {index.tobytes(): i for i, index in enumerate(self.indices)}
+        return np.array([numbers[index.tobytes()] for index in np.ascontiguousarray(indices[:, self.members])])
+
+
+def hermite(t: FloatArray, degree: int) -> FloatArray:
+    """Return the normalised Hermite polynomials (n, degree + 1) at t (n,)."""
+    beta = [1.0, *map(float, range(1, degree + 1))]
+    return np.column_stack(_recur(t, [0.0] * (degree + 1), beta, degree, derivatives=False)[0])
 
 
 @dataclass(frozen=True)
@@ -38,21 +90,26 @@ class Basis:
     alpha, beta
         Recurrence coefficients (d, N + 1) of the standardised coordinates, for degrees up to N.
     indices
-        Multi-indices (P, d): degree of each function in each parameter.
+        Multi-indices (P, d): degree of each function in each coordinate.
+    joint
+        Functions of coordinates that depend on each other, if there are such.
     """
 
     coordinates: Coordinates
     alpha: FloatArray
     beta: FloatArray
     indices: IntArray
+    joint: Joint | None = None
 
     def values(self, points: FloatArray) -> FloatArray:
         """Return ψ (n, P) at points (n, d)."""
         tables, _ = self._tables(points, derivatives=False)
-        return _products(tables, self.indices)
+        return _products(tables, self._numbers)
 
     def at(self, point: FloatArray) -> FloatArray:
         """Return ψ (P,) at one point (d,), without the overhead of arrays."""
+        if self.joint is not None:
+            return np.asarray(self.values(point[None, :])[0])
         result = np.ones(len(self.indices))
         t = self.coordinates.of(point).tolist()
         for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
@@ -67,11 +124,14 @@ class Basis:
     def rows(self, points: FloatArray, *, gradients: bool) -> FloatArray:
         """Return the rows of a regression (n, 1 + d, P): values and derivatives, or values (n, 1, P) only."""
         tables, slopes = self._tables(points, derivatives=gradients)
+        numbers, last = self._numbers, len(tables) - 1
         result = np.zeros((len(points), 1 + len(slopes), len(self.indices)))
-        result[:, 0] = _products(tables, self.indices)
+        result[:, 0] = _products(tables, numbers)
         for i, table in enumerate(slopes):
-            varying = np.flatnonzero(self.indices[:, i])
-            result[:, 1 + i, varying] = _products([*tables[:i], table, *tables[i + 1 :]], self.indices[varying])
+            factor = i if self.joint is None or i < self.joint.members[0] else last
+            varying = np.flatnonzero(numbers[:, factor])
+            others = [*tables[:factor], table, *tables[factor + 1 :]]
+            result[:, 1 + i, varying] = _products(others, numbers[varying])
         return result
 
     def of_one(self, i: int, t: FloatArray) -> FloatArray:
@@ -85,15 +145,46 @@ class Basis:
         return replace(self, indices=self.indices[which])
 
     def _tables(self, points: FloatArray, *, derivatives: bool) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return p_k(t_i) and p_k'(t_i), each a list over i of (n, N + 1)."""
+        """Return p_k(t_i) and p_k'(t_i), each a list over i of (n, N + 1); the values of a joint factor last."""
         t = self.coordinates.of(points)
-        values, slopes = [], []
-        for i, degree in enumerate(self.indices.max(axis=0, initial=0).tolist()):
+        values: list[FloatArray] = []
+        slopes: list[FloatArray] = []
+        for i, degree in enumerate(self._degrees):
             columns = _recur(t[:, i], self.alpha[i].tolist(), self.beta[i].tolist(), degree, derivatives=derivatives)
             values.append(np.column_stack(columns[0]))
             if derivatives:
                 slopes.append(np.column_stack(columns[1]))
-        return values, slopes
+        if self.joint is None:
+            return values, slopes
+        start, joint = int(self.joint.members[0]), self.joint
+        own, together = values[:start], values[start:]
+
+        def orthonormal_of(tables: list[FloatArray]) -> FloatArray:
+            return np.asarray(_products(tables, joint.indices) @ joint.inverse)
+
+        for i, table in enumerate(slopes[start:]):
+            derived = np.zeros((len(t), len(joint.indices)))
+            varying = np.flatnonzero(joint.indices[:, i])
+            derived[:, varying] = _products([*together[:i], table, *together[i + 1 :]], joint.indices[varying])
+            slopes[start + i] = derived @ joint.inverse
+        return [*own, orthonormal_of(together)], slopes
+
+    @property
+    def _degrees(self) -> list[int]:
+        """Largest degree of each coordinate that is needed."""
+        found: IntArray = self.indices.max(axis=0, initial=0)
+        if self.joint is not None:
+            found = found.copy()
+            found[self.joint.members] = self.joint.indices.max(axis=0, initial=0)
+        return [int(degree) for degree in found]
+
+    @cached_property
+    def _numbers(self) -> IntArray:
+        """Columns (P, F) of the tables that each function is the product of."""
+        if self.joint is None:
+            return self.indices
+        own = self.indices[:, : int(self.joint.members[0])]
+        return np.column_stack([own, self.joint.number(self.indices)])
 
 
 def _products(tables: list[FloatArray], indices: IntArray) -> FloatArray:
@@ -124,11 +215,20 @@ def _recur(t: Real, alpha: list[float], beta: list[float], degree: int, *, deriv
 
 
 def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
-    """Return the orthonormal polynomials of independent parameters with these multi-indices (P, d)."""
+    """Return the orthonormal polynomials with these multi-indices (P, d), of parameters without correlations.
+
+    Those of draws contain all functions of lower degree (hyperbolic sets do, and their unions).
+    """
     degree = int(indices.max(initial=1))
-    pairs = [recurrence(marginal, degree) for marginal in inputs.marginals.values()]
+    members = list(inputs.joint)
+    marginals = list(inputs.marginals.values())
+    pairs = [recurrence(one, degree) for one in marginals[: inputs.joint.start]]
+    pairs += [recurrence(Normal(mean=0.0, std=1.0), degree)] * len(members)
     alpha, beta = (np.array(column) for column in zip(*pairs, strict=True))
-    return Basis(inputs.coordinates, alpha, beta, indices)
+    joint = None
+    if inputs.draws is not None:
+        joint = Joint.of(inputs.draws, np.array(members), by_degree(np.unique(indices[:, members], axis=0)))
+    return Basis(inputs.coordinates, alpha, beta, indices, joint)
 
 
 @cache

@@ -10,7 +10,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
-from uq.surrogates.basis import Basis
+from uq.surrogates.basis import Basis, Joint
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -60,13 +60,21 @@ class Expansion:
             message = "these results hold no expansion, expected results of method.kind = 'chaos'"
             raise ValueError(message)
         arrays = {str(name): variable.to_numpy() for name, variable in results.data_vars.items()}
+        d, joint = len(arrays["coordinate_mean"]), None
+        if "joint_index" in arrays:
+            members = np.arange(d - arrays["joint_index"].shape[1], d)
+            joint = Joint(members, arrays["joint_index"], arrays["joint_inverse"])
         basis = Basis(
             Coordinates(
-                arrays["coordinate_logarithmic"].astype(bool), arrays["coordinate_mean"], arrays["coordinate_std"]
+                arrays["coordinate_logarithmic"].astype(bool),
+                arrays["coordinate_mean"],
+                arrays["coordinate_std"],
+                arrays.get("coordinate_mixing"),
             ),
             arrays["recurrence_alpha"],
             arrays["recurrence_beta"],
             arrays["multi_index"],
+            joint,
         )
         return cls(
             tuple(map(str, results["parameter"].values)),
@@ -86,7 +94,7 @@ class Expansion:
         """Return the derivatives dψ/dω (n, m, d) at points (n, d)."""
         points = self._checked(points)
         slopes = self.basis.derivatives(points) @ self.coefficients
-        return np.asarray(np.swapaxes(slopes, 1, 2) / self.basis.coordinates.steps(points)[:, None, :])
+        return self.basis.coordinates.tangents(np.swapaxes(slopes, 1, 2), points)
 
     def displacements(self, points: FloatArray) -> FloatArray:
         """Return the displacement fields (n, nodes, 3) at points (n, d), in m.

@@ -78,7 +78,7 @@ class Projections:
             deviation: FloatArray = (solution.state - state)[None, :]
             if not self.gradients:
                 return deviation
-            directions = np.diag(self.basis.coordinates.steps(parameters))
+            directions = self.basis.coordinates.directions(parameters)
             return np.vstack([deviation, solution.state_tangent(directions)])
 
         return rows

@@ -59,14 +59,14 @@ class Linearisation:
     @property
     def output_slopes(self) -> FloatArray:
         """Derivatives dψ/dt (m, d) of the outputs along the coordinates."""
-        return self.tangents * self.coordinates.steps(self.point)
+        return self.coordinates.along(self.tangents, self.point)
 
     @property
     def state_slopes(self) -> FloatArray:
         """Derivatives dū/dt (d, U) of the state along the coordinates; empty (0, U) if there are none."""
         if len(self.slopes) == 0:
             return self.slopes
-        return self.slopes * self.coordinates.steps(self.point)[:, None]
+        return np.ascontiguousarray(self.coordinates.along(self.slopes.T, self.point).T)
 
     @property
     def middle(self) -> FloatArray:

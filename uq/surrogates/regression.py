@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, SolveError
 from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_tails
-from uq.estimators.indices import Analysis, coefficient_moments, shares
+from uq.estimators.indices import Analysis, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.estimators.tails import influences
 from uq.evaluation.evaluate import Evaluations
@@ -88,6 +88,7 @@ def whole(inputs: Inputs, order: int) -> Candidates:
 def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> Candidates:
     """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
     d = len(inputs.names)
+    max_order = min(max_order, inputs.largest_degree)
     most = max(rows // ROWS_PER_TERM, d + 1)
     found: dict[tuple[bool, bytes], tuple[IntArray, int, float]] = {}
     determined = False
@@ -151,7 +152,7 @@ class Data:
         """Take values (n, m) and, if given, tangents (n, m, d) at points; `weights` as in `of`."""
         slopes = None
         if tangents is not None:
-            slopes = np.swapaxes(tangents * inputs.coordinates.steps(points)[:, None, :], 1, 2)
+            slopes = np.swapaxes(inputs.coordinates.along(tangents, points), 1, 2)
         return cls(points, values, slopes, np.ones(len(points)) if weights is None else weights)
 
     def some(self, which: slice | IntArray) -> Data:
@@ -598,9 +599,28 @@ class Regression:
         """The P functions of the fit."""
         return self.largest.subset(self.fit.chosen.which)
 
-    def estimates(self, of: Analysis = coefficient_moments) -> dict[str, FloatArray]:
-        """Return estimates from the coefficients, by output, with standard errors."""
-        return _estimates(self.fit, self.largest.indices, self.data, self.rest(), of)
+    def estimates(self, of: Analysis | None = None) -> dict[str, FloatArray]:
+        """Return estimates from the coefficients, by output, with standard errors.
+
+        Without another analysis these are moments and Sobol' indices, or Shapley effects where parameters depend on
+        each other.
+        """
+        if of is None and not self.inputs.independent:
+            return self._dependent()
+        return _estimates(self.fit, self.largest.indices, self.data, self.rest(), of or coefficient_moments)
+
+    def _dependent(self) -> dict[str, FloatArray]:
+        """Moments and, of few parameters, Shapley effects."""
+        from uq.estimators.shapley import MOST, Shapley
+
+        draws = self.inputs.draws
+        assert draws is not None
+        if len(draws.names) > MOST:
+            return _estimates(self.fit, self.largest.indices, self.data, self.rest(), moments)
+        of = Shapley.of(self.largest, draws)
+        found = _estimates(self.fit, self.largest.indices, self.data, self.rest(), of.analysis)
+        of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
+        return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
 
     def rest(self) -> FloatArray | None:
         """Return the norms (m,) of what the basis misses in outputs; None if no parameter has a tail.

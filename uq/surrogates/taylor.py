@@ -113,6 +113,8 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
     held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
     mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))
     for i, marginal in enumerate(inputs.marginals.values()):
+        if i in inputs.joint:
+            continue
         if tails[i]:
             t, weights = _normal_rule(marginal, held.lower[i], held.upper[i])
             table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
@@ -121,6 +123,10 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
             table = fitted.basis.of_one(i, t)
         mean *= weights @ table
         second *= table.T @ (weights[:, None] * table)
+    if fitted.basis.joint is not None:  # orthonormal as they are
+        number = fitted.basis.joint.number(fitted.basis.indices)
+        mean *= number == 0
+        second *= number[:, None] == number
     return Control(held, fitted.outputs, fitted.state[:0], mean, second)
 
 
@@ -191,7 +197,7 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
         raise SolveError(message, failure.history)
     assert found.tangents is not None
     # (2d, m, d): ∂ψ/∂t_j; (d, m, d): ∂/∂t_i of it
-    slopes = found.tangents * coordinates.steps(displaced)[:, None, :]
+    slopes = coordinates.along(found.tangents, displaced)
     differences = (slopes[:d] - slopes[d:]) / (2 * steps[:, None, None])
     hessian = np.array([(differences[i, :, j] + differences[j, :, i]) / 2 for i, j in pairs])
     state = np.concatenate([centre.state_slopes, found.fields]) if wanted is not None else centre.slopes[:0]
@@ -206,13 +212,19 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
 
 
 def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, factors: FloatArray) -> FloatArray:
-    """E[φφᵀ] (k, k) of independent inputs, for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by exact Gauss rules."""
+    """E[φφᵀ] (k, k) for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by exact Gauss rules and sums over draws."""
     moments = []
-    for marginal, at in zip(inputs.marginals.values(), middle, strict=True):
+    own = inputs.joint.start
+    for marginal, at in zip(list(inputs.marginals.values())[:own], middle[:own], strict=True):
         t, weights = gauss_rule(marginal, 3)
         moments.append([weights @ (t - at) ** k for k in range(5)])
     total = exponents[:, None, :] + exponents[None, :, :]
-    products = np.prod(np.array(moments)[np.arange(len(middle)), total], axis=-1)
+    products = np.ones(total.shape[:2])
+    if own:
+        products = np.prod(np.array(moments)[np.arange(own), total[..., :own]], axis=-1)
+    if inputs.draws is not None:
+        powers = np.prod((inputs.draws.coordinates - middle[own:])[:, None, :] ** exponents[:, own:], axis=-1)
+        products = products * (powers.T @ (inputs.draws.weights[:, None] * powers))
     return np.asarray(factors[:, None] * factors[None, :] * products)
 
 
@@ -221,6 +233,9 @@ def _steps(inputs: Inputs) -> FloatArray:
     marginals = inputs.marginals.values()
     supports = [marginal.support or (marginal.at(EDGE), marginal.at(1 - EDGE)) for marginal in marginals]
     lower, upper = inputs.coordinates.of(np.array(supports).T)
+    if inputs.draws is not None:
+        own, t = inputs.joint.start, inputs.draws.coordinates
+        lower[own:], upper[own:] = t.min(axis=0), t.max(axis=0)
     middle = inputs.coordinates.of(inputs.mean)
     return np.asarray(np.minimum(STEP, np.minimum(middle - lower, upper - middle) / 2))
 
@@ -239,7 +254,7 @@ class _SecondDerivatives:
         def rows(solution: Solution, parameters: FloatArray) -> FloatArray:
             step = self.coordinates.of(parameters) - here
             moved = int(np.abs(step).argmax())
-            directions = np.diag(self.coordinates.steps(parameters))
+            directions = self.coordinates.directions(parameters)
             slopes = solution.state_tangent(directions) / (2 * step[moved])
             total = np.zeros((len(self.pairs), slopes.shape[1]))
             for k, (i, j) in enumerate(self.pairs):

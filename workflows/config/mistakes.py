@@ -89,6 +89,8 @@ def _around_member(steps: Sequence[str | int], place: str) -> tuple[str, str | N
 
 
 def _place(steps: Sequence[str | int], place: str) -> str:
+    if not place and steps and steps[0] == "source":  # where it stands in files
+        steps = ("parameters", "from", *steps[1:])
     for step in steps:
         if isinstance(step, int):
             place += f"[{step}]"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.materials.admissible import Materials
-from forward.model import Finding
+from forward.model import Finding, FloatArray
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest
 from uq.inputs.distributions import Distribution
@@ -16,6 +16,7 @@ from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
     from forward.spec import ModelSpec
+    from uq.inputs.draws import Draws
     from workflows.config.blocks import Correlation
 
 NEGLIGIBLE = 1e-9  # a tail of this probability may lie outside the admissible values
@@ -25,6 +26,38 @@ LEAST = 0.5  # smallest probability of admissible constants
 def ranges(parameters: Mapping[str, Distribution]) -> dict[str, tuple[float, float]]:
     """Return the ranges of parameters, by their paths."""
     return {path: distribution.range for path, distribution in parameters.items()}
+
+
+def mistakes_of_draws(
+    scalars: Mapping[str, Scalar], draws: Draws, constants: Collection[str] = ()
+) -> Iterator[Mistake]:
+    """Find draws at most of which the model is impossible; constants of materials are judged together."""
+    for name, values in zip(draws.names, draws.values.T, strict=True):
+        share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
+        if share > 1 - LEAST:
+            message = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
+            yield ("parameters", "from"), message, name
+
+
+def findings_of_impossible(
+    scalars: Mapping[str, Scalar], draws: Draws, constants: Collection[str] = ()
+) -> Iterator[Finding]:
+    """Say how many draws are where the model is impossible, and that these samples fail."""
+    for name, values in zip(draws.names, draws.values.T, strict=True):
+        share, objection = _impossible(scalars[name], values, draws) if name not in constants else (0.0, "")
+        if share > 0:
+            text = (
+                f"{100 * share:.2g} % of the draws of '{name}' are where the model is impossible ({objection}): these "
+                "samples count as failed, and results are over the others."
+            )
+            yield Finding("warning", text)
+
+
+def _impossible(number: Scalar, values: FloatArray, draws: Draws) -> tuple[float, str]:
+    """Share of draws where the model is impossible, and why it is at the first of them."""
+    why = {value: number.objection(float(value)) for value in np.unique(values)}
+    bad = np.array([why[value] is not None for value in values])
+    return float(draws.weights[bad].sum()), next((text for text in why.values() if text is not None), "")
 
 
 def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
@@ -65,7 +98,7 @@ def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mist
     """Find distributions of constants most of which are inadmissible; constants are judged together."""
     if inputs.admitted >= LEAST:
         return
-    middle = inputs.from_normals(np.zeros((1, len(inputs.names))))[0][0]
+    middle = inputs.points(np.full((1, len(inputs.names)), 0.5))[0]
     objection = materials.objection(dict(zip(inputs.names, map(float, middle), strict=True)))
     said = f"; at the medians, {objection}" if objection is not None else ""
     message = f"{100 * (1 - inputs.admitted):.3g} % of the values are impossible{said}"

@@ -15,6 +15,7 @@ from forward.settings import cut
 from uq.methods.method import METHODS
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import located
+from workflows.config.source import KEPT
 from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
 
 _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
@@ -100,11 +101,26 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
     if isinstance(source, str) and isinstance(method, Mapping):
         place = next((path for path in (folder / source, Path(source)) if path.exists()), folder / source)
         blocks = blocks | {"method": {**method, "source": str(place.resolve())}}
+    blocks = _with_draws(blocks, folder)
     body = model.get("body") if isinstance(model, Mapping) else None
     file = body.get("file") if isinstance(body, Mapping) else None
     if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
         return blocks
     return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
+
+
+def _with_draws(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Give the full path of draws; in the directory of results that were begun with them, they are kept."""
+    parameters = blocks.get("parameters")
+    source = parameters.get("from") if isinstance(parameters, Mapping) else None
+    block = {"file": source} if isinstance(source, str) else source
+    if not isinstance(parameters, Mapping) or not isinstance(block, Mapping) or not isinstance(block.get("file"), str):
+        return blocks
+    file = block["file"]
+    kept = folder / KEPT
+    places = (*([kept] if block.get("digest") else []), folder / file, Path(file))
+    place = next((path for path in places if path.exists()), folder / file)
+    return blocks | {"parameters": {**parameters, "from": {**block, "file": str(place.resolve())}}}
 
 
 def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
@@ -142,6 +158,10 @@ def schema() -> dict[str, Any]:
             found["$defs"] |= table.pop("$defs", {}) | {name: table}
             data = found["$defs"][form.__name__]["properties"]
             data["data"] = {"anyOf": [data["data"], {"$ref": _REFERENCE.format(model=name)}]}
+    # Draws stand among the parameters that they are of.
+    sampled = found["$defs"][STUDIES[SAMPLING].__name__]
+    properties = sampled["properties"]
+    properties["parameters"] |= {"properties": {"from": {"anyOf": [{"type": "string"}, properties.pop("source")]}}}
     # A tolerance for all errors stands in place of a method.
     sampled = found["$defs"][STUDIES[SAMPLING].__name__]
     sampled["required"].remove("method")
@@ -173,8 +193,9 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     Blocks on which results do not depend do not count, nor does the path of a mesh, as long as the mesh is the same.
     """
     before, after = (dict(_leaves({k: v for k, v in d.items() if k not in WITHOUT_EFFECT})) for d in (old, new))
-    if before.get(_MESH) == after.get(_MESH) is not None:
-        after |= {"model.body.file": before["model.body.file"]}
+    for digest, file in _FILES.items():
+        if before.get(digest) == after.get(digest) is not None:
+            after |= {file: before[file]}
     places = [*before, *(place for place in after if place not in before)]
     return [
         f"{place}: {before.get(place, 'absent')} → {after.get(place, 'absent')}"
@@ -183,7 +204,8 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     ]
 
 
-_MESH = "model.body.contents.digest"
+# Files that count by their contents, not their path.
+_FILES = {"model.body.contents.digest": "model.body.file", "parameters.from.digest": "parameters.from.file"}
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:

@@ -143,6 +143,7 @@ SECTIONS = Kinds(
         "expansion": f"{_HERE}.expansion:Expansion",
         "levels": f"{_HERE}.levels:Levels",
         "sobol": f"{_HERE}.sobol:SobolIndices",
+        "shapley": f"{_HERE}.shapley:ShapleyEffects",
         "sobol-field": f"{_HERE}.sobol_field:SobolField",
         "derivative-based": f"{_HERE}.derivative_based:DerivativeBased",
         "distribution": f"{_HERE}.distribution:Distribution",

@@ -38,6 +38,8 @@ def model_in_words(study: Study) -> Iterator[tuple[str, list[str]]]:
     scalars = study.model.scalars
 
     def said(path: str) -> str:
-        return "random" if path in study.parameters else with_unit(number(scalars[path].value, 6), scalars[path].unit)
+        if path in getattr(study, "given", study.parameters):
+            return "random"
+        return with_unit(number(scalars[path].value, 6), scalars[path].unit)
 
     return study.spec.words(said, " on the coarsest mesh" if len(study.meshes) > 1 else "")

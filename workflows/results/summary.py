@@ -110,6 +110,10 @@ def _sobol(dataset: xr.Dataset) -> Part:
     return found
 
 
+def _shapley(dataset: xr.Dataset) -> Part:
+    return {"shapley": _by(dataset, "parameter", _with_errors(dataset, "shapley", "value"))}
+
+
 def _second(dataset: xr.Dataset) -> Part:
     names = _with_errors(dataset, "sobol_second", "second")
     pairs = {
@@ -236,6 +240,7 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"quantiles", "mean"}, _quantiles),
     ({"sobol_first"}, _sobol),
     ({"sobol_second"}, _second),
+    ({"shapley"}, _shapley),
     ({"total_bound"}, _bounds),
     ({"derivative"}, _local),
     ({"derivative", "nominal_corrected"}, _nominal),

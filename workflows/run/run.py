@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import Loaded
-from forward.machine import StopError, headroom, out_of_memory, reason_to_stop
+from forward.machine import StopError, headroom, out_of_memory, reason_to_stop, write_whole
 from forward.model import SolveError
 from uq.evaluation.evaluate import Evaluations
 from uq.findings import add
 from workflows.config.mistakes import StudyError
+from workflows.config.source import KEPT
 from workflows.config.study import differences, document, dump
 from workflows.results.directory import (
     above_rounding,
@@ -264,6 +265,8 @@ def _keep_study(directory: Path, study: StudyKind) -> None:
     """Write study.toml, also if only the block of the report differs; the report is then made again."""
     kept = directory / "study.toml"
     if not kept.exists():
+        for name, content in study.beside.items():
+            write_whole(directory / name, content)
         write_text(kept, dump(study))
     elif tomllib.loads(kept.read_text(encoding="utf-8")).get("report") != document(study).get("report"):
         write_text(kept, dump(study))
@@ -307,7 +310,7 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
         checkpoint.clear()
         for name in (*REFINED, CHOSEN):
             (directory / name).unlink(missing_ok=True)
-    made = ("study.toml", own_code.FILE)
+    made = ("study.toml", own_code.FILE, KEPT)
     if {path.name for path in directory.iterdir()} <= set(made):
         for name in made:
             (directory / name).unlink(missing_ok=True)

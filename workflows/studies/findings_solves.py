@@ -23,7 +23,7 @@ def measured(study: Study, model: HyperelasticModel) -> list[Finding]:
     Empty if the body does not lock by the tables, or if the solve would be too large or fails.
     """
     spec, better = model.spec, model.spec.unlocked()
-    tables = spec.locking(ranges(study.parameters))
+    tables = spec.locking(ranges(study.given))
     if better.unknowns > AFFORDABLE or not any(finding.severity == "warning" for finding in tables):
         return []
     mean = study.inputs.mean

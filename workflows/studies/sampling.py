@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_serializer, model_validator
 
 from forward.machine import MIB
 from forward.model import Finding, ModelError
@@ -20,8 +20,15 @@ from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
 from workflows.config.blocks import Accuracy, Correlation, Parallel
 from workflows.config.mistakes import refused
-from workflows.config.priors import findings_of_draws, mistakes_of_materials, mistakes_of_parameters, ranges
+from workflows.config.priors import (
+    findings_of_draws,
+    mistakes_of_draws,
+    mistakes_of_materials,
+    mistakes_of_parameters,
+    ranges,
+)
 from workflows.config.report import Report
+from workflows.config.source import KEPT, READER, Source
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -30,6 +37,7 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.evaluate import Evaluations
+    from uq.inputs.draws import Draws
     from workflows.studies.job import Job
 
 
@@ -45,7 +53,9 @@ class Study(StudyKind):
         A body, or a model of another program.
     parameters
         Distributions by the paths of the numbers of the model that they replace; may be left out if the model has
-        random fields, whose coefficients are parameters automatically.
+        random fields, whose coefficients are parameters automatically. ``from`` among them names draws (`source`).
+    source
+        Draws of further numbers; in a file it is ``parameters.from``.
     correlations
         Correlations between them.
     method
@@ -63,6 +73,7 @@ class Study(StudyKind):
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     parameters: dict[str, Distribution] = Field(default={})
+    source: Source | None = None
     correlations: tuple[Correlation, ...] = ()
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
@@ -72,7 +83,21 @@ class Study(StudyKind):
     @property
     def inputs(self) -> Inputs:
         """The random parameters: those that are given, and then the standard normal coefficients of random fields."""
-        return Inputs(self._marginals, tuple((*c.between, c.value) for c in self.correlations))
+        pairs = tuple((*c.between, c.value) for c in self.correlations)
+        return Inputs(self._marginals, pairs, draws=self.draws)
+
+    @cached_property
+    def draws(self) -> Draws | None:
+        """Draws of numbers of the model, if there is a source of them."""
+        if self.source is None:
+            return None
+        found: Draws | None = named(f"{READER}:draws_of")(self.source, self.model.scalars)
+        return found
+
+    @property
+    def given(self) -> dict[str, Distribution]:
+        """The distributions by the paths of the numbers that they replace, those of draws too."""
+        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
 
     @property
     def _marginals(self) -> dict[str, Distribution]:
@@ -81,7 +106,7 @@ class Study(StudyKind):
     @cached_property
     def spec(self) -> ModelSpec:
         """The model, in the form that suits all values of its parameters, solved as exactly as a tolerance needs."""
-        spec, asked = self.model.over(ranges(self.parameters)), self.accuracy.tolerance
+        spec, asked = self.model.over(ranges(self.given)), self.accuracy.tolerance
         solver = spec.solver_tolerance
         return spec if asked is None or solver is None else spec.solved_to(min(solver, OF_SOLVER * asked))
 
@@ -103,7 +128,7 @@ class Study(StudyKind):
     @property
     def planned(self) -> int:
         """Number of solves: the most if a tolerance may end the study earlier, the least for multilevel methods."""
-        return self.method.planned(len(self._marginals))
+        return self.method.planned(len(self.inputs.names))
 
     @property
     def estimates(self) -> int:
@@ -148,7 +173,9 @@ class Study(StudyKind):
         """Findings about the study before anything is solved."""
         materials = self.spec.materials(self.inputs.names)
         of_draws = () if materials is None else findings_of_draws(self.inputs.within(materials))
-        found = (*self.model.findings_over(ranges(self.parameters)), *of_draws, *self._of_estimates())
+        found = (*self.model.findings_over(ranges(self.given)), *of_draws, *self._of_estimates())
+        if self.source is not None:
+            found = (*found, *named(f"{READER}:findings")(self, self.source))
         return found if self.accuracy.tolerance is None else (*found, *named(f"{OF_TOLERANCE}:findings")(self))
 
     def _of_estimates(self) -> Iterator[Finding]:
@@ -220,7 +247,37 @@ class Study(StudyKind):
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
-        return super().identity() | {"model": self.model.identity()}
+        return super().identity() | {"model": self.model.identity()} | self._source_identity
+
+    @property
+    def _source_identity(self) -> dict[str, Any]:
+        return {} if self.source is None else {"parameters": {"from": self.source.digest, **self._written}}
+
+    @property
+    def _written(self) -> dict[str, Any]:
+        return {path: one.model_dump(mode="json") for path, one in self.parameters.items()}
+
+    @property
+    def beside(self) -> Mapping[str, bytes]:
+        """The draws, as they were read."""
+        return {} if self.source is None else {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
+
+    @model_serializer(mode="wrap")
+    def _source_among_parameters(self, handler: Any) -> dict[str, Any]:
+        """Write the source where files have it."""
+        found: dict[str, Any] = handler(self)
+        source = found.pop("source", None)
+        return found if source is None else found | {"parameters": {"from": source, **found["parameters"]}}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_source(cls, value: Any) -> Any:
+        """Take the source from among the parameters."""
+        parameters = value.get("parameters") if isinstance(value, dict) else None
+        if not isinstance(parameters, dict) or "from" not in parameters:
+            return value
+        rest = {path: block for path, block in parameters.items() if path != "from"}
+        return value | {"parameters": rest, "source": parameters["from"]}
 
     @model_validator(mode="before")
     @classmethod
@@ -248,6 +305,11 @@ class Study(StudyKind):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
+        if self.source is not None:
+            wrong = list(named(f"{READER}:mistakes")(self.source, self.model, tuple(self.parameters)))
+            yield from wrong
+            if wrong:
+                return
         unfit = list(self.method.unfit(self.spec))
         yield from unfit
         if not unfit:
@@ -283,9 +345,11 @@ class Study(StudyKind):
 
     def _mistakes_of_parameters(self) -> Iterator[Mistake]:
         spec = self.spec
-        if not self._marginals:
+        if not self.given and not self._marginals:
             or_field = ", or one of model.fields" if spec.meshed else ""
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         materials = spec.materials(self.parameters)
         constants = () if materials is None else materials.names
         yield from mistakes_of_parameters(spec.scalars, self.parameters, constants)
+        if self.draws is not None:
+            yield from mistakes_of_draws(spec.scalars, self.draws, constants)

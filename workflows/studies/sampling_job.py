@@ -49,8 +49,10 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
             within: Callable[..., xr.Dataset] = named("workflows.studies.within:within")
-            return within(study, method, inputs, evaluate, recorders, estimates, directory)
-        found = method.run(inputs, recorders["/"])
+            return _with_errors_of_draws(
+                study, within(study, method, inputs, evaluate, recorders, estimates, directory)
+            )
+        found = _with_errors_of_draws(study, method.run(inputs, recorders["/"]))
         return (
             _with_mesh_errors(study, found, inputs, evaluate, recorders["/"], estimates) if study.estimates else found
         )
@@ -122,6 +124,15 @@ def _with_mesh_errors(
     errors = estimate(inputs, evaluate, centre, count, seed, fields="node" in found.dims)
     estimates.append(errors.evaluations)
     return with_mesh_errors(found, inputs, centre, errors, told_of(study))
+
+
+def _with_errors_of_draws(study: Study, found: xr.Dataset) -> xr.Dataset:
+    """Add to the errors what draws are responsible for, if some parameters are given by draws."""
+    if study.source is None:
+        return found
+    in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
+    added: xr.Dataset = named("uq.estimators.of_draws:with_errors_of_draws")(found, study.inputs, in_turn)
+    return added
 
 
 def told_of(study: Study) -> Told:

@@ -25,14 +25,14 @@ def plan(study: Study, rank_groups: int) -> list[str]:
     later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
     lines = [
         f"method      {method.kind}",
-        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.given))),
     ]
     for k, mesh in enumerate(study.meshes[1:], 1):
         cost = mesh.cost()
         taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
         lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
     lines += [
-        f"parameters  {', '.join([*study.parameters, *_in_series(spec.coefficients)])}",
+        f"parameters  {', '.join([*study.given, *_in_series(spec.coefficients)])}",
         f"outputs     {', '.join(output.name for output in spec.returned)}",
         f"solves      {up_to}{planned:,}{later}",
         *(tolerance_asked.plan(study) if study.accuracy.tolerance is not None else ()),

@@ -167,6 +167,11 @@ class StudyKind(Settings):
         """Return the part of summary.json that is specific to this kind."""
         return {}
 
+    @property
+    def beside(self) -> Mapping[str, bytes]:
+        """Files that are kept beside study.toml, by name."""
+        return {}
+
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on, as a table."""
         blocks = self.model_dump(mode="json", exclude_none=True)

@@ -28,7 +28,7 @@ class Model(Section):
 def parameters(results: Results) -> Table:
     """The random parameters and their distributions."""
     rows = []
-    for name, distribution in results.study.parameters.items():
+    for name, distribution in results.study.given.items():
         block = distribution.model_dump()
         of_parameter = results.dataset.sel(parameter=name)
         mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))

@@ -1,0 +1,436 @@
+"""Draws as inputs: of posteriors that `select` and `invert` have left, and of tables of other programs."""
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from forward.model import FunctionModel
+from tests.launch import TISSUQ, environment
+from tests.launch import run as on_ranks
+from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import netcdf
+from uq.inputs.draws import Draws
+from uq.inputs.random_parameters import Inputs
+from uq.methods.monte_carlo import MonteCarlo
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse, schema
+from workflows.report.page import write_report
+from workflows.run.run import run
+from workflows.studies.tables_of_draws import effective
+
+MODULE = """
+import math
+def value(p):
+    a, b, c = p
+    return [a + 2 * b + c, a * math.exp(b)]
+def slopes(p):
+    a, b, c = p
+    return [[1.0, 2.0, 1.0], [math.exp(b), a * math.exp(b), 0.0]]
+"""
+STUDY = """
+[model]
+kind = "python"
+function = "drawn_model.value"
+jacobian = "drawn_model.slopes"
+parameters = {{ a = 1.0, b = 0.5, c = 0.0 }}
+outputs = [{{ name = "sum", unit = "m" }}, {{ name = "other", unit = "m" }}]
+
+[parameters]
+{parameters}
+
+[method]
+{method}
+"""
+NUMBERS = np.column_stack(
+    [1 + 0.1 * np.random.default_rng(0).standard_normal(300), 0.5 + 0.1 * np.random.default_rng(1).standard_normal(300)]
+)
+NUMBERS[:, 1] += 0.8 * (NUMBERS[:, 0] - 1)
+
+
+def table(path, values=NUMBERS, head="a,b", **more):
+    columns = [*values.T, *more.values()]
+    rows = [",".join(repr(float(x)) for x in row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([",".join([head, *more]), *rows]) + "\n")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    (tmp_path / "drawn_model.py").write_text(MODULE)
+    table(tmp_path / "draws.csv")
+    return tmp_path
+
+
+def study(folder, parameters='from = "draws.csv"', method='kind = "monte-carlo"\nsamples = 300'):
+    path = folder / "study.toml"
+    path.write_text(STUDY.format(parameters=parameters, method=method))
+    return path
+
+
+def mistake(path):
+    with pytest.raises(StudyError) as error:
+        load(path)
+    assert len(error.value.args) == 1, error.value.args
+    return error.value.args[0]
+
+
+def test_draws_give_the_moments_of_a_loop_over_them_with_any_ranks(folder):
+    path = study(folder, 'from = "draws.csv"\nc = { kind = "normal", mean = 0, std = 0.1 }')
+    files = []
+    for ranks in (None, 2, 3):
+        out = folder / f"out-{ranks}"
+        done = on_ranks(ranks, TISSUQ, "run", path, "--out", out, "--no-report", "--quiet")
+        assert done.returncode == 0, done.stderr
+        files.append((out / "results.nc").read_bytes())
+    assert files[0] == files[1] == files[2]
+    found = xr.load_dataset(folder / "out-None" / "results.nc")
+    assert found.parameter.values.tolist() == ["c", "a", "b"]
+    points = found["points"].to_numpy()
+    assert np.array_equal(points[np.argsort(points[:, 1]), 1:], NUMBERS[np.argsort(NUMBERS[:, 0])])  # each once
+    inputs = Inputs(dict(load(path).parameters), draws=Draws(("a", "b"), NUMBERS, np.full(300, 1 / 300), 300.0))
+    model = FunctionModel(lambda p: [p[1] + 2 * p[2] + p[0], p[1] * math.exp(p[2])], ("c", "a", "b"), ("sum", "other"))
+    alone = MonteCarlo(samples=300).run(inputs, SerialEvaluate(model))
+    for name in ("mean", "std", "mean_error", "quantiles"):
+        assert np.array_equal(found[name], alone[name]), name
+    a, b, c = points[:, 1], points[:, 2], points[:, 0]
+    np.testing.assert_allclose(found["mean"], [np.mean(a + 2 * b + c), np.mean(a * np.exp(b))], rtol=1e-14)
+
+
+def test_a_study_reads_itself_without_its_source(folder):
+    path = study(folder)
+    made = load(path)
+    blocks = document(made)
+    assert blocks["parameters"]["from"]["digest"] == made.source.digest
+    assert parse(blocks) == made
+    assert run(made, "study", folder / "out", quiet=True) == 0
+    (folder / "draws.csv").unlink()
+    again = load(folder / "out" / "study.toml")
+    assert np.array_equal(again.draws.values, NUMBERS)
+    assert run(again, "study", folder / "out", quiet=True) == 0
+    (folder / "out" / "report.html").unlink()
+    write_report(folder / "out")
+    page = (folder / "out" / "report.html").read_text()
+    assert "draws" in page
+    assert made.source.digest in page
+
+
+def test_other_draws_do_not_continue_a_study(folder, capsys):
+    path = study(folder)
+    assert run(load(path), "study", folder / "out", quiet=True, report=False) == 0
+    (folder / "out" / "summary.json").unlink()  # as if it had been interrupted
+    shutil.copy(folder / "draws.csv", folder / "moved.csv")
+    study(folder, 'from = "moved.csv"')
+    assert run(load(path), "study", folder / "out", quiet=True, report=False) == 0
+    (folder / "out" / "summary.json").unlink()
+    table(folder / "draws.csv", NUMBERS + 1e-9)
+    with pytest.raises(StudyError, match=r"holds another study \(parameters\.from\.digest: "):
+        run(load(study(folder)), "study", folder / "out", quiet=True, report=False)
+    blocks = document(load(path))
+    table(folder / "draws.csv", NUMBERS + 1e-8)
+    with pytest.raises(StudyError, match=r"^parameters\.from: .*draws\.csv has changed since the study was begun"):
+        parse(blocks)
+
+
+def test_a_killed_study_goes_on(folder):
+    path = study(folder, method='kind = "chaos"\nsamples = 40')
+    whole, cut = folder / "whole", folder / "cut"
+    arguments = ["run", path, "--no-report", "--quiet", "--out"]
+    assert on_ranks(None, TISSUQ, *arguments, whole).returncode == 0
+    (folder / "drawn_model.py").write_text(
+        MODULE + "import os, itertools\ncount, known = itertools.count(), value\n"
+        "def value(p):\n    if next(count) > 20 and os.environ.get('KILL'): os._exit(9)\n    return known(p)\n"
+    )
+    command = list(map(str, [TISSUQ, *arguments, cut]))
+    killed = subprocess.run(command, env=environment() | {"KILL": "1"}, capture_output=True, check=False)
+    assert killed.returncode == 9
+    assert not (cut / "results.nc").exists()
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (cut / "results.nc").read_bytes() == (whole / "results.nc").read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["arviz", "plain netCDF", "classic netCDF", "weights", "log weights", "Stan"])
+def test_tables_of_other_programs(folder, kind):
+    a, b = NUMBERS.T
+    weights = np.random.default_rng(2).random(300)
+    name = "t.nc" if "CDF" in kind or kind == "arviz" else "t.csv"
+    if kind == "arviz":
+        dims = ("chain", "draw")
+        columns = {"a": (dims, a.reshape(3, 100)), "b": (dims, b.reshape(3, 100))}
+        posterior = xr.Dataset(columns, {"chain": np.arange(3), "draw": np.arange(100)})
+        (folder / name).write_bytes(netcdf(xr.Dataset(), {"posterior": posterior, "sample_stats": posterior * 2}))
+    elif kind == "plain netCDF":
+        (folder / name).write_bytes(netcdf(xr.Dataset({"a": ("draw", a), "b": ("draw", b)})))
+    elif kind == "classic netCDF":
+        xr.Dataset({"a": ("draw", a), "b": ("draw", b)}).to_netcdf(folder / name, engine="scipy")
+    elif kind == "Stan":
+        table(folder / name, head="a,b", lp__=a, accept_stat__=b)
+    else:
+        log = kind == "log weights"
+        table(folder / name, head="a,b", **{"log_weight" if log else "weight": np.log(weights) + 7 if log else weights})
+    found = load(study(folder, f'from = "{name}"')).draws
+    assert found.names == ("a", "b")
+    assert np.array_equal(found.values, NUMBERS)
+    right = weights / weights.sum() if "weights" in kind else np.full(300, 1 / 300)
+    np.testing.assert_allclose(found.weights, right, rtol=1e-12)
+    assert found.effective == pytest.approx(1 / (right**2).sum(), rel=0.5 if kind == "Stan" else 1e-9)
+
+
+def test_names_are_mapped(folder):
+    table(folder / "t.csv", head="first,second", third=NUMBERS[:, 0] ** 2)
+    path = study(folder, 'from = { file = "t.csv", names = { b = "first", c = "third" } }')
+    found = load(path)
+    assert found.draws.names == ("b", "c")
+    assert np.array_equal(found.draws.values, np.column_stack([NUMBERS[:, 0], NUMBERS[:, 0] ** 2]))
+
+
+def test_names_are_the_ends_of_paths(folder):
+    table(folder / "t.csv", NUMBERS * [1000, 1000], head="C1,C2")
+    blocks = BODY | {"parameters": {"from": str(folder / "t.csv")}}
+    assert parse(blocks).draws.names == ("material.C1", "material.C2")
+
+
+BODY = {
+    "model": {
+        "body": {"kind": "box", "size": [0.1, 0.1, 0.1], "cells": [1, 1, 1], "cell": "hexahedron", "degree": 2},
+        "material": {"kind": "mooney-rivlin", "C1": 1000.0, "C2": 500.0, "D1": 1e4},
+        "clamp": ["z-min"],
+        "loads": [{"kind": "traction", "on": "z-max", "direction": [0, 0, 1], "size": 10.0}],
+        "outputs": [{"name": "up", "kind": "max-displacement", "component": "z"}],
+    },
+    "method": {"kind": "monte-carlo", "samples": 4},
+}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ('from = "nowhere"', "parameters.from: FOLDER/nowhere: is not there, expected a results directory"),
+        ("from = 3", "parameters.from: "),
+        ('from = { file = "draws.csv", colour = 1 }', "parameters.from.colour: unknown key"),
+        ('from = { file = "draws.csv", group = "x" }', "which has no groups"),
+        (
+            'from = { file = "draws.csv", names = { z = "a" } }',
+            "parameters.from.names: 'z' is not a number of the model",
+        ),
+        ('from = { file = "draws.csv", names = { a = "z" } }', "parameters.from.names: 'z' is not in "),
+        (
+            'from = "draws.csv"\na = { kind = "normal", mean = 0, std = 1 }',
+            "parameters.a: has a distribution, and is in",
+        ),
+        ('from = "empty.csv"', "empty.csv: empty"),
+        ('from = "words.csv"', "words.csv: line 3: 'x' in column 'b', expected a number"),
+        ('from = "nan.csv"', "nan.csv: draw 2 of 'b' is nan"),
+        ('from = "other.csv"', "'alpha' of FOLDER/other.csv is not a number of the model; "),
+        ('from = "constant.csv"', "'b' is 2 in all draws, expected a fixed number in the model"),
+        ('from = "few.csv"', "holds 2 different draws of 2 parameters"),
+        ('from = "dependent.csv"', "depend linearly on each other"),
+        ('from = "weights.csv"', "weights.csv: weights are negative"),
+        ('from = "no.nc"', "no.nc: is no netCDF file"),
+        ('from = "unfinished"', "unfinished: holds an unfinished study"),
+        ('from = "forward"', "forward: is a study of kind 'monte-carlo', which has no posterior"),
+    ],
+)
+def test_sources_that_cannot_be_used(folder, parameters, said):
+    a = NUMBERS[:, 0]
+    (folder / "empty.csv").write_text("")
+    (folder / "words.csv").write_text("a,b\n1,2\n2,x\n")
+    (folder / "nan.csv").write_text("a,b\n1,2\n2,nan\n3,4\n5,5\n")
+    table(folder / "other.csv", head="alpha,b")
+    table(folder / "constant.csv", np.column_stack([a, 2 + 0 * a]))
+    table(folder / "few.csv", np.repeat(NUMBERS[:2], 5, axis=0))
+    table(folder / "dependent.csv", np.column_stack([a, 3 - a]))
+    table(folder / "weights.csv", weight=-np.ones(300))
+    (folder / "no.nc").write_bytes(b"not a netCDF file")
+    for name in ("unfinished", "forward"):
+        (folder / name).mkdir()
+        (folder / name / "study.toml").write_text("")
+    (folder / "forward" / "summary.json").write_text('{"method": "monte-carlo"}')
+    line = mistake(study(folder, parameters))
+    assert said.replace("FOLDER", str(folder)) in line
+    assert line.startswith("parameters.")
+
+
+def test_correlations_with_draws_are_refused(folder):
+    path = study(folder, 'from = "draws.csv"\nc = { kind = "normal", mean = 0, std = 0.1 }')
+    path.write_text('correlations = [{ between = ["a", "c"], value = 0.5 }]\n' + path.read_text())
+    assert "of which there are draws" in mistake(path)
+
+
+def test_what_draws_are_worth_is_said(folder):
+    weights = np.where(np.arange(300) < 20, 1.0, 1e-6)
+    table(folder / "draws.csv", weight=weights)
+    texts = [finding.text for finding in load(study(folder)).findings]
+    assert len(texts) == 1
+    assert "The 300 draws of a, b are worth 20 independent ones" in texts[0]
+
+
+def test_autocorrelated_draws_are_worth_less():
+    rng = np.random.default_rng(3)
+    x = np.zeros(20_000)
+    for i in range(1, x.size):
+        x[i] = 0.9 * x[i - 1] + rng.standard_normal()
+    assert effective(x) == pytest.approx(x.size * 0.1 / 1.9, rel=0.2)
+    assert effective(x[rng.permutation(x.size)]) == pytest.approx(x.size, rel=0.05)
+    chains = np.repeat(np.arange(4), 5000)
+    assert effective(x, chains) == pytest.approx(x.size * 0.1 / 1.9, rel=0.2)
+
+
+def test_draws_outside_the_admissible_range(folder):
+    values = NUMBERS * [1000, 1000]
+    values[:30] *= -1
+    table(folder / "t.csv", values, head="C1,C2")
+    blocks = BODY | {"parameters": {"from": str(folder / "t.csv")}}
+    texts = [finding.text for finding in parse(blocks).findings]
+    assert any("10 % of the samples are of materials that are not stable at rest" in text for text in texts), texts
+    table(folder / "t.csv", -values, head="C1,C2")
+    with pytest.raises(StudyError, match="90 % of the values are impossible"):
+        parse(blocks)
+    sizes = np.abs(NUMBERS[:, :1]) * 10
+    sizes[:3] = -1
+    table(folder / "s.csv", sizes, head="nu")
+    blocks = json.loads(json.dumps(BODY)) | {"parameters": {"from": str(folder / "s.csv")}}
+    blocks["parameters"]["from"] = {"file": str(folder / "s.csv"), "names": {"loads.traction.size": "nu"}}
+    assert parse(blocks).draws.names == ("loads.traction.size",)
+
+
+def test_a_schema_knows_draws():
+    parameters = schema()["$defs"]["Study"]["properties"]["parameters"]
+    assert "from" in parameters["properties"]
+    assert "source" not in schema()["$defs"]["Study"]["properties"]
+
+
+def test_a_study_without_draws_imports_nothing_of_them(folder):
+    path = study(folder, 'a = { kind = "normal", mean = 0, std = 0.1 }')
+    script = (
+        "import sys; from workflows.__main__ import main; "
+        f"main(['run', {str(path)!r}, '--out', {str(folder / 'out')!r}, '--quiet']); "
+        "ends = ('.draws', '.posteriors', 'of_draws', '.shapley'); print([n for n in sys.modules if n.endswith(ends)])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environment(), check=False
+    )
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
+# --- of studies that have found a posterior ---------------------------------------------------------------------------
+
+STRETCH = np.linspace(1.05, 1.5, 10)
+SLOPE = 2 * (STRETCH - STRETCH**-2)  # of the nominal stress of an incompressible neo-Hookean material, by C1
+PRIOR, NOISE, TRUTH = (1000.0, 400.0), 150.0, 1300.0
+SELECT = """
+[data]
+file = "curve.csv"
+at = "stretch"
+measured = "stress"
+group = "specimen"
+[candidates.neo-hookean]
+material = {{ kind = "neo-hookean" }}
+parameters.C1 = {{ kind = "normal", mean = {0[0]}, std = {0[1]} }}
+[candidates.mooney-rivlin]
+material = {{ kind = "mooney-rivlin" }}
+parameters.C1 = {{ kind = "normal", mean = {0[0]}, std = {0[1]} }}
+parameters.C2 = {{ kind = "normal", mean = 0, std = {0[1]} }}
+[method]
+kind = "select"
+samples = 64
+starts = 1
+noise = {{ absolute = {1} }}
+"""
+
+
+@pytest.fixture(scope="module")
+def selected(tmp_path_factory):
+    """Results of `select` for two specimens, whose posteriors are normal, and their data."""
+    folder = tmp_path_factory.mktemp("selected")
+    rng = np.random.default_rng(5)
+    data = {name: SLOPE * TRUTH + NOISE * rng.standard_normal(SLOPE.size) for name in ("one", "two")}
+    rows = [f"uniaxial,{name},{x},{y}" for name, stress in data.items() for x, y in zip(STRETCH, stress, strict=True)]
+    (folder / "curve.csv").write_text("\n".join(["mode,specimen,stretch,stress", *rows]))
+    (folder / "select.toml").write_text(SELECT.format(PRIOR, NOISE))
+    assert run(load(folder / "select.toml"), "select", folder / "results", quiet=True, report=False) in (0, 3)
+    return folder, data
+
+
+def chain(folder, source, method):
+    """The study that predicts with a posterior."""
+    (folder / "drawn_model.py").write_text("def value(p):\n    return [3 * p[0] + 7, p[1] - p[0]]\n")
+    text = f"""
+[model]
+kind = "python"
+function = "drawn_model.value"
+parameters = {{ C1 = 1.0, C2 = 0.0, other = 1.0 }}
+outputs = [{{ name = "up", unit = "m" }}, {{ name = "between", unit = "m" }}]
+[parameters]
+from = {source}
+[method]
+{method}
+"""
+    (folder / "chain.toml").write_text(text)
+    return load(folder / "chain.toml")
+
+
+@pytest.mark.parametrize(
+    "method", ['kind = "monte-carlo"\nsamples = 400', 'kind = "chaos"\nsamples = 20\nquantiles = []']
+)
+def test_a_linear_normal_chain_equals_the_closed_form(selected, tmp_path, monkeypatch, method):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    folder, data = selected
+    source = f'{{ file = "{folder / "results"}", group = "two", model = "neo-hookean" }}'
+    study = chain(tmp_path, source, method)
+    assert study.draws.names == ("C1",)
+    precision = 1 / PRIOR[1] ** 2 + SLOPE @ SLOPE / NOISE**2
+    mean = (PRIOR[0] / PRIOR[1] ** 2 + SLOPE @ data["two"] / NOISE**2) / precision
+    found = study.run()
+    for name, right in (("mean", 3 * mean + 7), ("std", 3 / np.sqrt(precision))):
+        error = float(found[f"{name}_error"][0])
+        assert abs(float(found[name][0]) - right) < 4 * error
+        assert error < 0.3 * 3 / np.sqrt(precision)
+
+
+def test_the_best_candidate_is_taken(selected, tmp_path):
+    folder, _ = selected
+    source = f'{{ file = "{folder / "results"}", group = "one", model = "best", names = {{ C1 = "C1" }} }}'
+    with xr.open_dataset(folder / "results" / "results.nc") as found:
+        best = str(found.model[int(found["probability"].argmax())].item())
+        assert best == "neo-hookean"
+        weights = found["point_weight"].sel(model=best, group="one").to_numpy()
+        points = found["point"].sel(model=best, group="one", parameter="C1").to_numpy()
+    draws = chain(tmp_path, source, 'kind = "monte-carlo"\nsamples = 4').draws
+    assert float(draws.weights @ draws.values[:, 0]) == pytest.approx(np.nansum(weights * points) / np.nansum(weights))
+
+
+@pytest.mark.parametrize(
+    ("block", "said"),
+    [
+        ('model = "best"', "has several groups, expected group = one of: one, two"),
+        ('group = "one"', "has several models, expected model = one of: neo-hookean, mooney-rivlin"),
+        ('group = "on", model = "best"', "group = 'on' is not in"),
+        ('group = "one", model = "mooney"', "model = 'mooney' is not in"),
+    ],
+)
+def test_what_a_comparison_does_not_hold(selected, tmp_path, block, said):
+    folder, _ = selected
+    with pytest.raises(StudyError) as error:
+        chain(tmp_path, f'{{ file = "{folder / "results"}", {block} }}', 'kind = "monte-carlo"\nsamples = 4')
+    assert len(error.value.args) == 1
+    assert error.value.args[0].startswith("parameters.from: ")
+    assert said in error.value.args[0]
+
+
+def test_constants_of_another_material_are_refused(selected):
+    folder, _ = selected
+    source = {"file": str(folder / "results"), "group": "one", "model": "neo-hookean"}
+    with pytest.raises(StudyError, match=r"^model\.material\.kind: constants are of the material 'neo-hookean' in"):
+        parse(BODY | {"parameters": {"from": source}})
+    named = source | {"names": {"material.C1": "C1"}}
+    assert parse(BODY | {"parameters": {"from": named}}).draws.names == ("material.C1",)

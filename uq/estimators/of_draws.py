@@ -1,0 +1,125 @@
+"""What estimates err because the draws that stand for a distribution are few.
+
+Methods integrate over the draws themselves, and their errors are those of that. A mean over a distribution of which N
+draws are worth n_e independent ones errs by σ_d/√n_e beside, σ_d² = Var E[ψ | draws] the part of the variance that
+comes from them, the standard deviation σ by σ_d √((κ − 1)/n_e)/2 with the kurtosis κ, and a quantile as one of n_e
+samples. Where parameters have distributions of their own too, σ_d² is at most what these do not explain linearly.
+
+Monte Carlo that takes n of N draws of equal weight, each once, has samples of the distribution: of N that are worth as
+many nothing is added up to n = N.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.model import Finding, FloatArray
+from uq.estimators.moments import quantiles_worth
+from uq.findings import add
+from uq.inputs.random_parameters import Inputs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FEW = 100.0  # independent draws below which a finding says so
+SHARE = 0.5  # of the square of an error, from which draws decide it
+
+
+def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) -> xr.Dataset:
+    """Add to standard errors what draws are responsible for, and say where that is most of them.
+
+    Parameters
+    ----------
+    dataset
+        Results of a method.
+    inputs
+        The parameters, some of them given by draws.
+    in_turn
+        Number of samples that took the draws in turn; 0 where draws come by chance.
+    """
+    draws = inputs.draws
+    if draws is None or "mean_error" not in dataset or "values" not in dataset or "row" in dataset.dims:
+        return dataset
+    taken = max(in_turn, len(draws.values)) if in_turn and draws.equal else np.inf
+    left = max(1 / draws.effective - 1 / taken, 0.0)
+    ok = dataset["ok"].to_numpy()
+    values, points = dataset["values"].to_numpy()[ok], dataset["points"].to_numpy()[ok]
+    share = _share(inputs, points, values)
+    std = dataset["std"].to_numpy()
+    added = {
+        "mean_error": std * np.sqrt(share * left),
+        "std_error": std * np.sqrt(share * (_kurtosis(values) - 1) * left) / 2,
+    }
+    dominated = []
+    for name, error in added.items():
+        known = dataset[name].to_numpy()
+        dataset = dataset.assign(
+            {name: (("output",), np.hypot(known, error)), f"{name}_of_draws": (("output",), error)}
+        )
+        dominated.append((error**2 > SHARE * (known**2 + error**2)) & (error > 0))
+    if "quantiles" in dataset and left > 0:
+        dataset = dataset.assign(_quantiles(dataset, values, share, 1 / left))
+    if "field_mean_error" in dataset:
+        whole = float(share.max(initial=0.0)) * left
+        spread = dataset["field_std"].to_numpy()
+        for name, error in (("mean", spread * np.sqrt(whole)), ("std", spread * np.sqrt(whole / 2))):
+            whole_error = np.hypot(dataset[f"field_{name}_error"].to_numpy(), error)
+            dataset = dataset.assign({f"field_{name}_error": (("node", "component"), whole_error)})
+    outputs = [str(one) for one, few in zip(dataset["output"].values, dominated[0], strict=True) if few]
+    if outputs:
+        text = (
+            f"The draws are worth {draws.effective:,.0f} independent ones, which decides the error of the mean of "
+            f"{', '.join(outputs)}: more draws reduce it, more samples hardly."
+        )
+        add(dataset, Finding("note", text))
+    return dataset
+
+
+def findings_of_source(inputs: Inputs) -> Iterator[Finding]:
+    """Say that draws are worth few."""
+    draws = inputs.draws
+    if draws is not None and draws.effective < FEW:
+        yield Finding(
+            "warning",
+            f"The {len(draws.values):,} draws of {', '.join(draws.names)} are worth {draws.effective:.0f} independent "
+            f"ones, fewer than {FEW:.0f}: errors count that, but tails of the distribution are hardly known. More "
+            "solves in the study that they come from, or a longer chain, help.",
+        )
+
+
+def _share(inputs: Inputs, points: FloatArray, values: FloatArray) -> FloatArray:
+    """Largest share (m,) of the variances of values (n, m) that may come from draws."""
+    own = inputs.joint.start
+    if not own or len(points) < 4 * (own + 1):
+        return np.ones(values.shape[1])
+    t = inputs.coordinates.of(points)[:, :own]
+    columns = np.column_stack([np.ones(len(t)), t])
+    left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+    variance = values.var(axis=0)
+    return np.where(variance > 0, left.var(axis=0) / np.where(variance > 0, variance, 1.0), 0.0)
+
+
+def _kurtosis(values: FloatArray) -> FloatArray:
+    deviations = values - values.mean(axis=0)
+    variance = (deviations**2).mean(axis=0)
+    varies = variance > 0
+    return np.where(varies, (deviations**4).mean(axis=0) / np.where(varies, variance, 1.0) ** 2, 3.0)
+
+
+def _quantiles(dataset: xr.Dataset, values: FloatArray, share: FloatArray, worth: float) -> dict[str, object]:
+    """Intervals of quantiles, wider by those of as many independent samples as the draws are worth."""
+    probabilities = dataset["quantile"].to_numpy()
+    of_draws = quantiles_worth(values, tuple(probabilities), worth)
+    central = dataset["quantiles"].to_numpy()
+    lower = np.hypot(
+        central - dataset["quantiles_lower"].to_numpy(), np.sqrt(share) * (of_draws.central - of_draws.lower)
+    )
+    upper = np.hypot(
+        dataset["quantiles_upper"].to_numpy() - central, np.sqrt(share) * (of_draws.upper - of_draws.central)
+    )
+    error = np.hypot(dataset["quantiles_error"].to_numpy(), np.sqrt(share) * of_draws.error)
+    found = {"quantiles_lower": central - lower, "quantiles_upper": central + upper, "quantiles_error": error}
+    return {name: (("quantile", "output"), one) for name, one in found.items()}

@@ -1,0 +1,64 @@
+"""The block `parameters.from`: numbers of the model whose distribution is known by draws, as from a calibration."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field, model_validator
+
+from forward.registry import named
+from forward.settings import Settings
+
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
+
+KEPT = "draws.npz"  # beside study.toml: the draws as they were read
+READER = "workflows.studies.posteriors"  # reads files of draws, once a study names one
+
+
+class Source(Settings):
+    """Draws of numbers of the model, which take the place of distributions.
+
+    Parameters
+    ----------
+    file
+        The results directory of a study of kind ``select`` or ``invert``, or a table of draws: CSV with a column for
+        each number, or netCDF with a group ``posterior`` (ArviZ) or a variable for each.
+    group
+        The group of data of ``select``, or the data set of ``invert``; may be left out if there is only one.
+    model
+        The candidate of ``select``: its name, or "best", the most probable one.
+    names
+        Names in the source by the paths of numbers of the model, where they differ. Without it every name of the source
+        is looked for among the paths: as it is, or as the end of a path, if only one ends so. With it, only
+        these are taken.
+    digest
+        Hash of the file, filled in when it is read: an interrupted study is not continued with other draws.
+    """
+
+    file: str = Field(min_length=1)
+    group: str | None = None
+    model: str | None = None
+    names: dict[str, str] = Field(default={})
+    digest: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_text(cls, value: Any) -> Any:
+        return {"file": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _read(self) -> Source:
+        found = self.drawn.digest
+        if self.digest and found != self.digest:
+            message = f"{self.file} has changed since the study was begun: hash {self.digest} → {found}"
+            raise ValueError(message)
+        object.__setattr__(self, "digest", found)
+        return self
+
+    @cached_property
+    def drawn(self) -> Draws:
+        """The draws, by their names in the source; a ValueError says what is wrong with it."""
+        found: Draws = named(f"{READER}:read")(self.file, self.group, self.model)
+        return found

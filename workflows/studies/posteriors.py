@@ -1,0 +1,289 @@
+"""Posteriors that `select` and `invert` have left as draws of numbers of another model."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import Finding
+from forward.settings import nearest
+from inverse.low_dimensional.posterior import NOISE
+from uq.evaluation.hdf5 import variables
+from uq.inputs.draws import Draws
+from workflows.config.priors import findings_of_impossible
+from workflows.config.source import KEPT
+from workflows.studies.tables_of_draws import of_table
+
+if TYPE_CHECKING:
+    from forward.scalars import Mistake, Scalar
+    from forward.spec import ModelSpec
+    from workflows.config.source import Source
+    from workflows.studies.sampling import Study
+
+Arrays = Mapping[str, Any]
+LETTERS = 16  # of a hash
+BEST, AVERAGED = "best", "averaged"
+
+
+def read(file: str, group: str | None, model: str | None) -> Draws:
+    """Read draws by their names in a source.
+
+    Raises
+    ------
+    ValueError
+        If it is not there, unfinished, of another kind, without draws, or ambiguous: one line.
+    """
+    path = Path(file)
+    if path.name == KEPT:
+        return _kept(path)
+    if path.name == "results.nc" and (path.parent / "summary.json").exists():
+        path = path.parent
+    try:
+        if path.is_dir():
+            return _of_results(path, group, model)
+        if not path.exists():
+            message = f"{path}: is not there, expected a results directory of 'select' or 'invert', or a table of draws"
+            raise ValueError(message)
+        for what, value in (("group", group), ("model", model)):
+            if value is not None:
+                message = f"{what} = '{value}', but {path.name} is a table of draws, which has no {what}s"
+                raise ValueError(message)
+        return of_table(path, sha256(path.read_bytes()).hexdigest()[:LETTERS])
+    except OSError as error:
+        message = f"{path}: cannot be read: {error.strerror or error}"
+        raise ValueError(message) from None
+
+
+def to_file(draws: Draws) -> bytes:
+    """Return the content of a file of draws."""
+    file = io.BytesIO()
+    np.savez(
+        file,
+        names=np.array(draws.names),
+        values=draws.values,
+        weights=draws.weights,
+        effective=draws.effective,
+        digest=draws.digest,
+    )
+    return file.getvalue()
+
+
+def _kept(path: Path) -> Draws:
+    try:
+        with np.load(path) as found:
+            names, digest = tuple(map(str, found["names"])), str(found["digest"])
+            return Draws(names, found["values"], found["weights"], float(found["effective"]), digest)
+    except (OSError, KeyError, ValueError) as error:
+        message = f"{path}: cannot be read: {error}"
+        raise ValueError(message) from None
+
+
+# --- results of tissuq ---------------------------------------------------------------------------------------------
+
+
+def _of_results(path: Path, group: str | None, model: str | None) -> Draws:
+    try:
+        summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        begun = (path / "study.toml").exists()
+        what = "holds an unfinished study" if begun else "holds no results"
+        message = f"{path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
+        raise ValueError(message) from None
+    kind = summary.get("method")
+    if kind not in ("select", "invert"):
+        message = f"{path}: is a study of kind '{kind}', which has no posterior, expected 'select' or 'invert'"
+        raise ValueError(message)
+    content = (path / "results.nc").read_bytes()
+    found = {name: one.values for name, one in variables(content)[0].items()}
+    digest = sha256(content).hexdigest()[:LETTERS]
+    return (_selected if kind == "select" else _inverted)(path, found, group, model, digest)
+
+
+def _texts(found: Arrays, name: str) -> list[str]:
+    return [str(one) for one in np.atleast_1d(found[name])]
+
+
+def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> int:
+    if given is None and len(known) > 1:
+        message = f"{path}: has several {what}s, expected {what} = one of: {', '.join(known)}"
+        raise ValueError(message)
+    if given is not None and given not in known:
+        message = f"{what} = '{given}' is not in {path}; {nearest(given, list(known))}"
+        raise ValueError(message)
+    return 0 if given is None else known.index(given)
+
+
+def _selected(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+    """Weighted points of one candidate in one group of data."""
+    models, parameters = _texts(found, "model"), _texts(found, "parameter")
+    if model == AVERAGED:
+        message = (
+            f"model = 'averaged': candidates of {path} have numbers of their own, expected "
+            f"'best' or one of: {', '.join(models)}; `[average]` predicts with all of them"
+        )
+        raise ValueError(message)
+    k = int(np.nanargmax(found["probability"])) if model == BEST else _chosen("model", model, models, path)
+    g = _chosen("group", group, _texts(found, "group"), path)
+    weights = np.nan_to_num(found["point_weight"][k, g])
+    values = found["point"][k, g]
+    here = np.isfinite(values).any(axis=0) & (np.array(parameters) != NOISE)
+    some = weights > 0
+    if not some.any() or not here.any():
+        message = f"{path}: candidate '{models[k]}' has no draws, as its evidence was not found"
+        raise ValueError(message)
+    names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
+    weights = weights[some] / weights[some].sum()
+    return Draws(names, values[some][:, here], weights, float(1 / (weights**2).sum()), digest)
+
+
+def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+    """Draws of the posterior of one data set."""
+    if model is not None:
+        message = f"model = '{model}', but {path} is an inversion, which has one model"
+        raise ValueError(message)
+    if "draw" not in found:
+        message = f"{path}: is an inversion of a field, which has no draws of numbers, expected one with few parameters"
+        raise ValueError(message)
+    k = _chosen("group", group, _texts(found, "data_set"), path)
+    parameters = _texts(found, "parameter")
+    values = np.asarray(found["draw"])
+    values = values[k] if values.ndim == 3 else values
+    whole = np.isfinite(values).all(axis=1)
+    here = np.array([name != NOISE for name in parameters])
+    if not whole.any() or not bool(np.atleast_1d(found["ok"])[k]):
+        message = f"{path}: has no draws of that data set, which could not be inverted"
+        raise ValueError(message)
+    values = values[whole][:, here]
+    chains = int(np.nan_to_num(np.atleast_1d(found["chains"])[k])) if "chains" in found else 0
+    worth = float(np.atleast_1d(found["chain_effective" if chains else "effective"])[k])
+    names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
+    weights = np.full(len(values), 1 / len(values))
+    return Draws(names, values, weights, min(len(values), worth) if worth > 0 else len(values), digest)
+
+
+# --- numbers of the model --------------------------------------------------------------------------------------------
+
+
+def mapped(source: Source, scalars: Mapping[str, Scalar]) -> dict[str, str]:
+    """Return names in the source by paths of numbers of the model; those that do not fit are left out."""
+    drawn = source.drawn.names
+    if source.names:
+        return {path: name for path, name in source.names.items() if path in scalars and name in drawn}
+    found = {}
+    for name in drawn:
+        ends = [path for path in scalars if path == name or path.endswith(f".{name}")]
+        if name in scalars or len(ends) == 1:
+            found[name if name in scalars else ends[0]] = name
+    return found
+
+
+def mistakes(source: Source, model: ModelSpec, own: Sequence[str]) -> Iterator[Mistake]:
+    """Find what does not fit the model, and numbers that have a distribution of their own too."""
+    drawn, place, scalars = source.drawn.names, ("parameters", "from"), model.scalars
+    found, clean = mapped(source, scalars), True
+    for path, name in source.names.items():
+        if path not in scalars:
+            clean = False
+            yield (*place, "names"), f"'{path}' is not a number of the model; {nearest(path, tuple(scalars))}", path
+        if name not in drawn:
+            clean = False
+            yield (*place, "names"), f"'{name}' is not in {source.file}; {nearest(name, list(drawn))}", name
+    for name in drawn if not source.names else ():
+        if name not in found.values():
+            clean = False
+            ends = [path for path in scalars if path.endswith(f".{name}")]
+            near = f"expected one of: {', '.join(ends)}" if ends else nearest(name, tuple(scalars))
+            message = (
+                f"'{name}' of {source.file} is not a number of the model; {near}; with names = {{ PATH = NAME }} "
+                "only the names in it are taken"
+            )
+            yield place, message, name
+    for path in found:
+        if path in own:
+            clean = False
+            yield (
+                ("parameters", path),
+                f"has a distribution, and is in {source.file} too, expected only one of them",
+                path,
+            )
+    material, mine = material_of(source), getattr(model, "material", None)
+    if material and mine is not None and material.get("kind") != mine.kind and not source.names:
+        clean = False
+        message = f"constants are of the material '{material.get('kind')}' in {source.file}, expected it in the model"
+        yield ("model", "material", "kind"), message, mine.kind
+    if clean:
+        try:
+            draws_of(source, scalars)
+        except ValueError as error:
+            yield place, str(error), source.file
+
+
+def findings(study: Study, source: Source) -> Iterator[Finding]:
+    """Find what the draws say before anything is solved."""
+    from uq.estimators.of_draws import findings_of_source
+
+    inputs, scalars = study.inputs, study.spec.scalars
+    yield from findings_of_source(inputs)
+    materials = study.spec.materials(study.given)
+    if inputs.draws is not None:
+        yield from findings_of_impossible(scalars, inputs.draws, () if materials is None else materials.names)
+    material, mine = material_of(source), getattr(study.model, "material", None)
+    if material and mine is not None:
+        fixed = {
+            name: float(v)
+            for name, v in material.items()
+            if isinstance(v, int | float) and name not in source.drawn.names
+        }
+        here = mine.model_dump()
+        other = [
+            f"{name} = {here[name]:g}, there {v:g}" for name, v in fixed.items() if name in here and here[name] != v
+        ]
+        if other:
+            text = f"Constants are not those with which {source.file} was calibrated: {'; '.join(other)}."
+            yield Finding("warning", text)
+
+
+def material_of(source: Source) -> dict[str, Any]:
+    """Return the block of the material that was calibrated, as far as it is known."""
+    path = Path(source.file)
+    path = path.parent if path.name == "results.nc" else path
+    if not path.is_dir():
+        return {}
+    found, attributes = variables((path / "results.nc").read_bytes())
+    config = tomllib.loads(str(attributes["config"]))
+    if "candidates" not in config:
+        chosen = config.get("model", {})
+    else:
+        name = source.model
+        if name in (None, BEST):
+            name = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
+        candidate = config["candidates"].get(name, {})
+        chosen = {**config.get("model", {}), **candidate.get("model", candidate)}
+    material = chosen.get("material", {})
+    return dict(material) if isinstance(material, dict) else {}
+
+
+def draws_of(source: Source, scalars: Mapping[str, Scalar]) -> Draws | None:
+    """Return the draws by paths of numbers of the model; None if there are none.
+
+    Raises
+    ------
+    ValueError
+        If they are no distribution: too few, constant, or linearly dependent.
+    """
+    found, drawn = mapped(source, scalars), source.drawn
+    if not found:
+        return None
+    columns = [drawn.names.index(name) for name in found.values()]
+    chosen = Draws(tuple(found), drawn.values[:, columns], drawn.weights, drawn.effective, drawn.digest)
+    objection = chosen.objection()
+    if objection is not None:
+        raise ValueError(objection)
+    return chosen

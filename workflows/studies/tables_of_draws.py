@@ -1,0 +1,165 @@
+"""Tables of draws of other programs: CSV, netCDF, and ArviZ's netCDF (PyMC, Stan, emcee)."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from forward.model import FloatArray
+from inverse.data.table import DataError, read_table
+from inverse.low_dimensional.posterior import NOISE
+from uq.evaluation.hdf5 import Variable, variables
+from uq.inputs.draws import Draws
+
+Columns = dict[str, FloatArray]
+WEIGHTS = ("weight", "weights")
+LOG_WEIGHTS = ("log_weight", "log_weights")
+# What programs write beside parameters (with everything that ends in two underscores, as Stan's).
+BESIDE = {
+    *("chain", "draw", "iteration", "walker", "sample"),
+    *("lp", "log_prob", "log_posterior", "log_likelihood", "log_prior"),
+}
+
+
+def of_table(path: Path, digest: str) -> Draws:
+    """Read draws by the names of columns or variables; a column `weight` or `log_weight` is their weight.
+
+    Raises
+    ------
+    ValueError
+        If it is no table of draws: one line.
+    OSError
+        If it cannot be read.
+    """
+    columns, chains = _netcdf(path) if path.suffix.lower() in {".nc", ".netcdf", ".h5"} else _table(path)
+    return _of_columns(path.name, columns, chains, digest)
+
+
+def _table(path: Path) -> tuple[Columns, FloatArray | None]:
+    try:
+        table = read_table(path)
+    except DataError as error:
+        raise ValueError(str(error.args[0])) from None
+    columns: Columns = {}
+    for name in table.columns:
+        cells = [row[name] for row in table.rows]
+        try:
+            columns[name] = np.array([float(cell) for cell in cells])
+        except ValueError:
+            if _beside(name):
+                continue
+            n = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            message = f"{path.name}: line {table.lines[n]}: '{cells[n]}' in column '{name}', expected a number"
+            raise ValueError(message) from None
+    return columns, columns.get("chain", columns.get("chain__"))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _netcdf(path: Path) -> tuple[Columns, FloatArray | None]:
+    """Columns of variables with the dimensions chain and draw, or all with the same first dimension."""
+    content = path.read_bytes()
+    if content[:3] == b"CDF":
+        from scipy.io import netcdf_file
+
+        with netcdf_file(io.BytesIO(content), mmap=False) as file:
+            found = {name: Variable(one.data.copy(), one.dimensions) for name, one in file.variables.items()}
+    else:
+        try:
+            found = variables(content, "posterior")[0]
+        except OSError:
+            message = f"{path.name}: is no netCDF file"
+            raise ValueError(message) from None
+    columns: Columns = {}
+    chains = None
+    for name, one in found.items():
+        values, dims = np.asarray(one.values), one.dims
+        if not dims or name in dims or values.dtype.kind not in "fiu":
+            continue
+        if dims[:2] == ("chain", "draw"):
+            chains = np.repeat(np.arange(values.shape[0]), values.shape[1])
+            values, dims = values.reshape(-1, *values.shape[2:]), dims[1:]
+        for place, index in enumerate(np.ndindex(values.shape[1:])):
+            labels = [_label(found, dim, i) for dim, i in zip(dims[1:], index, strict=True)]
+            columns[name + (f"[{','.join(labels)}]" if labels else "")] = values.reshape(len(values), -1)[
+                :, place
+            ].astype(float)
+    if not columns:
+        message = f"{path.name}: has no draws, expected a group 'posterior' with dimensions chain and draw, or columns"
+        raise ValueError(message)
+    if len({len(one) for one in columns.values()}) > 1:
+        message = f"{path.name}: its variables have different numbers of draws, expected the same of each"
+        raise ValueError(message)
+    return columns, chains
+
+
+def _label(found: dict[str, Variable], dim: str, i: int) -> str:
+    """Name a place along a dimension: by its text, if it has one."""
+    labels = np.asarray(found[dim].values if dim in found else ())
+    return str(labels[i]) if labels.dtype.kind in "OSU" and len(labels) > i else str(i)
+
+
+def _beside(name: str) -> bool:
+    return name.lower() in {*BESIDE, *WEIGHTS, *LOG_WEIGHTS, NOISE} or name.endswith("__") or not name
+
+
+def _of_columns(name: str, columns: Columns, chains: FloatArray | None, digest: str) -> Draws:
+    """Draws from columns (N,), with the weights among them."""
+    names = tuple(one for one in columns if not _beside(one))
+    if not names:
+        message = f"{name}: has columns {', '.join(columns)}, expected one for each parameter"
+        raise ValueError(message)
+    values = np.column_stack([columns[one] for one in names])
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0]
+        message = f"{name}: draw {row + 1} of '{names[column]}' is {values[row, column]}, expected numbers"
+        raise ValueError(message)
+    weights = np.ones(len(values))
+    for one in columns:
+        if one.lower() in WEIGHTS:
+            weights = columns[one]
+        elif one.lower() in LOG_WEIGHTS:
+            weights = np.exp(columns[one] - columns[one].max())
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+        message = f"{name}: weights are negative, infinite or all zero, expected numbers ≥ 0"
+        raise ValueError(message)
+    weights = weights / weights.sum()
+    worth = 1 / float((weights**2).sum())
+    if np.ptp(weights) == 0:
+        worth = min(worth, *(effective(column, chains) for column in values.T))
+    return Draws(names, values, weights, worth, digest)
+
+
+def effective(values: FloatArray, chains: FloatArray | None = None) -> float:
+    """Return the number of independent draws that draws (N,) of chains (N,) are worth for their mean.
+
+    N/(1 + 2 Σ ρ_t), summed over pairs of autocorrelations as long as these are positive and no larger than before
+    (C. J. Geyer, Stat. Sci. 7 (1992) 473–483). Without chains the draws are those of one, in their order.
+    """
+    parts = [values] if chains is None else [values[chains == one] for one in np.unique(chains)]
+    worth = 0.0
+    for part in parts:
+        n = len(part)
+        deviations = part - values.mean()
+        power = np.abs(np.fft.rfft(deviations, 2 * n)) ** 2
+        products = np.fft.irfft(power)[:n] / n
+        if products[0] <= 0:
+            worth += 1.0
+            continue
+        rho = products / products[0]
+        if abs(rho[1]) < 2 / np.sqrt(n):  # as of independent draws
+            worth += n
+            continue
+        pairs = rho[: n - n % 2].reshape(-1, 2).sum(axis=1)
+        ends = np.flatnonzero(pairs <= 0)
+        pairs = np.minimum.accumulate(pairs[: ends[0] if ends.size else None])
+        worth += n / max(2 * pairs.sum() - 1, 1 / np.log10(max(n, 10)))
+    return float(min(worth, len(values)))
