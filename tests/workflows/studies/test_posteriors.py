@@ -434,3 +434,62 @@ def test_constants_of_another_material_are_refused(selected):
         parse(BODY | {"parameters": {"from": source}})
     named = source | {"names": {"material.C1": "C1"}}
     assert parse(BODY | {"parameters": {"from": named}}).draws.names == ("material.C1",)
+
+
+INVERT = """
+[model]
+kind = "python"
+function = "drawn_model.value"
+jacobian = "drawn_model.slopes"
+parameters = { a = 1.0, b = -1.0 }
+outputs = [{ name = "u", unit = "m" }, "v"]
+[parameters]
+a = { kind = "normal", mean = 1.0, std = 0.5 }
+b = { kind = "normal", mean = -1.0, std = 2.0 }
+[data]
+outputs = { u = 0.4, v = 0.3 }
+noise = { absolute = 0.3 }
+[method]
+kind = "invert"
+samples = 64
+starts = 1
+draws = 800
+"""
+
+
+def test_draws_of_an_inversion_keep_their_dependence(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    (tmp_path / "drawn_model.py").write_text(
+        "def value(p):\n    return [p[0] + 2 * p[1], p[0] / 2 - p[1]]\n"
+        "def slopes(p):\n    return [[1.0, 2.0], [0.5, -1.0]]\n"
+        "def other(p):\n    return [p[0] + p[1], p[0] - p[1]]\n"
+    )
+    (tmp_path / "invert.toml").write_text(INVERT)
+    assert run(load(tmp_path / "invert.toml"), "invert", tmp_path / "posterior", quiet=True, report=False) == 0
+    predict = INVERT.replace(".value", ".other").replace('jacobian = "drawn_model.slopes"', "").split("[parameters]")[0]
+    (tmp_path / "predict.toml").write_text(
+        predict
+        + '[parameters]\nfrom = "posterior"\n[method]\nkind = "quasi-monte-carlo"\ncontrol = "none"\nsamples = 512\n'
+    )
+    study = load(tmp_path / "predict.toml")
+    assert study.draws.names == ("a", "b")
+    assert study.draws.effective <= 800
+    found = study.run()
+    A, C = np.array([[1, 2], [0.5, -1]]), np.array([[1, 1], [1, -1]])
+    covariance = np.linalg.inv(np.diag([4.0, 0.25]) + A.T @ A / 0.09)
+    mean = covariance @ (A.T @ [0.4, 0.3] / 0.09 + [4.0, -0.25])
+    for name, right in (("mean", C @ mean), ("std", np.sqrt(np.diag(C @ covariance @ C.T)))):
+        assert (np.abs(found[name] - right) < 4 * found[f"{name}_error"]).all(), (found[name], right)
+        assert (found[f"{name}_error"] < 0.2 * np.sqrt(np.diag(C @ covariance @ C.T))).all()
+    for block, said in (
+        ('group = "x"', "group = 'x' is not in"),
+        ('model = "best"', "is an inversion, which has one model"),
+    ):
+        text = (
+            (tmp_path / "predict.toml")
+            .read_text()
+            .replace('from = "posterior"', f'from = {{ file = "posterior", {block} }}')
+        )
+        (tmp_path / "other.toml").write_text(text)
+        assert said in mistake(tmp_path / "other.toml")
