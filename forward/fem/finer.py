@@ -72,7 +72,7 @@ def share(spec: AnyBody) -> float:
     """Return what the finer mesh still misses, over its difference from the coarser one."""
     if isinstance(spec.body, MeshFile):
         return OF_LINEAR if spec.body.degree == 1 else HALVED
-    if spec.fields:
+    if spec.fields or (_touched(spec) and spec.body.degree == 2):
         return HALVED
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
     times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
