@@ -143,12 +143,13 @@ class MeshFile(Settings):
 
     Boundaries and regions are gmsh's physical groups by their names; in other formats, and where a group has no name,
     the numbers that an array of the cells gives to triangles or quadrilaterals (boundaries) and to cells (regions).
-    A triangle may be in several groups, a cell in only one.
+    A triangle may be in several groups, a cell in only one. In files of Abaqus, sets of elements are regions, and sets
+    of nodes boundaries: the faces of the surface all of whose nodes are in the set.
 
     Parameters
     ----------
     file
-        The file (.msh, .xdmf, .vtk, .vtu, or whatever else meshio reads), beside the study.
+        The file (.msh, .xdmf, .vtk, .vtu, Abaqus's .inp, or whatever else meshio reads), beside the study.
     unit
         Length (m) of one unit of its coordinates: 1e-3 for millimetres.
     degree
@@ -318,12 +319,8 @@ class MeshFile(Settings):
         """Return the places (n, 3) of the undeformed body that are nearest to points (n, 3) in or beside it (m)."""
         mesh = self.load()
         tetrahedra = mesh.points[mesh.cells[:, _TETRAHEDRA[mesh.cell]].reshape(-1, 4)]
-        faces = mesh.cells[:, _FACES[mesh.cell]].reshape(-1, len(_FACES[mesh.cell][0]))
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        outer = faces[first[count == 1]]
-        triangles = mesh.points[
-            np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
-        ]
+        outer = self.surface
+        triangles = np.concatenate([outer[:, [0, *pair]] for pair in ((1, 2), (2, 3))[: outer.shape[1] - 2]])
         lows, highs = tetrahedra.min(axis=1), tetrahedra.max(axis=1)
         slack = CLOSE * max(high - low for low, high in self.bounds)
         found = np.array(points, dtype=float)
@@ -336,6 +333,14 @@ class MeshFile(Settings):
             places = nearest_of(triangles, point)
             found[i] = places[((places - point) ** 2).sum(axis=1).argmin()]
         return found
+
+    @property
+    def surface(self) -> FloatArray:
+        """Corners (n, 3 or 4, 3) of all faces that belong to one cell (m)."""
+        mesh = self.load()
+        faces = mesh.cells[:, _FACES[mesh.cell]].reshape(-1, len(_FACES[mesh.cell][0]))
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return np.asarray(mesh.points[faces[first[count == 1]]])
 
     def corners_of(self, boundary: str) -> list[Point]:
         """Points (m) that span a boundary."""
@@ -397,7 +402,7 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     printed = StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(StringIO()):  # meshio prints empty lines, and what is wrong
-            mesh = meshio.read(file)
+            mesh = _with_groups(meshio.read(file)) if file.endswith(".inp") else meshio.read(file)
     except SystemExit:
         said = (printed.getvalue().strip().splitlines() or [f"it is no {Path(file).suffix} file that meshio reads"])[0]
         refuse(f"cannot be read as a mesh: {said}{', try .vtu' if file.endswith('.vtk') else ''}")
@@ -440,6 +445,58 @@ def _load(file: str, digest: str, unit: float, names: tuple[tuple[str, int], ...
     present = np.unique(region_numbers)
     regions = tuple(words.get((3, int(n)), ALL if len(present) == 1 and not n else f"{n}") for n in present)
     return Loaded(points, cells, cell, boundaries, regions, np.searchsorted(present, region_numbers))
+
+
+def _with_groups(mesh: meshio.Mesh) -> meshio.Mesh:
+    """Return a mesh of Abaqus with its sets as groups: those of solid elements regions, those of nodes boundaries.
+
+    A boundary has the faces of the surface all of whose nodes are in a set. Sets of all elements, beside others, are
+    no regions, and elements in no set are the region "body".
+    """
+    import meshio
+
+    solid = [i for i, block in enumerate(mesh.cells) if block.type in _MESHIO]
+    kinds = {_MESHIO[mesh.cells[i].type] for i in solid}
+    if len(kinds) != 1:  # which is refused elsewhere
+        return mesh
+    (cell,) = kinds
+    cells = np.concatenate([mesh.cells[i].data for i in solid])
+    members = {}
+    for name, parts in mesh.cell_sets.items():
+        inside = [np.isin(np.arange(len(mesh.cells[i].data)), parts[i]) for i in solid if parts[i] is not None]
+        if len(inside) == len(solid) and np.concatenate(inside).any():
+            members[name] = np.concatenate(inside)
+    some = {name: member for name, member in members.items() if not member.all()}
+    members = some or dict(list(members.items())[:1])
+    faces = cells[:, _FACES[cell]].reshape(-1, len(_FACES[cell][0]))
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = faces[first[count == 1]]
+    groups = {
+        f"{name}-nodes" if name in members else name: found
+        for name, nodes in mesh.point_sets.items()
+        if (found := np.isin(outer, nodes).all(axis=1)).any()
+    }
+    if groups:
+        outer = outer[np.any(list(groups.values()), axis=0)]
+    numbers = np.zeros(len(cells), dtype=np.int64)
+    for number, member in enumerate(members.values(), start=1):
+        numbers[member] = number
+    of_faces = np.zeros(len(outer), dtype=np.int64)
+    nothing = np.zeros(0, dtype=np.int64)
+    beside, titles = {}, {ALL: np.array([0, 3])} | {name: np.array([k, 3]) for k, name in enumerate(members, start=1)}
+    for number, (name, found) in enumerate(groups.items(), start=1):
+        member = found[np.any(list(groups.values()), axis=0)]
+        of_faces[member] = number
+        beside[name], titles[name] = [nothing, np.flatnonzero(member)], np.array([number, 2])
+    within = {name: [np.flatnonzero(member), nothing] for name, member in members.items()}
+    shape = mesh.cells[solid[0]].type
+    return meshio.Mesh(
+        mesh.points,
+        [(shape, cells), (_SURFACES[cell], outer)],
+        cell_data={_TAGS[0]: [numbers, of_faces]},
+        field_data=titles,
+        cell_sets=within | beside,
+    )
 
 
 def _of_ours(file: str, unit: float, refuse: Any) -> Loaded:

@@ -1,13 +1,16 @@
-"""Facets of named boundaries as arrays, for what is checked before a body is meshed."""
+"""The surface of a body as arrays, for what is looked at before it is meshed: facets of boundaries, nearest places."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
-from forward.bodies.mesh_file import MeshFile
+from forward.bodies.mesh_file import MeshFile, nearest_of
 from forward.model import FloatArray
 
+NEAREST = 4  # triangles that are tried first
+AT_ONCE = 200_000  # pairs of a point and a triangle
 FINE = 12  # parts of the edge of a facet at which it is looked at closely
 
 
@@ -64,3 +67,54 @@ def _pierced(corners: FloatArray, start: FloatArray, along: FloatArray) -> Float
     s, t, far = np.linalg.solve(sides[steep], (start - a[steep])[..., None])[..., 0].T
     inside = (s >= -1e-9) & (t >= -1e-9) & (s + t <= 1 + 1e-9)
     return np.asarray(start + far[inside, None] * along)
+
+
+class Surface:
+    """The whole surface of a body.
+
+    Parameters
+    ----------
+    triangles
+        Corners (n, 3, 3) of its triangles (m).
+    """
+
+    def __init__(self, triangles: FloatArray) -> None:
+        from scipy.spatial import cKDTree
+
+        self.triangles = triangles
+        centres = triangles.mean(axis=1)
+        self._reach = float(np.linalg.norm(triangles - centres[:, None], axis=2).max())
+        self._centres = cKDTree(centres)
+
+    @classmethod
+    def of(cls, body: Body) -> Surface:
+        """Make that of a body."""
+        corners = [body.surface] if isinstance(body, MeshFile) else [facets(body, name) for name in body.boundaries]
+        fan = [one[:, [0, k, k + 1]] for one in corners for k in range(1, one.shape[1] - 1)]
+        return cls(np.concatenate(fan))
+
+    @property
+    def middle(self) -> FloatArray:
+        """Centre (3,) of the box around it (m)."""
+        points = self.triangles.reshape(-1, 3)
+        return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the places (n, 3) nearest to points (n, 3) (m), and the unit normals (n, 3) there, of either sign."""
+        few = min(NEAREST, len(self.triangles))
+        first = self._centres.query(points, few)[1].reshape(len(points), few)
+        far = np.min([self._distance(first[:, k], points) for k in range(few)], axis=0)
+        near = self._centres.query_ball_point(points, far * (1 + 1e-9) + self._reach)
+        point = np.repeat(np.arange(len(points)), [len(found) for found in near])
+        triangle = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
+        parts = np.array_split(np.arange(len(point)), -(-len(point) // AT_ONCE))
+        places = np.concatenate([nearest_of(self.triangles[triangle[one]], points[point[one]]) for one in parts])
+        distance = ((places - points[point]) ** 2).sum(axis=1)
+        order = np.lexsort((triangle, distance, point))
+        best = order[np.searchsorted(point[order], np.arange(len(points)))]
+        a, b, c = np.moveaxis(self.triangles[triangle[best]], 1, 0)
+        normal = np.cross(b - a, c - a)
+        return places[best], normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def _distance(self, triangle: NDArray[np.int64], points: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(nearest_of(self.triangles[triangle], points) - points, axis=1))

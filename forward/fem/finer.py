@@ -207,7 +207,8 @@ class OtherMesh(OneByOne):
         if not hasattr(mesh, "observing"):
             return self._mesh
         observed: Any = self._own if self._observed is None else self._observed
-        return cast("SpecimenModel", mesh.observing(observed.places, observed.axes.tolist(), observed.cases.tolist()))
+        axes, cases = observed.axes.tolist(), observed.cases.tolist()
+        return cast("SpecimenModel", mesh.observing(observed.places, axes, cases, observed.directions))
 
     @cached_property
     def _scalars(self) -> list[int]:

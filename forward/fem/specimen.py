@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import AXES
@@ -50,6 +49,8 @@ class SpecimenModel(OneByOne):
         Points (n, 3) at which the outputs are observed (m, undeformed).
     axes
         Their components (n,): 0, 1 or 2.
+    directions
+        Unit vectors (n, 3) along which these are measured.
     cases
         Their load cases (n,), by number.
     models
@@ -89,9 +90,12 @@ class SpecimenModel(OneByOne):
                 places.append(np.repeat(where, len(item.components), axis=0))
                 axes += [AXES.index(axis) for axis in item.components] * len(where)
                 cases += [number] * len(where) * len(item.components)
-        self._observing(np.concatenate(places) if places else np.zeros((0, 3)), axes, cases, tuple(names))
+        where = np.concatenate(places) if places else np.zeros((0, 3))
+        self._observing(where, axes, cases, np.eye(3)[axes].reshape(-1, 3), tuple(names))
 
-    def observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int]) -> SpecimenModel:
+    def observing(
+        self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], directions: FloatArray | None = None
+    ) -> SpecimenModel:
         """Return the same model with other outputs, sharing meshes, forms and factors; collective.
 
         Parameters
@@ -102,19 +106,30 @@ class SpecimenModel(OneByOne):
             Their components (n,): 0, 1 or 2.
         cases
             Their load cases (n,) by number, in ascending order.
+        directions
+            Unit vectors (n, 3) along which the components are measured, by default the axes of the body.
         """
         other = copy.copy(self)
+        along = np.eye(3)[np.asarray(axes, dtype=np.int64)].reshape(-1, 3) if directions is None else directions
         labels = [(self.spec.cases[case].name, AXES[axis]) for case, axis in zip(cases, axes, strict=True)]
-        other._observing(places, axes, cases, tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels)))
+        names = tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels))
+        other._observing(places, axes, cases, along, names)
         return other
 
-    def _observing(self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], names: tuple[str, ...]) -> None:
-        self.outputs, self.places = names, places
+    def _observing(
+        self,
+        places: FloatArray,
+        axes: Sequence[int],
+        cases: Sequence[int],
+        directions: FloatArray,
+        names: tuple[str, ...],
+    ) -> None:
+        self.outputs, self.places, self.directions = names, places, directions
         self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
         numbers = range(len(self.models))
         self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
         found = [
-            _interpolation(model.equations, self.places[self.cases == number], self.axes[self.cases == number])
+            _interpolation(model.equations, self.places[self.cases == number], self.directions[self.cases == number])
             for number, model in zip(numbers, self.models, strict=True)
         ]
         self.observations: list[csr_matrix] = [matrix for matrix, _ in found]
@@ -126,7 +141,7 @@ class SpecimenModel(OneByOne):
         degree = bodies[0].equations.spec.body.degree
         if degree not in self._enriched_observations:
             self._enriched_observations[degree] = [
-                _interpolation(body.equations, self.places[self.cases == n], self.axes[self.cases == n])[0]
+                _interpolation(body.equations, self.places[self.cases == n], self.directions[self.cases == n])[0]
                 for n, body in enumerate(bodies)
             ]
         return self._enriched_observations[degree]
@@ -310,9 +325,11 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
 
 
 def _interpolation(
-    equations: Discretisation, places: FloatArray, axes: NDArray[np.int64]
+    equations: Discretisation, places: FloatArray, directions: FloatArray
 ) -> tuple[csr_matrix, FloatArray]:
-    """Return B (n, U_local) of components (n,) at points (n, 3), and their distances (n,) from the mesh; collective.
+    """Return B (n, U_local) of components along directions (n, 3) at points (n, 3), and their distances (n,).
+
+    Distances are from the mesh; collective.
 
     Raises
     ------
@@ -320,17 +337,18 @@ def _interpolation(
         If a point is farther from the mesh than the mesh can be from the body.
     """
     layout = equations.layout
-    different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, axes)
+    different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, np.arange(0))
     which = which.ravel()
     held, distances = BodySpace(equations).interpolation(different)
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
     rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for row, (i, axis) in enumerate(zip(which, axes, strict=True)):
+    for row, (i, along) in enumerate(zip(which, directions, strict=True)):
         at, w = held[i]
         owned = local[at] >= 0
-        rows.append(np.full(owned.sum(), row))
-        columns.append(3 * local[at][owned] + axis)
-        values.append(w[owned])
+        for axis in np.flatnonzero(along):
+            rows.append(np.full(owned.sum(), row))
+            columns.append(3 * local[at][owned] + axis)
+            values.append(along[axis] * w[owned])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return csr_matrix(entries, shape=(len(places), equations.size)), distances[which]

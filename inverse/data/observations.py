@@ -1,10 +1,10 @@
-"""Measured displacements of a specimen: their files, and what may be wrong with them.
+"""Measured displacements of a specimen, tables of them, and what may be wrong with them.
 
 A table of comma-separated values has the columns x, y, z (of the undeformed body), any of ux, uy, uz, and optionally
-sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Empty cells
-and ``nan`` mean that a component was not measured. Lines that begin with # state the source of the data, and lines
-``# truth.NAME = VALUE`` the true values behind synthetic data. Other files are meshes that meshio reads, with the
-displacements of a load case at their points as ``displacement_CASE``, or ``displacement`` if there is only one.
+sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Heads may
+state the unit of all lengths: ``x [mm]``, ``ux [mm]``. Empty cells and ``nan`` mean that a component was not measured.
+Lines that begin with # state the source of the data, and lines ``# truth.NAME = VALUE`` the true values behind
+synthetic data. Other files: `inverse.data.scans`.
 
 Most of the module describes what may be wrong with a table, each mistake with its line.
 """
@@ -23,15 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from forward.settings import nearest, one_line
+from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
-from inverse.data.table import DataError, others, read_table
+from inverse.data.table import DataError, Table, others, read_table
+from inverse.data.units import factor, split_head
 
 TABLES = (".csv", ".txt")
-MESHES = (".vtu", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
+MESHES = (".vtu", ".vtp", ".vtk", ".xdmf", ".msh", ".inp", ".med", ".stl", ".ply")
+SCANS = (".toml",)  # that say what files belong together
 POSITION, MOTION, ERRORS = ("x", "y", "z"), ("ux", "uy", "uz"), ("sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (*POSITION, *MOTION, "sigma", *ERRORS, "case")
+FAR = 0.02  # of the extent of a body: median distance of points from which on they may belong to another
 SAME = 1e-9  # of the extent of all points: distance within which points coincide
 TRUTH = "truth."
 
@@ -56,6 +59,8 @@ class Observations:
         Their source, line by line.
     truth
         True values by name, as text.
+    axes
+        Directions (3, 3) in the body along which x, y and z of the displacements are measured, as rows.
     """
 
     places: FloatArray
@@ -66,6 +71,7 @@ class Observations:
     labels: tuple[str, ...]
     source: tuple[str, ...] = ()
     truth: dict[str, str] = field(default_factory=dict)
+    axes: FloatArray = field(default_factory=lambda: np.eye(3))
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -89,29 +95,45 @@ class Observations:
             raise DataError(message)
         return replace(self, sigma=np.where(np.isfinite(self.sigma), self.sigma, sigma))
 
+    def of(self, rows: NDArray[np.bool_]) -> Observations:
+        """Return some of the points (n,)."""
+        return replace(
+            self,
+            places=self.places[rows],
+            displacements=self.displacements[rows],
+            sigma=self.sigma[rows],
+            case=self.case[rows],
+            labels=tuple(label for label, kept in zip(self.labels, rows, strict=True) if kept),
+        )
+
     def on(
-        self, nearest_place: Callable[[FloatArray], FloatArray], extent: float, tolerance: float
-    ) -> tuple[Observations, FloatArray]:
+        self,
+        nearest_place: Callable[[FloatArray], FloatArray],
+        extent: float,
+        tolerance: float,
+        *,
+        surface: bool = False,
+        leave_out: bool = False,
+    ) -> Placed:
         """Move the points onto a body.
 
         Parameters
         ----------
         nearest_place
-            Places (n, 3) of the body that are nearest to points (n, 3).
+            Places (n, 3) of the body, or of its surface, that are nearest to points (n, 3).
         extent
             Size of the body (m).
         tolerance
-            Largest distance (m) from the body.
-
-        Returns
-        -------
-        tuple
-            The same with points that lie outside moved to the nearest place, and how far (n,) each was moved (m).
+            Largest distance (m) from the body, or from its surface.
+        surface
+            Whether the surface is meant.
+        leave_out
+            Whether points that are farther away are left out.
 
         Raises
         ------
         DataError
-            If points are farther away, or displacements larger than the body.
+            If points are farther away, all of them are left out, or displacements are larger than the body.
         """
         mistakes = []
         largest = np.nanmax(np.abs(self.displacements))
@@ -124,17 +146,21 @@ class Observations:
         moved = nearest_place(self.places)
         distance = np.linalg.norm(moved - self.places, axis=1)
         distance[distance < SAME * extent] = 0.0
-        far = np.flatnonzero(distance > tolerance)
-        if far.size:
-            worst = far[distance[far].argmax()]
+        far = distance > tolerance
+        if far.any() and not (leave_out and not far.all()):
+            worst = int(distance.argmax())
             where = ", ".join(f"{x:g}" for x in self.places[worst])
+            from_body = "from the surface of" if surface else "outside"
+            rest = f" (and {far.sum() - 1} more of {len(far)})" if far.sum() > 1 else ""
             mistakes.append(
-                f"{self.labels[worst]}: ({where}) lies {distance[worst]:.3g} m outside the body, expected at most "
-                f"data.tolerance = {tolerance:.4g} m{others(far.size - 1)}"
+                f"{self.labels[worst]}: ({where}) lies {distance[worst]:.3g} m {from_body} the body, expected at most "
+                f"data.tolerance = {tolerance:.4g} m{rest}{_of_another(distance, extent)}"
             )
         if mistakes:
             raise DataError(*mistakes)
-        return replace(self, places=moved), distance
+        kept = replace(self, places=moved).of(~far)
+        lost = np.flatnonzero(far)
+        return Placed(kept, distance[~far], tuple(f"{self.labels[i]} ({distance[i]:.3g} m)" for i in lost))
 
     def data_labels(self) -> list[str]:
         """Say for each of the `components` its location in the file, place, load case and axis."""
@@ -161,7 +187,34 @@ class Observations:
             self.case[which],
             self.displacements[which, axes],
             self.sigma[which, axes],
+            self.axes[axes],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Observations that were moved onto a body.
+
+    Attributes
+    ----------
+    observations
+        On the body.
+    distances
+        How far (n,) each was moved (m).
+    left_out
+        Labels and distances of points that were too far away.
+    """
+
+    observations: Observations
+    distances: FloatArray
+    left_out: tuple[str, ...] = ()
+
+
+def _of_another(distance: FloatArray, extent: float) -> str:
+    """Say that a scan is of another body, or not registered, where most of its points are far away."""
+    if np.median(distance) < FAR * extent:
+        return ""
+    return "; half of the points are far away: is it another body, another unit, or is data.registration missing?"
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +231,8 @@ class Components:
         Numbers (m,) of the load cases.
     values, sigma
         What was measured (m,), and the standard deviations (m,) of the errors, in m.
+    directions
+        Unit vectors (m, 3) in the body along which; by default its axes.
     """
 
     places: FloatArray
@@ -185,6 +240,12 @@ class Components:
     cases: NDArray[np.int64]
     values: FloatArray
     sigma: FloatArray
+    directions: FloatArray | None = None
+
+    @property
+    def along(self) -> FloatArray:
+        """Unit vectors (m, 3) in the body along which they are measured."""
+        return np.eye(3)[self.axes] if self.directions is None else self.directions
 
     @property
     def which(self) -> None:
@@ -194,7 +255,7 @@ class Components:
     @property
     def described(self) -> dict[str, FloatArray]:
         """Places and axes, by their names in results."""
-        return {"place": self.places, "datum_axis": self.axes.astype(float)}
+        return {"place": self.places, "datum_axis": self.axes.astype(float), "direction": self.along}
 
     @property
     def spread(self) -> Places:
@@ -229,7 +290,10 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
         for folder in folders:
             path = folder / pattern
             if path.is_dir():
-                here = sorted(child for child in path.iterdir() if child.suffix in TABLES + MESHES)
+                children = sorted(path.iterdir())
+                # What says that files belong together stands for them.
+                here = [child for child in children if child.suffix in SCANS]
+                here = here or [child for child in children if child.suffix in TABLES + MESHES]
             elif path.is_file():
                 here = [path]
             else:
@@ -266,34 +330,8 @@ def distinct(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def read(path: Path, cases: Sequence[str], unit: float = 1.0) -> Observations:
-    """Read a file.
-
-    Parameters
-    ----------
-    path
-        A table, or a mesh.
-    cases
-        Names of the load cases.
-    unit
-        m per unit of the file.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
-    """
-    if path.suffix not in TABLES + MESHES:
-        message = f"{path.name}: unknown kind of file, expected one of: {', '.join(TABLES + MESHES)}"
-        raise DataError(message)
-    found = _table(path, tuple(cases), unit) if path.suffix in TABLES else _mesh(path, tuple(cases), unit)
-    mistakes = list(_mistakes(found, path.name))
-    if mistakes:
-        raise DataError(*mistakes)
-    return found
-
-
-def _mistakes(found: Observations, name: str) -> list[str]:
+def mistakes_of(found: Observations, name: str) -> list[str]:
+    """Say what is wrong with the data of a file."""
     mistakes = []
     for number, case in enumerate(found.cases):
         of_case = found.case == number
@@ -321,9 +359,25 @@ def _mistakes(found: Observations, name: str) -> list[str]:
     return mistakes
 
 
-def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
+def of_table(path: Path, cases: tuple[str, ...], unit: float | None = None) -> Observations:
+    """Read a table of displacements.
+
+    Parameters
+    ----------
+    path
+        The table.
+    cases
+        Names of the load cases.
+    unit
+        m per unit of the file, if it does not state that.
+
+    Raises
+    ------
+    DataError
+        With every kind of mistake in the file.
+    """
     name = path.name
-    found = read_table(path)
+    found, unit = _without_units(read_table(path), name, unit)
     columns = found.columns
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
@@ -371,53 +425,31 @@ def _table(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
     )
 
 
-def _mesh(path: Path, cases: tuple[str, ...], unit: float) -> Observations:
-    import contextlib
-    import io
-
+def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, float]:
+    """Return a table whose heads are names alone, and m per unit of its lengths."""
+    heads = [split_head(head) for head in table.columns]
+    lengths = [(column, said) for column, said in heads if column != "case"]
+    said = {unit for _, unit in lengths}
+    stated = sorted(one for one in said if one is not None)
+    if not stated:
+        return table, 1.0 if unit is None else unit
+    if len(said) > 1:
+        words = ", ".join(column if one is None else f"{column} [{one}]" for column, one in lengths)
+        raise DataError(f"{name}: mixed units: {words}; expected the same unit in all heads, or in none")
     try:
-        import meshio
-    except ImportError:
-        message = f"{path.name}: files of this kind need meshio (pip install meshio)"
-        raise DataError(message) from None
-    if not path.exists():
-        raise DataError(f"{path.name}: cannot be read: No such file or directory")
-    said = io.StringIO()  # what meshio prints, also before it exits
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:
-        reason = said.getvalue() if isinstance(error, SystemExit) else str(error)
-        raise DataError(one_line(f"{path.name}: cannot be read as {path.suffix}: {' '.join(reason.split())}")) from None
-    fields = {case: f"displacement_{case}" for case in cases}
-    if len(cases) == 1 and fields[cases[0]] not in mesh.point_data:
-        fields[cases[0]] = "displacement"
-    missing = [name for name in fields.values() if name not in mesh.point_data]
-    if missing:
+        scale = factor(stated[0], "m")
+    except ValueError as error:
+        raise DataError(f"{name}: column '{lengths[0][0]}' has {error}") from None
+    if unit is not None and abs(unit / scale - 1) > SAME:
         raise DataError(
-            *(
-                f"{path.name}: no point data '{name}'; {nearest(name, tuple(mesh.point_data) or ('none',))}"
-                for name in missing
-            )
+            f"{name}: its heads state {stated[0]}, but the study says {unit:g} m per unit; expected one of them"
         )
-    motions = [np.asarray(mesh.point_data[name], dtype=float) for name in fields.values()]
-    points = np.asarray(mesh.points, dtype=float)
-    n = len(points)
-    for name, motion in zip(fields.values(), motions, strict=True):
-        if motion.shape != (n, 3) or points.shape != (n, 3):
-            raise DataError(f"{path.name}: '{name}' has the shape {motion.shape}, expected ({n}, 3)")
-    if not np.isfinite(points).all():
-        raise DataError(f"{path.name}: a point has a coordinate that is not a number")
-    if any(np.isinf(motion).any() for motion in motions):
-        raise DataError(f"{path.name}: a displacement is infinite, expected numbers, or nan where nothing was measured")
-    return Observations(
-        unit * np.tile(points, (len(cases), 1)),
-        unit * np.concatenate(motions),
-        np.full((n * len(cases), 3), np.nan),
-        cases,
-        np.repeat(np.arange(len(cases)), n),
-        tuple(f"{path.name}: point {i}" for _ in cases for i in range(n)),
-    )
+    names = [column for column, _ in heads]
+    twice = next((column for column in names if names.count(column) > 1), None)
+    if twice is not None:
+        raise DataError(f"{name}: several columns '{twice}', expected different names")
+    rows = [dict(zip(names, row.values(), strict=True)) for row in table.rows]
+    return replace(table, columns=tuple(names), rows=rows), scale
 
 
 def _number(text: str) -> float | None:

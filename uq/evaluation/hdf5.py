@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
+from forward.model import FloatArray
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -117,3 +119,15 @@ def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dic
             coordinate = h5py.h5ds.is_scale(one.id) and np.ndim(values) == 1  # its own dimension
             found[name.removeprefix(OTHER)] = Variable(values, (name,) if coordinate else dims)
         return found, dict(part.attrs)
+
+
+def stored_array(path: Path, place: str) -> FloatArray:
+    """Return the numbers of a data set in a file.
+
+    Raises
+    ------
+    OSError, KeyError
+        If the file cannot be read, or has no such data set.
+    """
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[place], dtype=float)

@@ -125,8 +125,9 @@ def _kinds() -> set[str]:
     from typing import get_args
 
     from forward.bodies import geometry, inclusions
+    from inverse.data.registration import Registration
 
-    unions = (geometry.Body, inclusions.Inclusion, Distribution)
+    unions = (geometry.Body, inclusions.Inclusion, Distribution, Registration)
     members = [member for union in unions for member in get_args(get_args(union)[0])]
     return {member.model_fields["kind"].default for member in members}
 

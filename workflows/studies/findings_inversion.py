@@ -79,10 +79,16 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     labels = study.labels(number)
     found += criticism.strangers(residual, resolution, labels, heavy=study.data.errors.kind != "normal")
     if "points_moved" in one and int(one["points_moved"]):
-        count, farthest = int(one["points_moved"]), float(one["largest_move"])
+        count, farthest, rms = int(one["points_moved"]), float(one["largest_move"]), float(one["rms_move"])
         points = "1 point" if count == 1 else f"{count} points"
-        moved = f"{points} outside the body moved to its surface, by up to {farthest:.2g} m"
+        where = " outside the body" if not study.measurements[number].on_surface else ""
+        moved = f"{points}{where} moved to its surface, by up to {farthest:.2g} m (root mean square {rms:.2g} m)"
         found.append(criticism.Doubt("note", moved, ""))
+    if "points_moved" in one:
+        measured = study.measurements[number]
+        if measured.registered is not None:
+            found.append(criticism.Doubt("note", f"registered: {measured.registered.described}", ""))
+        found += [criticism.Doubt("note", line, "") for line in measured.warnings]
     if "mesh_checked" not in one:
         return found
     found += criticism.not_estimable(study.not_estimable(number))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -31,7 +30,7 @@ from workflows.config.priors import (
     ranges,
 )
 from workflows.config.report import Report
-from workflows.studies.measured import DataFiles, DataSet, read_measurement
+from workflows.studies.measured import DataFiles, DataSet, digest_of, read_measurement
 from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import StudyKind
 
@@ -46,13 +45,6 @@ if TYPE_CHECKING:
     from workflows.studies.measured import Measurement
 
 SOLVES_OF_FIELD = 12  # for a mode
-
-
-def _digest(path: Path) -> str:
-    try:
-        return sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError:  # it is not there, or cannot be read: then it is refused
-        return ""
 
 
 class InversionStudy(StudyKind):
@@ -225,7 +217,7 @@ class InversionStudy(StudyKind):
             except DataError as error:
                 measurement, wrong = None, "; ".join(error.args)
                 lines += [f"data: {line}" for line in error.args]
-            sets.append(DataSet(name=name, file=path.name, digest=_digest(path), refused=wrong))
+            sets.append(DataSet(name=name, file=path.name, digest=digest_of(path), refused=wrong))
             found.append(measurement)
         if all(measurement is None for measurement in found):
             raise StudyError(*lines)

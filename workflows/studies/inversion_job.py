@@ -137,7 +137,7 @@ class _Specimen:
         """Return the model of the displacements of a data set; errors as for every model."""
         data = self.study.measured(number)
         try:
-            return self.model.observing(data.places, data.axes, data.cases)  # type: ignore[arg-type]
+            return self.model.observing(data.places, data.axes, data.cases, data.along)  # type: ignore[arg-type]
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
 

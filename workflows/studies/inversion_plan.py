@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
     from workflows.studies.inversion import Inversion
+    from workflows.studies.measured import Measurement
     from workflows.studies.output_inversion import OutputInversion
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
@@ -43,16 +46,21 @@ def plan(study: Inversion) -> list[str]:
         f"load cases  {', '.join(case.name for case in spec.cases)}, of {spec.unknowns:,} unknowns each",
         formulation(study.model.decision(ranges(study.parameters))),
         f"data sets   {len(usable)}, of {', '.join(f'{count:,}' for count in counts)} components",
-        *([f"            {_moved(sum(moved), max(m.moved.max() for m in usable))}"] if sum(moved) else []),
+        *([f"            {_moved(sum(moved), usable)}"] if sum(moved) else []),
+        *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
+        *(f"warning     {line}" for one in usable for line in one.warnings),
         f"mesh check  {checked}",
         f"time        about {duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
 
 
-def _moved(count: int, farthest: float) -> str:
-    are = "point outside the body is" if count == 1 else "points outside the body are"
-    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m"
+def _moved(count: int, usable: list[Measurement]) -> str:
+    where = "" if all(m.on_surface for m in usable) else " outside the body"
+    are = f"point{where} is" if count == 1 else f"points{where} are"
+    farthest = max(m.moved.max() for m in usable)
+    square = float(np.mean(np.concatenate([m.moved for m in usable]) ** 2))
+    return f"{count} {are} moved to its surface, by up to {farthest:.2g} m (root mean square {np.sqrt(square):.2g} m)"
 
 
 def plan_of_outputs(study: OutputInversion) -> list[str]:

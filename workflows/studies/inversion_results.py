@@ -93,6 +93,8 @@ def _of_specimen(
     return {
         "points_moved": ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found]),
         "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found]),
+        "rms_move": ("data_set", [0.0 if m is None else float(np.sqrt((m.moved**2).mean())) for m in found]),
+        "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
         "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),

@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field, TypeAdapter, field_validator
+from pydantic import Field, TypeAdapter, ValidationError, field_validator
 
 from forward.bodies.geometry import tolerance
 from forward.bodies.inclusions import Inclusion
-from forward.settings import Settings
+from forward.bodies.surface import Surface
+from forward.settings import Settings, one_line
 from inverse.data.errors import NORMAL, Errors
-from inverse.data.observations import Observations, read
+from inverse.data.observations import SCANS, Observations, Placed
+from inverse.data.registration import Registered, ToSurface, register
+from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
+from workflows.config.mistakes import lines
 
 if TYPE_CHECKING:
     from forward.bodies.geometry import Body
     from forward.model import FloatArray
     from forward.specimen import Specimen
+
+
+LISTED = 5  # points that do not belong to a body
 
 
 class DataSet(Settings):
@@ -44,23 +54,22 @@ class DataSet(Settings):
     refused: str = ""
 
 
-class DataFiles(Settings):
+class DataFiles(Reading):
     """Where measured displacements are.
 
     Parameters
     ----------
     files
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
-        directory; a single one may be given as a string. Each file is a data set and is inverted separately.
-    sigma
-        Standard deviation (m) of the errors, if a file does not state it.
-    unit
-        m per unit of the files.
-    tolerance
-        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are moved to its
-        nearest point, and counted.
+        directory; a single one may be given as a string. Each file is a data set and is inverted separately. A file in
+        TOML says which files of a scan belong together, and any of what follows for it alone.
+    sigma, unit, units, field, on_surface, tolerance, beyond, registration
+        What the files do not say themselves (`inverse.data.scans`): standard deviation (m) of the errors, unit, array
+        of displacements, whether the points lie on the surface, how far (m) points may lie from the body, what is
+        done about others, and the rigid motion from the frame of the files to that of the body.
     errors
-        Their distribution: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be outliers.
+        Distribution of the errors: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be
+        outliers.
     truth
         By path: true values, if they are known in addition to those in the files.
     sets
@@ -68,21 +77,51 @@ class DataFiles(Settings):
     """
 
     files: tuple[str, ...] = Field(min_length=1)
-    sigma: Annotated[float, Field(gt=0)] | None = None
-    unit: Annotated[float, Field(gt=0)] = 1.0
-    tolerance: Annotated[float, Field(ge=0)] | None = None
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
-
-    def allowed(self, body: Body) -> float:
-        """How far (m) points may lie outside a body."""
-        return tolerance(body) if self.tolerance is None else self.tolerance
 
     @field_validator("files", mode="before", json_schema_input_type=tuple[str, ...] | str)
     @classmethod
     def _one_alone(cls, given: Any) -> Any:
         return (given,) if isinstance(given, str) else given
+
+
+def scan_of(path: Path, usual: Reading) -> Scan:
+    """Return the scan that a file is, or describes; what it does not say is as usual.
+
+    Raises
+    ------
+    DataError
+        If a description is none.
+    """
+    known = {name: getattr(usual, name) for name in Reading.model_fields if name in usual.model_fields_set}
+    if path.suffix not in SCANS:
+        return Scan(**known, file=path.name)
+    try:
+        given = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path.name}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # of the encoding, or the syntax
+        raise DataError(one_line(f"{path.name}: not a file in TOML: {error}")) from None
+    if not {"unit", "units"}.isdisjoint(given):
+        known = {name: value for name, value in known.items() if name not in {"unit", "units"}}
+    try:
+        return Scan.model_validate(known | given)
+    except ValidationError as error:
+        raise DataError(*(f"{path.name}: {line.removeprefix(': value error, ')}" for line in lines(error))) from None
+
+
+def digest_of(path: Path) -> str:
+    """Return the hash of a file and, if it describes a scan, of the files of that; empty if one cannot be read."""
+    try:
+        whole = path.read_bytes()
+        if path.suffix in SCANS:
+            for name in scan_of(path, Reading()).files:
+                whole += sha256((path.parent / name).read_bytes()).digest()
+        return sha256(whole).hexdigest()[:16]
+    except (OSError, DataError):  # then it is refused
+        return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +140,12 @@ class Measurement:
         The true ones.
     places, stiffness
         Where (k, 3) ln of the true stiffness factor (k,) is known beside that.
+    left_out
+        Points that do not belong to the body, and how far they are from it.
+    registered
+        The motion from the frame of the file to that of the body; None if they are the same.
+    on_surface
+        Whether its points lie on the surface.
     """
 
     observations: Observations
@@ -109,6 +154,60 @@ class Measurement:
     inclusions: tuple[Any, ...]
     places: FloatArray
     stiffness: FloatArray
+    left_out: tuple[str, ...] = ()
+    registered: Registered | None = None
+    on_surface: bool = False
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be known of the points before they are used."""
+        found = []
+        if self.left_out:
+            points = "1 point does" if len(self.left_out) == 1 else f"{len(self.left_out)} points do"
+            more = "" if len(self.left_out) <= LISTED else f" and {len(self.left_out) - LISTED} others"
+            found.append(f"{points} not belong to the body and are left out: {', '.join(self.left_out[:LISTED])}{more}")
+        if self.registered is not None and self.registered.unseen:
+            found.append(
+                f"the registration does not determine {', '.join(self.registered.unseen)}: left as at the start; what "
+                "the data say then depends on it"
+            )
+        return tuple(found)
+
+
+def read_on(path: Path, cases: Sequence[str], body: Body, usual: Reading) -> tuple[Placed, Registered | None, Scan]:
+    """Read a scan, and put it on a body.
+
+    Parameters
+    ----------
+    path
+        Its file, or its description.
+    cases
+        Names of the load cases.
+    body
+        The body.
+    usual
+        What is so where the description says nothing else.
+
+    Raises
+    ------
+    DataError
+        With every kind of mistake in the files.
+    """
+    scan = scan_of(path, usual)
+    found = read(path.parent, scan, cases)
+    if scan.sigma is not None:
+        found = found.with_sigma(scan.sigma)
+    extent = max(high - low for low, high in body.bounds)
+    surface = Surface.of(body) if scan.surface or isinstance(scan.registration, ToSurface) else None
+    registered = None
+    if scan.registration is not None:
+        unit = 1.0 if scan.metres is None else scan.metres
+        registered = register(scan.registration, found.places, unit, surface, extent, path.name)
+        found = replace(found, places=registered.motion(found.places), axes=registered.motion.rotation.T)
+    allowed = tolerance(body) if scan.tolerance is None else scan.tolerance
+    nearest_place = (lambda points: surface.nearest(points)[0]) if scan.surface and surface else body.nearest
+    leave_out = scan.beyond == "leave-out"
+    return found.on(nearest_place, extent, allowed, surface=scan.surface, leave_out=leave_out), registered, scan
 
 
 def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measurement:
@@ -119,11 +218,8 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     DataError
         With every kind of mistake in the file.
     """
-    cases = tuple(case.name for case in model.cases)
-    found = read(path, cases, data.unit).with_sigma(data.sigma)
-    body = model.body
-    extent = max(high - low for low, high in body.bounds)
-    found, moved = found.on(body.nearest, extent, data.allowed(body))
+    placed, registered, scan = read_on(path, tuple(case.name for case in model.cases), model.body, data)
+    found = placed.observations.with_sigma(None)
     truth, places, stiffness = dict(data.truth), np.zeros((0, 3)), np.zeros(0)
     for name, text in found.truth.items():
         if name not in {"stiffness", "inclusions"}:
@@ -131,7 +227,9 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     inclusions = _true_inclusions(found.truth["inclusions"], path) if "inclusions" in found.truth else ()
     if "stiffness" in found.truth:
         places, stiffness = _true_stiffness(path.parent / found.truth["stiffness"])
-    return Measurement(found, moved, truth, inclusions, places, stiffness)
+    return Measurement(
+        found, placed.distances, truth, inclusions, places, stiffness, placed.left_out, registered, scan.surface
+    )
 
 
 def _known(name: str, text: str, path: Path) -> float:

@@ -5,30 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from forward.bodies.geometry import AXES, Vector, tolerance
+from forward.bodies.geometry import AXES, Vector
 from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import ModelSpec
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Data
-from inverse.data.observations import read
+from inverse.data.scans import Reading
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE
+from workflows.studies.measured import read_on
 from workflows.studies.model_selection import ModelSelection, Positive, changed
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
 
 
-class DisplacementFile(Settings):
-    """A file of measured displacements, see `inverse.data.observations`.
+class DisplacementFile(Reading):
+    """A file of measured displacements, see `inverse.data.scans`.
 
     Parameters
     ----------
@@ -37,17 +38,11 @@ class DisplacementFile(Settings):
     sigma
         Standard deviation (m) of the errors, if the file does not state it; not needed if the method's noise is given
         otherwise.
-    unit
-        m per unit of the file.
-    tolerance
-        How far (m) points may lie outside the body, by default a thousandth of its diagonal; they are moved to its
-        nearest point.
+    unit, units, field, on_surface, tolerance, beyond, registration
+        As of an inversion.
     """
 
     file: str
-    sigma: Positive | None = None
-    unit: Positive = 1.0
-    tolerance: Annotated[float, Field(ge=0)] | None = None
 
     def read(self, folder: Path, specimen: Specimen) -> dict[str, Any]:
         """Return the block `data` with the displacements themselves.
@@ -58,15 +53,15 @@ class DisplacementFile(Settings):
             If the file cannot be used.
         """
         cases = tuple(case.name for case in specimen.cases)
-        extent = max(high - low for low, high in specimen.body.bounds)
         try:
-            found = read(folder / self.file, cases, self.unit)
-            if self.sigma is not None:
-                found = found.with_sigma(self.sigma)
-            allowed = tolerance(specimen.body) if self.tolerance is None else self.tolerance
-            found, moved = found.on(specimen.body.nearest, extent, allowed)
+            placed, registered, _ = read_on(folder / self.file, cases, specimen.body, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
+        if registered is not None and registered.uncertain:
+            raise StudyError(
+                f"data: {self.file}: an uncertain registration is for inversions, expected a known one here"
+            )
+        found, moved = placed.observations, placed.distances
         data = found.components()
         known = bool(np.isfinite(data.sigma).all())
         truth = [f"truth: {name} = {value}" for name, value in found.truth.items()]
@@ -74,6 +69,7 @@ class DisplacementFile(Settings):
             "source": [*found.source, *truth],
             "places": data.places.tolist(),
             "components": [AXES[axis] for axis in data.axes],
+            **({} if registered is None else {"axes": found.axes.tolist()}),
             "cases": [cases[case] for case in data.cases],
             "measured": data.values.tolist(),
             **({"sigma": data.sigma.tolist()} if known else {}),
@@ -94,6 +90,8 @@ class MeasuredDisplacements(Settings):
         Displacements (m).
     sigma
         Standard deviations (m) of their errors, if known.
+    axes
+        Directions in the body of x, y and z, along which components were measured; by default its own.
     source
         Their source, line by line.
     points_moved, largest_move
@@ -105,6 +103,7 @@ class MeasuredDisplacements(Settings):
     cases: tuple[str, ...]
     measured: tuple[float, ...]
     sigma: tuple[Positive, ...] | None = None
+    axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     source: tuple[str, ...] = ()
     points_moved: int = 0
     largest_move: float = 0.0
@@ -202,7 +201,8 @@ class SpecimenSelection(ModelSelection):
         specimen = self.of_candidates[name]
         numbers = {case.name: i for i, case in enumerate(specimen.cases)}
         model: SpecimenModel = specimen.build(comm, tuple(self.candidates[name].parameters))
-        return model.observing(np.array(self.data.places), self._axes, [numbers[case] for case in self.data.cases])
+        cases = [numbers[case] for case in self.data.cases]
+        return model.observing(np.array(self.data.places), self._axes, cases, np.array(self.data.axes)[self._axes])
 
     def _mistakes(self) -> Iterator[Mistake]:
         if self.method.check is not None:

@@ -334,6 +334,45 @@ def test_numbers_of_an_xdmf_file_count(tmp_path):
     assert MeshFile(file=str(tmp_path / "box.xdmf")).found.digest != before
 
 
+ABAQUS = """*HEADING
+ two tetrahedra
+*NODE
+ 1, 0, 0, 0
+ 2, 1, 0, 0
+ 3, 0, 1, 0
+ 4, 0, 0, 1
+ 5, 1, 1, 1
+*ELEMENT, TYPE=C3D4, ELSET=ALL
+ 10, 1, 2, 3, 4
+ 11, 2, 3, 4, 5
+*ELSET, ELSET=LUMP
+ 11
+*NSET, NSET=BOTTOM
+ 1, 2, 3
+*NSET, NSET=INNER
+ 2, 3, 4
+*NSET, NSET=SIDES, GENERATE
+ 1, 4, 1
+"""
+
+
+def test_sets_of_abaqus(tmp_path):
+    """Of elements they are regions, of nodes boundaries; a set of all elements says nothing, and faces inside none."""
+    path = tmp_path / "a.inp"
+    path.write_text(ABAQUS)
+    body = MeshFile(file=str(path))
+    assert body.found.regions == pytest.approx({"body": 1 / 6, "LUMP": 1 / 3}, rel=1e-5)
+    assert body.found.areas == pytest.approx({"BOTTOM": 0.5, "SIDES": 1.5}, rel=1e-5)
+    path.write_text(ABAQUS.replace("ELSET=LUMP\n 11", "ELSET=BOTTOM\n 10, 11").replace(", ELSET=ALL", ""))
+    body = MeshFile(file=str(path))
+    assert (body.regions, body.boundaries) == (("BOTTOM",), ("BOTTOM-nodes", "SIDES"))
+    path.write_text(ABAQUS + "*ELSET, ELSET=SOFT\n 11\n")
+    with pytest.raises(ValidationError, match="1 cells are in several groups of volumes"):
+        MeshFile(file=str(path))
+    path.write_text(ABAQUS.partition("*NSET")[0])
+    assert MeshFile(file=str(path)).boundaries == ("surface",)
+
+
 def test_files_of_pyvista(tmp_path):
     mesh = box("tetra")
     grid = pyvista.UnstructuredGrid(

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from forward.bodies.geometry import Block, Box
-from inverse.data.observations import distinct, files, read
+from inverse.data import scans
+from inverse.data.observations import distinct, files
+from inverse.data.scans import Scan
 from inverse.data.table import DataError
 
 pytestmark = pytest.mark.unit
@@ -21,6 +23,10 @@ x, y, z, ux, uz, sigma, case
 1, 0.5, 0.5, nan, 0.2, 0.02, shear
 0, 0.5, 0.5, 0.3, 0.4, 0.01, extension
 """
+
+
+def read(path, cases, **more):
+    return scans.read(path.parent, Scan(file=path.name, **more), cases)
 
 
 @pytest.fixture
@@ -119,9 +125,12 @@ def test_points_are_put_on_the_body(table):
     found = read(table(TABLE.replace("0, 0.5, 0.5, 0.1", "-0.01, 0.5, 0.5, 0.1")), CASES)
     with pytest.raises(DataError, match=r"data.csv: line 4: \(-0.01, 0.5, 0.5\) lies 0.01 m outside the body"):
         found.on(BODY.nearest, 1.0, 1e-3)
-    placed, moved = found.on(BODY.nearest, 1.0, 0.02)
-    np.testing.assert_allclose(placed.places[0], [0, 0.5, 0.5])
-    np.testing.assert_allclose(moved, [0.01, 0, 0])
+    placed = found.on(BODY.nearest, 1.0, 0.02)
+    np.testing.assert_allclose(placed.observations.places[0], [0, 0.5, 0.5])
+    np.testing.assert_allclose(placed.distances, [0.01, 0, 0])
+    left = found.on(BODY.nearest, 1.0, 1e-3, leave_out=True)
+    assert left.left_out == ("data.csv: line 4 (0.01 m)",)
+    assert left.observations.labels == found.labels[1:]
     with pytest.raises(DataError, match=r"a displacement of 400 m in a body of 1 m.*data\.unit"):
         read(table(TABLE.replace("0.4", "400")), CASES).on(BODY.nearest, 1.0, 0.0)
 

@@ -11,7 +11,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from forward.bodies.mesh_file import MeshFile
-from inverse.data.observations import read
+from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
 from tests.forward.bodies.test_mesh_file import box, numbered
 from tests.fuzz import damaged_bytes, damaged_table, mutations
@@ -197,7 +197,7 @@ def test_meshes_with_mistakes(tmp_path, name, how):
         except ValidationError as error:
             said += [str(mistake["msg"]) for mistake in error.errors()]
         try:
-            read(path, ("one",))
+            read(path.parent, Scan(file=path.name), ("one",))
         except DataError as error:
             said += error.args
         for line in said:

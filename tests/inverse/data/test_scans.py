@@ -1,0 +1,304 @@
+"""Scans: every format gives the same data, pairs of surfaces their difference, and one line for what is wrong."""
+
+import random
+import struct
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from pydantic import ValidationError
+
+from forward.bodies.geometry import Box
+from forward.bodies.surface import Surface
+from inverse.data.scans import Reading, Scan, read
+from inverse.data.table import DataError
+from tests.fuzz import damaged_bytes
+from workflows.studies.measured import digest_of, read_on, scan_of
+
+POINTS = 50 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1.0]])  # mm
+TRIANGLES = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2], [1, 5, 3]])
+MOTION = POINTS @ np.array([[0.02, 0.01, 0], [0, -0.03, 0.01], [0.01, 0, 0.04]]) + 1.0
+HOLES = np.where(np.arange(18).reshape(6, 3) % 5 == 3, np.nan, MOTION)
+SIGMA = 0.1 + 0.01 * np.arange(6.0)
+BODY = Box(size=(0.05, 0.05, 0.05), cells=(2, 2, 2))
+
+XDMF = """<?xml version="1.0"?>
+<!DOCTYPE Xdmf SYSTEM "Xdmf.dtd" []>
+<Xdmf Version="3.0" xmlns:xi="http://www.w3.org/2001/XInclude"><Domain>
+<Grid Name="mesh" GridType="Uniform">
+<Topology TopologyType="Triangle" NumberOfElements="4" NodesPerElement="3">
+<DataItem Dimensions="4 3" NumberType="Int" Format="HDF">scan.h5:/Mesh/mesh/topology</DataItem></Topology>
+<Geometry GeometryType="XYZ"><DataItem Dimensions="6 3" Format="HDF">scan.h5:/Mesh/mesh/geometry</DataItem></Geometry>
+</Grid>
+<Grid Name="displacement" GridType="Collection" CollectionType="Temporal">STEPS</Grid>
+</Domain></Xdmf>
+"""
+STEP = """<Grid Name="displacement" GridType="Uniform">
+<xi:include xpointer="xpointer(/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry])" />
+<Time Value="{k}" /><Attribute Name="displacement" AttributeType="Vector" Center="Node">
+<DataItem Dimensions="6 3" Format="HDF">scan.h5:/Function/displacement/{k}</DataItem></Attribute></Grid>
+"""
+
+
+def as_dolfinx(path):
+    """Write two steps of a series as DOLFINx does; the last one counts."""
+    with h5py.File(path.with_suffix(".h5"), "w") as file:
+        file["Mesh/mesh/topology"], file["Mesh/mesh/geometry"] = TRIANGLES, POINTS
+        file["Function/displacement/0"], file["Function/displacement/1"] = 0 * HOLES, HOLES
+    path.write_text(XDMF.replace("STEPS", "".join(STEP.format(k=k) for k in (0, 1))))
+
+
+def write(path):
+    """Write the same points in the format of a path."""
+    arrays = {"displacement": HOLES, "sigma": SIGMA}
+    if path.name == "dolfinx.xdmf":
+        as_dolfinx(path.with_name("scan.xdmf"))
+        path.with_name("scan.xdmf").rename(path)
+    elif path.suffix == ".csv":
+        rows = ["x [mm], y [mm], z [mm], ux [mm], uy [mm], uz [mm], sigma [mm]"]
+        rows += [", ".join(map(repr, map(float, (*p, *u, s)))) for p, u, s in zip(POINTS, HOLES, SIGMA, strict=True)]
+        path.write_text("\n".join(rows))
+    elif path.suffix in {".vtp", ".vtk"} and "polygons" in path.name:
+        found = pyvista.PolyData(POINTS, np.column_stack([np.full(4, 3), TRIANGLES]).ravel())
+        for name, values in arrays.items():
+            found.point_data[name] = values
+        found.save(path)
+    elif path.suffix == ".ply":
+        columns = dict(zip(("ux", "uy", "uz"), HOLES.T, strict=True))
+        triangles = TRIANGLES.astype(np.int32)
+        meshio.Mesh(POINTS, [("triangle", triangles)], point_data=columns | {"sigma": SIGMA}).write(path)
+    else:
+        meshio.Mesh(POINTS, [("triangle", TRIANGLES)], point_data=arrays).write(path)
+
+
+FORMATS = ("scan.csv", "scan.vtu", "scan.vtk", "scan.xdmf", "dolfinx.xdmf", "scan.ply", "polygons.vtp", "polygons.vtk")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_says_the_same(tmp_path, name):
+    write(tmp_path / name)
+    scan = Scan(file=name, units=None if name.endswith("csv") else "mm", sigma=1e-4)
+    found = read(tmp_path, scan, ("press",)).with_sigma(scan.sigma)
+    np.testing.assert_allclose(found.places, POINTS / 1e3, rtol=1e-6)
+    np.testing.assert_allclose(found.displacements, HOLES / 1e3, rtol=1e-6)
+    expected = np.full(6, 1e-4) if name == "dolfinx.xdmf" else SIGMA / 1e3
+    np.testing.assert_allclose(found.sigma, np.tile(expected[:, None], 3), rtol=1e-6)
+    assert len(found.components().values) == np.isfinite(HOLES).sum()
+
+
+def test_what_dolfinx_writes_is_read(tmp_path):
+    """DOLFINx itself wrote it, in a process of its own."""
+    from tests.launch import run_script
+
+    script = """
+from mpi4py import MPI
+import numpy as np
+from dolfinx import fem, io, mesh
+from forward.fem.dolfinx import spaces
+box = mesh.create_box(MPI.COMM_WORLD, [np.zeros(3), np.full(3, 0.05)], [1, 2, 1])
+u = fem.Function(spaces.vector_space(box, 1))
+u.name = "displacement"
+with io.XDMFFile(box.comm, FILE, "w") as file:
+    file.write_mesh(box)
+    for k in (1, 2):
+        u.interpolate(lambda x: k * np.array([[0.1], [0.2], [0.3]]) * x)
+        file.write_function(u, float(k))
+"""
+    path = tmp_path / "run.xdmf"
+    run_script(1, script.replace("FILE", repr(str(path))))
+    found = read(tmp_path, Scan(file="run.xdmf", sigma=1e-5), ("press",))
+    assert len(found.places) == 12
+    np.testing.assert_allclose(found.displacements, found.places * [0.2, 0.4, 0.6], atol=1e-15)
+
+
+@pytest.mark.parametrize("form", [".stl", "binary.stl", ".ply", ".inp", ".vtu"])
+def test_pairs_of_surfaces(tmp_path, form):
+    """The difference of surfaces with the same numbering; corners of facets that coincide count once."""
+    for name, points in (("rest", POINTS), ("press", POINTS + MOTION), ("pull", POINTS - MOTION)):
+        more = {"binary": form.startswith("binary")} if form.endswith("stl") else {}
+        path = tmp_path / f"{name}{Path(form).suffix or form}"
+        meshio.write(path, meshio.Mesh(points.copy(), [("triangle", TRIANGLES)]), **more)
+        if form.endswith("stl"):
+            write_stl(path, points, binary=form.startswith("binary"))
+    suffix = Path(form).suffix or form
+    (tmp_path / "scan.toml").write_text(
+        f'reference = "rest{suffix}"\nunits = "mm"\nsigma = 1e-4\n'
+        f'deformed = {{ press = "press{suffix}", pull = "pull{suffix}" }}\n'
+    )
+    scan = scan_of(tmp_path / "scan.toml", Reading(unit=7.0, tolerance=0.2))
+    assert (scan.metres, scan.tolerance, scan.surface) == (1e-3, 0.2, True)
+    found = read(tmp_path, scan, ("press", "pull"))
+    assert len(found.places) == 12
+    order = [int(np.linalg.norm(POINTS / 1e3 - place, axis=1).argmin()) for place in found.places[:6]]
+    assert sorted(order) == list(range(6))
+    np.testing.assert_allclose(found.displacements[:6], MOTION[order] / 1e3, atol=1e-8)
+    np.testing.assert_allclose(found.displacements[6:], -MOTION[order] / 1e3, atol=1e-8)
+    before = digest_of(tmp_path / "scan.toml")
+    with (tmp_path / f"pull{suffix}").open("ab") as file:
+        file.write(b"\n")
+    assert digest_of(tmp_path / "scan.toml") != before
+
+
+def write_stl(path, points, *, binary):
+    """Write the facets one after another, each with its corners, as scanners do."""
+    if binary:
+        facets = [struct.pack("<12fH", 0, 0, 1, *points[t].ravel(), 0) for t in TRIANGLES]
+        path.write_bytes(b"scan".ljust(80) + struct.pack("<I", len(TRIANGLES)) + b"".join(facets))
+        return
+    corners = "\n".join(
+        "facet normal 0 0 1\nouter loop\n"
+        + "\n".join("vertex " + " ".join(f"{x:.9g}" for x in points[i]) for i in t)
+        + "\nendloop\nendfacet"
+        for t in TRIANGLES
+    )
+    path.write_text(f"solid scan\n{corners}\nendsolid scan\n")
+
+
+@pytest.mark.parametrize(
+    ("head", "settings", "told"),
+    [
+        ("x [mm],y [mm],z [m],ux [mm]", {}, "mixed units: x [mm], y [mm], z [m], ux [mm]; expected the same unit"),
+        ("x [mm],y [mm],z [mm],ux", {}, "mixed units: x [mm], y [mm], z [mm], ux; expected"),
+        ("x [mm],y [mm],z [mm],ux [um]", {}, "mixed units"),
+        ("x [mm],y [mm],z [mm],ux [mm]", {"units": "cm"}, "its heads state mm, but the study says 0.01 m per unit"),
+        ("x [mN],y [mN],z [mN],ux [mN]", {}, "column 'x' has the unit 'mN', expected m, mm or µm"),
+        ("x [mm],y [mm],z [mm],x (mm)", {}, "several columns 'x'"),
+    ],
+)
+def test_units_of_heads(tmp_path, head, settings, told):
+    (tmp_path / "scan.csv").write_text(f"{head}\n0,0,0,1\n")
+    with pytest.raises(DataError) as caught:
+        read(tmp_path, Scan(file="scan.csv", **settings), ("press",))
+    assert len(caught.value.args) == 1
+    assert told in str(caught.value)
+
+
+def test_units_agree(tmp_path):
+    (tmp_path / "scan.csv").write_text("x [mm],y [mm],z [mm],ux [mm]\n1,2,3,4\n")
+    for settings in ({}, {"units": "mm"}, {"unit": 1e-3}):
+        found = read(tmp_path, Scan(file="scan.csv", **settings), ("press",))
+        assert found.places.tolist() == [[1e-3, 2e-3, 3e-3]]
+    for settings, told in (({"units": "furlong"}, "unit 'furlong'"), ({"units": "mm", "unit": 1.0}, "either unit or")):
+        with pytest.raises(ValidationError, match=told):
+            Reading(**settings)
+
+
+@pytest.mark.parametrize("name", [*FORMATS, "scan.stl", "scan.inp", "scan.msh"])
+@pytest.mark.parametrize("damage", ["empty", "garbage", "missing", "cut", "words"])
+def test_files_that_cannot_be_read(tmp_path, name, damage, capfd):
+    """One line that begins with the name of the file, and nothing printed beside it."""
+    path = tmp_path / name
+    if damage != "missing":
+        (write_stl(path, POINTS, binary=True) if name.endswith("stl") else write(path))
+        whole = path.read_bytes()
+        some = {"empty": b"", "garbage": random.Random(1).randbytes(500), "words": b"not what it says\n"}
+        path.write_bytes(some.get(damage, whole[: len(whole) // 2]))
+    with pytest.raises(DataError) as caught:
+        read(tmp_path, Scan(file=name), ("press",)).with_sigma(None)
+    assert len(caught.value.args) == 1, caught.value.args
+    assert caught.value.args[0].startswith(f"{name}: ")
+    assert "\n" not in caught.value.args[0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_files_damaged_by_chance(tmp_path, capfd):
+    """Whatever is wrong, it is a line, or data: nothing else."""
+    chance = random.Random(3)
+    for name in (*FORMATS, "rest.stl"):
+        path = tmp_path / name
+        (write_stl(path, POINTS, binary=chance.random() < 0.5) if name.endswith("stl") else write(path))
+        whole = path.read_bytes()
+        for _ in range(12):
+            path.write_bytes(damaged_bytes(whole, chance)[0])
+            scan = Scan(file=name) if name != "rest.stl" else Scan(reference=name, deformed={"press": name})
+            said: tuple[str, ...] = ()
+            try:
+                read(tmp_path, scan, ("press",))
+            except DataError as error:
+                said = error.args
+            assert all(line.isprintable() for line in said), said
+    assert capfd.readouterr() == ("", "")
+
+
+def test_pairs_that_do_not_belong_together(tmp_path):
+    def told(deformed, reference="rest.ply", case="press"):
+        with pytest.raises(DataError) as caught:
+            read(tmp_path, Scan(reference=reference, deformed={case: deformed}), ("press",))
+        return str(caught.value)
+
+    mesh = meshio.Mesh(POINTS, [("triangle", TRIANGLES)])
+    mesh.write(tmp_path / "rest.ply")
+    meshio.Mesh(POINTS[:5], [("triangle", TRIANGLES[:2])]).write(tmp_path / "fewer.ply")
+    meshio.Mesh(POINTS, [("triangle", TRIANGLES[::-1])]).write(tmp_path / "other.ply")
+    write_stl(tmp_path / "rest.stl", POINTS, binary=True)
+    write_stl(tmp_path / "turned.stl", POINTS[[5, 3, 1, 0, 2, 4]] + MOTION, binary=True)
+    text = (tmp_path / "turned.stl").read_bytes()
+    (tmp_path / "turned.stl").write_bytes(text[:84] + text[134:] + text[84:134])
+    assert told("fewer.ply").startswith("fewer.ply: 5 points, and 6 in the reference: expected the same numbering")
+    assert "other cells than the reference" in told("other.ply")
+    assert "coincide, but move by different displacements" in told("turned.stl", "rest.stl")
+    assert "deformed: unknown load case 'pres'; did you mean 'press'?" in told("rest.ply", case="pres")
+    with pytest.raises(DataError, match=r"rest.ply: no displacements; expected data at its points, or a file in TOML"):
+        read(tmp_path, Scan(file="rest.ply"), ("press",))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("reference = ", "scan.toml: not a file in TOML"),
+        ('reference = "rest.ply"', "scan.toml: expected either file, or reference and deformed"),
+        ('deformed = { press = "a.ply" }', "scan.toml: expected either file, or reference and deformed"),
+        ('file = "a.csv"\nunit = "mm"', "scan.toml: unit: input should be a valid number; given 'mm'"),
+        ('fle = "a.csv"', "scan.toml: fle: unknown key; did you mean 'file'?"),
+        ('file = "a.csv"', "a.csv: cannot be read: No such file"),
+        ('file = "a.exe"', "a.exe: unknown kind of file"),
+        (
+            'file = "a.csv"\nregistration = { kind = "given", rotaton = [0, 0, 5] }',
+            "scan.toml: registration.rotaton: unknown key; did you mean 'rotation'?",
+        ),
+    ],
+)
+def test_mistakes_in_descriptions(tmp_path, text, told):
+    path = tmp_path / "scan.toml"
+    path.write_text(text)
+    with pytest.raises(DataError) as caught:
+        read(tmp_path, scan_of(path, Reading()), ("press",))
+    assert any(told in line for line in caught.value.args), caught.value.args
+
+
+def test_scans_of_another_body(tmp_path):
+    """Distances that are huge, a wrong unit, points within the body that should lie on its surface."""
+    write(tmp_path / "scan.vtu")
+    usual = {"sigma": 1e-4, "on_surface": True, "tolerance": 1e-3}
+    placed, registered, _ = read_on(tmp_path / "scan.vtu", ("press",), BODY, Reading(units="mm", **usual))
+    assert registered is None
+    assert placed.distances.max() < 1e-12
+    with pytest.raises(DataError, match="half of the points are far away: is it another body, another unit, or"):
+        read_on(tmp_path / "scan.vtu", ("press",), BODY, Reading(units="cm", **usual))
+    other = Box(size=(0.05, 0.05, 0.049), cells=(1, 1, 1))
+    reading = Reading(units="mm", **usual | {"tolerance": 5e-4})
+    with pytest.raises(DataError, match=r"lies 0.001 m from the surface of the body, expected at most .* \(and 1 more"):
+        read_on(tmp_path / "scan.vtu", ("press",), other, reading)
+    placed, *_ = read_on(
+        tmp_path / "scan.vtu", ("press",), other, Reading(**reading.model_dump() | {"beyond": "leave-out"})
+    )
+    assert placed.left_out == ("scan.vtu: point 3 (0.001 m)", "scan.vtu: point 5 (0.001 m)")
+    assert len(placed.observations.places) == 4
+
+
+def test_nearest_places_of_surfaces():
+    """Those of a box by its planes, on any division of its faces."""
+    points = np.random.default_rng(1).uniform(-0.02, 0.07, size=(300, 3))
+    inside = ((points > 0) & (points < 0.05)).all(axis=1)
+    expected = np.clip(points, 0, 0.05)
+    for i in np.flatnonzero(inside):
+        gaps = np.concatenate([points[i], 0.05 - points[i]])
+        k = int(gaps.argmin())
+        expected[i, k % 3] = 0.0 if k < 3 else 0.05
+    for cells in ((1, 1, 1), (3, 4, 2)):
+        places, normals = Surface.of(Box(size=(0.05, 0.05, 0.05), cells=cells)).nearest(points)
+        np.testing.assert_allclose(places, expected, atol=1e-15)
+        np.testing.assert_allclose(np.abs(normals).max(axis=1), 1)
