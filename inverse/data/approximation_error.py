@@ -131,20 +131,35 @@ class Whitening:
     log_determinant: float
 
     @classmethod
-    def of(cls, sigma: FloatArray, mesh: ApproximationError | None, errors: NormalErrors | StudentErrors) -> Whitening:
-        """Make it for standard deviations (m,), and what a mesh adds to them.
+    def of(
+        cls,
+        sigma: FloatArray,
+        mesh: ApproximationError | None,
+        errors: NormalErrors | StudentErrors,
+        shared: FloatArray | None = None,
+    ) -> Whitening:
+        """Make it for standard deviations (m,), what a mesh adds to them, and other errors (k, m) that data share.
 
         Errors with heavy tails are no multivariate ones: of those the scales only become larger.
         """
-        none = np.zeros((0, len(sigma)))
-        if mesh is None:
-            return cls(sigma, none, np.zeros(0), 0.0)
-        more = mesh.apart**2 if errors.kind == "normal" else mesh.apart**2 + (mesh.root**2).sum(axis=0)
-        wider = np.sqrt(sigma**2 + more / mesh.scale**2)
-        if errors.kind != "normal" or not len(mesh.root):
-            return cls(wider, none, np.zeros(0), 0.0)
-        _, sizes, basis = np.linalg.svd(mesh.root / (mesh.scale * wider), full_matrices=False)
+        m = len(sigma)
+        roots = [np.zeros((0, m))] if shared is None else [shared]
+        more = np.zeros(m)
+        if mesh is not None:
+            roots.append(mesh.root / mesh.scale)
+            more = more + (mesh.apart / mesh.scale) ** 2
+        root = np.concatenate(roots)
+        if errors.kind != "normal":
+            more, root = more + (root**2).sum(axis=0), root[:0]
+        wider = np.sqrt(sigma**2 + more) if mesh is not None or more.any() else sigma
+        if not len(root):
+            return cls(wider, root, np.zeros(0), 0.0)
+        _, sizes, basis = np.linalg.svd(root / wider, full_matrices=False)
         return cls(wider, basis, 1 - 1 / np.sqrt(1 + sizes**2), float(np.log1p(sizes**2).sum() / 2))
+
+    def undone(self, rows: FloatArray) -> FloatArray:
+        """Return W⁻¹r (…, m)."""
+        return np.asarray(rows + ((rows @ self.basis.T) * (self.less / (1 - self.less))) @ self.basis)
 
     def __call__(self, rows: FloatArray) -> FloatArray:
         """Return W r (…, m) of rows over σ (…, m); W is symmetric."""

@@ -187,7 +187,7 @@ class Observations:
             self.case[which],
             self.displacements[which, axes],
             self.sigma[which, axes],
-            self.axes[axes],
+            None if np.array_equal(self.axes, np.eye(3)) else self.axes[axes],
         )
 
 
@@ -255,7 +255,8 @@ class Components:
     @property
     def described(self) -> dict[str, FloatArray]:
         """Places and axes, by their names in results."""
-        return {"place": self.places, "datum_axis": self.axes.astype(float), "direction": self.along}
+        more = {} if self.directions is None else {"datum_direction": self.directions}
+        return {"place": self.places, "datum_axis": self.axes.astype(float), **more}
 
     @property
     def spread(self) -> Places:

@@ -50,6 +50,19 @@ from inverse.data.units import factor
 SURFACES = (".stl", ".ply")  # of which the points lie on the surface of the body
 
 
+class Between(Settings):
+    """Rigid motions between scans, unknown but for their size.
+
+    Parameters
+    ----------
+    rotation_std, translation_std
+        Standard deviations about, and along, each axis (degrees; unit of the file).
+    """
+
+    rotation_std: Annotated[float, Field(ge=0, le=30)] = 0.0
+    translation_std: Annotated[float, Field(ge=0)] = 0.0
+
+
 class Reading(Settings):
     """What files of displacements do not say themselves.
 
@@ -73,6 +86,9 @@ class Reading(Settings):
         What is done about points that are farther away: "refuse" the file, or "leave-out" the points, which are listed.
     registration
         The rigid motion from the frame of the files to that of the body; by default they are the same.
+    between
+        How uncertain it is that neither specimen nor scanner moved as a whole between the undeformed scan and that of
+        each load case.
     """
 
     sigma: Annotated[float, Field(gt=0)] | None = None
@@ -83,6 +99,14 @@ class Reading(Settings):
     tolerance: Annotated[float, Field(ge=0)] | None = None
     beyond: Literal["refuse", "leave-out"] = "refuse"
     registration: Registration | None = None
+    between: Between | None = None
+
+    @property
+    def moved_between(self) -> tuple[float, float]:
+        """Standard deviations (rad, m) of the motions between scans."""
+        if self.between is None:
+            return (0.0, 0.0)
+        return float(np.radians(self.between.rotation_std)), (self.metres or 1.0) * self.between.translation_std
 
     @property
     def metres(self) -> float | None:
@@ -109,7 +133,7 @@ class Scan(Reading):
         In place of it: the undeformed surface.
     deformed
         By load case: the deformed surface, of the same numbering.
-    sigma, unit, units, field, on_surface, tolerance, beyond, registration
+    sigma, unit, units, field, on_surface, tolerance, beyond, registration, between
         As of `Reading`.
     """
 

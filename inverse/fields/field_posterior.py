@@ -74,6 +74,8 @@ class FieldPosterior:
     mesh
         What the mesh of the model takes away from the outputs, the same for all fields; None where that is not known,
         or nothing.
+    shared
+        (k, n): errors that the data share, a row for a standard deviation of each; None if there are none.
     """
 
     model: ForwardModel
@@ -85,6 +87,7 @@ class FieldPosterior:
     progress: Callable[[int, int], None] = lambda done, failed: None
     errors: NormalErrors | StudentErrors = NORMAL
     mesh: ApproximationError | None = None
+    shared: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.model.outputs)
@@ -113,7 +116,8 @@ class FieldPosterior:
         mesh = self.mesh
         if mesh is not None:
             mesh = replace(mesh, root=mesh.root * self.measured, apart=mesh.apart * self.measured)
-        return Whitening.of(self.sigma, mesh, self.errors)
+        shared = None if self.shared is None else self.shared * self.measured
+        return Whitening.of(self.sigma, mesh, self.errors, shared)
 
     @cached_property
     def weights(self) -> FloatArray:

@@ -121,6 +121,8 @@ class Posterior:
         Distribution of the errors over their scale sσ.
     mesh
         What the mesh of the model takes away from the data; None where that is not known, or nothing.
+    shared
+        (k, m): errors that the data share, a row for a standard deviation of each; None if there are none.
     """
 
     inputs: Inputs
@@ -132,6 +134,7 @@ class Posterior:
     start: Start | None = None
     errors: NormalErrors | StudentErrors = NORMAL
     mesh: ApproximationError | None = None
+    shared: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.data.shape != self.sigma.shape:
@@ -157,7 +160,7 @@ class Posterior:
     @cached_property
     def whitening(self) -> Whitening:
         """What makes the errors independent."""
-        return Whitening.of(self.sigma, self.mesh, self.errors)
+        return Whitening.of(self.sigma, self.mesh, self.errors, self.shared)
 
     def scale(self, x: FloatArray) -> FloatArray:
         """Return the standard deviations (n, m) of the independent errors at x (n, c)."""

@@ -21,6 +21,7 @@ from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.weights import FEWEST, resampled
 from inverse.data.errors import NORMAL, NormalErrors, StudentErrors
+from inverse.data.shared_motion import Shared
 from inverse.fields.low_rank import Spectrum
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace, laplace
@@ -36,6 +37,7 @@ from inverse.methods.record import (
     of_chains,
     of_data,
     of_mesh,
+    of_motions,
     of_prior,
     of_test,
 )
@@ -92,6 +94,7 @@ def invert_by_group(
     finer: Finer | None = NOT_LOOKED,
     evaluate: Evaluate | None = None,
     say: Callable[[str], None] = lambda line: None,
+    shared: Shared | None = None,
 ) -> xr.Dataset:
     """Invert a data set on the model of one rank group, or by an evaluation of it; collective over the group.
 
@@ -107,6 +110,8 @@ def invert_by_group(
         Of the model.
     say
         Shows the user a line before the search.
+    shared
+        What errors the data share; None if they are independent.
 
     Raises
     ------
@@ -115,7 +120,7 @@ def invert_by_group(
     """
     solve = evaluate or SerialEvaluate(model)
     near = partial(Nearby.at, model, spread=inputs.std)
-    return _invert(inputs, solve, data, method, look, errors, finer, near, say)
+    return _invert(inputs, solve, data, method, look, errors, finer, near, say, shared)
 
 
 def invert_by_all(
@@ -127,6 +132,7 @@ def invert_by_all(
     errors: NormalErrors | StudentErrors = NORMAL,
     finer: Finer | None = NOT_LOOKED,
     say: Callable[[str], None] = lambda line: None,
+    shared: Shared | None = None,
 ) -> xr.Dataset:
     """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
     return _invert(
@@ -139,6 +145,7 @@ def invert_by_all(
         finer,
         lambda point: linearise(inputs, evaluate, point).prediction,
         say,
+        shared,
     )
 
 
@@ -152,15 +159,21 @@ def _invert(
     finer: Finer | None,
     start: Callable[[FloatArray], Start | None],
     say: Callable[[str], None],
+    shared: Shared | None,
 ) -> xr.Dataset:
     counted = Recorder(evaluate)
     posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
+    if shared is not None:
+        posterior = replace(posterior, shared=shared(inputs.mean))
     d = len(inputs.names)
     with suppress(SolveError):  # or else every solve begins at zero
         posterior = replace(posterior, start=start(inputs.mean))
     before = before_few(posterior, finer, say) if finer is not None and method.treatment is not None else None
     searched = laplace(posterior, starts=method.starts, seed=method.seed)
     gaussian, mesh = searched, None
+    if shared is not None:  # which depends on the displacements
+        posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
+        gaussian = laplace(posterior, starts=1, first=gaussian.mode)
     posterior = replace(posterior, start=start(posterior.physical(gaussian.mode[None])[0, :d]))
     if finer is not None:
         treatment = method.treatment or "report"
@@ -193,6 +206,7 @@ def _invert(
         **of_test(test),
         **of_prior(gaussian.mode[:d], spectrum),
         **({} if mesh is None else of_mesh(mesh, before, len(best) - d)),
+        **of_motions(spectrum, posterior.whitening, posterior.shared, root),
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(posterior, draws, outputs),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +25,7 @@ from inverse.criticism.comparison import quantiles
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.predictive import examine
 from inverse.criticism.weights import resampled
+from inverse.data.shared_motion import Shared
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import Mode, find_mode
@@ -43,6 +43,7 @@ from inverse.methods.record import (
     of_chains,
     of_data,
     of_mesh,
+    of_motions,
     of_prior,
     of_test,
     ritz,
@@ -97,8 +98,11 @@ def invert_field(
     vertices: Vertices,
     finer: Finer = NOT_LOOKED,
     say: Callable[[str], None] = lambda line: None,
+    shared: Shared | None = None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
+
+    What errors the data share is said by a function of the values of the field; by default they are independent.
 
     Raises
     ------
@@ -107,7 +111,15 @@ def invert_field(
     """
     g = vertices.volumes / vertices.volumes.sum()
     before = _before(posterior, finer, say) if method.treatment is not None else None
-    solve = partial(_solve, method)
+    first = None
+    if shared is not None:  # which depends on the displacements
+        posterior = replace(posterior, shared=shared(posterior.values(np.zeros(posterior.size))))
+        begun = _solve(method, posterior, None).mode.point
+        posterior, first = replace(posterior, shared=shared(begun.values)), begun.whitened
+
+    def solve(asked: FieldPosterior, start: FloatArray | None) -> _Solved:
+        return _solve(method, asked, first if start is None else start)
+
     treatment = method.treatment or "report"
     solved, moved, mesh = corrected_field(posterior, solve, finer, data.spread, treatment, g)
     mode, found, converged, factor = solved.mode, solved.found, solved.converged, solved.factor
@@ -138,6 +150,7 @@ def invert_field(
         _of_stiffness(found, vertices, method, values, weights),
     )
     record: Record = {
+        **of_motions(spectrum, mode.point.posterior.whitening, posterior.shared, root),
         **of_data(data, predicted, residual, scale / root, spectrum),
         **of_test(test),
         **of_prior(mode.point.whitened, spectrum),

@@ -17,8 +17,9 @@ from forward.model import FloatArray
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.predictive import ResidualTest
-from inverse.data.approximation_error import Places
+from inverse.data.approximation_error import Places, Whitening
 from inverse.data.neighbours import Neighbours
+from inverse.data.shared_motion import determined
 from inverse.fields.low_rank import Spectrum
 from inverse.methods.invert import Invert
 
@@ -77,9 +78,11 @@ DIMS: dict[str, tuple[str, ...]] = {
     "mesh_settled": (),
     "mesh_solves": (),
     "mesh_before": (),
+    "motion_eigenvalue": ("motion",),
     "step": ("iteration", "column"),
     "place": ("datum", "axis"),
     "datum_axis": ("datum",),
+    "datum_direction": ("datum", "axis"),
     "datum_case": ("datum",),
     "measured": ("datum",),
     "sigma": ("datum",),
@@ -240,6 +243,11 @@ def of_prior(x: FloatArray, spectrum: Spectrum) -> Record:
     values = spectrum.values[seen]
     squares = (spectrum.vectors[seen] @ x) ** 2 * (1 + values) / values
     return {"prior_square": np.array(squares.sum()), "prior_degrees": np.array(float(seen.sum()))}
+
+
+def of_motions(spectrum: Spectrum, whitening: Whitening, shared: FloatArray | None, root: FloatArray) -> Record:
+    """What the data say about rigid motions that are uncertain; none if none is."""
+    return {} if shared is None else {"motion_eigenvalue": determined(spectrum, whitening, shared, root)}
 
 
 def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, Severity
+from inverse.data.shared_motion import DETERMINED
 from uq.findings import add
 
 if TYPE_CHECKING:
@@ -89,6 +90,13 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         if measured.registered is not None:
             found.append(criticism.Doubt("note", f"registered: {measured.registered.described}", ""))
         found += [criticism.Doubt("note", line, "") for line in measured.warnings]
+    if "motion_eigenvalue" in one:
+        values = one["motion_eigenvalue"].to_numpy()
+        values = values[np.isfinite(values)]
+        seen, count = int((values > DETERMINED).sum()), len(values)
+        words = f"of {count} rigid motions that are uncertain, the data determine {seen} better than was known before"
+        rest = "" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise"
+        found.append(criticism.Doubt("note", words + rest, ""))
     if "mesh_checked" not in one:
         return found
     found += criticism.not_estimable(study.not_estimable(number))

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from forward.model import Finding, FloatArray
     from forward.spec import ModelSpec
     from inverse.data.observations import Components
+    from inverse.data.shared_motion import SharedMotion
     from inverse.methods.record import Data
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -311,6 +312,11 @@ class Inversion(InversionStudy):
     def measured(self, number: int) -> Components:
         """Return a data set that can be used."""
         found: Components = self.measurements[number].observations.components()
+        return found
+
+    def motion(self, number: int) -> SharedMotion | None:
+        """Return the uncertain motions of a data set; None if there are none."""
+        found: SharedMotion | None = self.measurements[number].motion(self.model.body)
         return found
 
     def labels(self, number: int) -> list[str]:

@@ -14,7 +14,7 @@ from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
@@ -32,10 +32,12 @@ if TYPE_CHECKING:
 
     from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
+    from inverse.data.shared_motion import Shared, SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.kept import KeptEvaluate, KeptModel
 
+MOVED = "moved points"  # in names of models
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
@@ -48,6 +50,9 @@ def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: 
         made = _Specimen.of(study, ensemble)
     derivable(made.model, study.model.kind)
     return _one(study, made, ensemble.say) if study.together else _many(study, made, ensemble, directory, checkpoint)
+
+
+_InvertField = Callable[[int, ForwardModel, Finer, "Ensemble", "Shared | None"], "xr.Dataset"]
 
 
 class _Made(Protocol):
@@ -79,6 +84,9 @@ class _Made(Protocol):
             If there is none.
         """
 
+    def shared(self, number: int) -> tuple[SharedMotion, ForwardModel] | None:
+        """Return what errors the data share, and the model that tells what they are; None if they are independent."""
+
     def finer(self, observed: ForwardModel) -> There:
         """Return the model on finer meshes (`forward.extrapolated`)."""
 
@@ -104,6 +112,10 @@ class _Outputs:
     def observing(self, number: int) -> ForwardModel:
         """Return the model: the data tell which of its outputs were measured."""
         return self.model
+
+    def shared(self, number: int) -> None:
+        """Return None: errors of outputs are independent."""
+        return
 
     def finer(self, observed: ForwardModel) -> There:
         """Return the same outputs on finer meshes."""
@@ -141,6 +153,11 @@ class _Specimen:
         except ValueError as error:  # a place that is far from the mesh: the other data sets go on
             raise SolveError(str(error)) from None
 
+    def shared(self, number: int) -> tuple[SharedMotion, ForwardModel] | None:
+        """Return the uncertain motions of a data set, and the model that tells what they do; None if nothing is."""
+        found = self.study.motion(number)
+        return None if found is None else (found, self.model.observing(*found.observed))  # type: ignore[arg-type]
+
     def finer(self, observed: ForwardModel) -> There:
         """Return the model of what is observed on finer meshes."""
         return None if self.meshes is None else self.meshes.observing(cast("SpecimenModel", observed)), self.why
@@ -169,25 +186,28 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
     invert_field = _inverting_field(study, made) if study.field else None
 
-    def look(name: str, model: ForwardModel) -> Finer:
-        """Solve on finer meshes, which are no solves of the model."""
-        kept = KeptEvaluate(model, ensemble.group, checkpoint, f"{name}/{FINER}", lambda done, failed: None)
+    def beside(name: str, model: ForwardModel) -> KeptEvaluate:
+        """Solve other models, on finer meshes or at moved points, which are no solves of the model."""
+        kept = KeptEvaluate(model, ensemble.group, checkpoint, name, lambda done, failed: None)
         solving.append(kept)
-        return solved_by(kept)
+        return kept
 
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         observed = made.observing(number)
-        finer = _solved(made.finer(observed), partial(look, names[number]))
+        finer = _solved(made.finer(observed), lambda model: solved_by(beside(f"{names[number]}/{FINER}", model)))
+        shared = _shared(made.shared(number), lambda model: beside(f"{names[number]}/{MOVED}", model))
         if invert_field is not None:
             states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
             solving.append(states)
-            return invert_field(number, states, finer or NOT_LOOKED, ensemble)
+            return invert_field(number, states, finer or NOT_LOOKED, ensemble, shared)
         kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
         solving.append(kept)
         data = study.measured(number)
-        return invert_by_group(study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say)
+        return invert_by_group(
+            study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say, shared
+        )
 
     def forget() -> None:
         """Remove the solves of a data set, whose results are stored."""
@@ -211,7 +231,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     )
 
 
-def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, ForwardModel, Finer, Ensemble], xr.Dataset]:
+def _inverting_field(study: InversionStudy, made: _Made) -> _InvertField:
     """Return what inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
@@ -220,12 +240,33 @@ def _inverting_field(study: InversionStudy, made: _Made) -> Callable[[int, Forwa
     model, prior = made.model, study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
 
-    def invert(number: int, states: ForwardModel, finer: Finer, ensemble: Ensemble) -> xr.Dataset:
+    def invert(
+        number: int, states: ForwardModel, finer: Finer, ensemble: Ensemble, shared: Shared | None
+    ) -> xr.Dataset:
         data, errors = study.measured(number), study.data.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
-        return invert_field(posterior, data, study.method, Vertices(offset, prior.matern.mass), finer, ensemble.say)
+        vertices = Vertices(offset, prior.matern.mass)
+        return invert_field(posterior, data, study.method, vertices, finer, ensemble.say, shared)
 
     return invert
+
+
+def _shared(
+    both: tuple[SharedMotion, ForwardModel] | None, evaluation: Callable[[ForwardModel], Evaluate]
+) -> Shared | None:
+    """Return what errors the data share, given the evaluation of the model that tells what they are."""
+    if both is None:
+        return None
+    motion, model = both
+    evaluate = evaluation(model)
+
+    def errors(point: FloatArray) -> FloatArray:
+        found = evaluate(Request(point[None]))
+        for failure in found.failures:
+            raise SolveError(failure.reason)
+        return motion.errors(found.outputs[0])
+
+    return errors
 
 
 def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:
@@ -245,12 +286,16 @@ def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> Meth
     model = None if there is None else there[0]
     if model is not None:
         others = {FINER: lambda: model}
+    both = made.shared(0)
+    if both is not None:
+        others[MOVED] = lambda: both[1]
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
         errors = study.data.errors
-        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say)
+        shared = _shared(both, lambda _: recorders["/"].on(MOVED))
+        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say, shared)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from forward.bodies.geometry import Body
     from forward.model import FloatArray
     from forward.specimen import Specimen
+    from inverse.data.shared_motion import SharedMotion
 
 
 LISTED = 5  # points that do not belong to a body
@@ -63,10 +64,11 @@ class DataFiles(Reading):
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
         directory; a single one may be given as a string. Each file is a data set and is inverted separately. A file in
         TOML says which files of a scan belong together, and any of what follows for it alone.
-    sigma, unit, units, field, on_surface, tolerance, beyond, registration
+    sigma, unit, units, field, on_surface, tolerance, beyond, registration, between
         What the files do not say themselves (`inverse.data.scans`): standard deviation (m) of the errors, unit, array
         of displacements, whether the points lie on the surface, how far (m) points may lie from the body, what is
-        done about others, and the rigid motion from the frame of the files to that of the body.
+        done about others, the rigid motion from the frame of the files to that of the body, and what is
+        unknown of motions between scans.
     errors
         Distribution of the errors: { kind = "normal" }, or { kind = "student-t", degrees = 4 } if a few data may be
         outliers.
@@ -146,6 +148,8 @@ class Measurement:
         The motion from the frame of the file to that of the body; None if they are the same.
     on_surface
         Whether its points lie on the surface.
+    between
+        Standard deviations (rad, m) of rigid motions between the undeformed scan and that of each load case.
     """
 
     observations: Observations
@@ -157,6 +161,23 @@ class Measurement:
     left_out: tuple[str, ...] = ()
     registered: Registered | None = None
     on_surface: bool = False
+    between: tuple[float, float] = (0.0, 0.0)
+
+    def motion(self, body: Body) -> SharedMotion | None:
+        """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
+        from inverse.data.shared_motion import SharedMotion
+
+        registered = self.registered
+        root = registered.root if registered is not None and registered.uncertain else np.zeros((0, 6))
+        root = root[np.linalg.norm(root, axis=1) > 0]
+        if not len(root) and not any(self.between):
+            return None
+        data = self.observations.components()
+        centre = registered.centre if registered is not None else data.places.mean(axis=0)
+        surface = Surface.of(body) if self.on_surface else None
+        project = (lambda points: surface.nearest(points)[0]) if surface is not None else None
+        between = np.repeat(self.between, 3)
+        return SharedMotion(data.places, data.along, data.cases, root, between, centre, project)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -228,7 +249,16 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     if "stiffness" in found.truth:
         places, stiffness = _true_stiffness(path.parent / found.truth["stiffness"])
     return Measurement(
-        found, placed.distances, truth, inclusions, places, stiffness, placed.left_out, registered, scan.surface
+        found,
+        placed.distances,
+        truth,
+        inclusions,
+        places,
+        stiffness,
+        placed.left_out,
+        registered,
+        scan.surface,
+        scan.moved_between,
     )
 
 

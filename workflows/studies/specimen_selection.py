@@ -38,7 +38,7 @@ class DisplacementFile(Reading):
     sigma
         Standard deviation (m) of the errors, if the file does not state it; not needed if the method's noise is given
         otherwise.
-    unit, units, field, on_surface, tolerance, beyond, registration
+    unit, units, field, on_surface, tolerance, beyond, registration, between
         As of an inversion.
     """
 
@@ -54,13 +54,12 @@ class DisplacementFile(Reading):
         """
         cases = tuple(case.name for case in specimen.cases)
         try:
-            placed, registered, _ = read_on(folder / self.file, cases, specimen.body, self)
+            placed, registered, scan = read_on(folder / self.file, cases, specimen.body, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        if registered is not None and registered.uncertain:
-            raise StudyError(
-                f"data: {self.file}: an uncertain registration is for inversions, expected a known one here"
-            )
+        if (registered is not None and registered.uncertain) or any(scan.moved_between):
+            message = f"data: {self.file}: uncertain motions are for inversions, expected a known registration here"
+            raise StudyError(message)
         found, moved = placed.observations, placed.distances
         data = found.components()
         known = bool(np.isfinite(data.sigma).all())

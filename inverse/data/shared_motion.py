@@ -1,0 +1,129 @@
+"""Errors that all data of a scan share, because its registration is uncertain.
+
+A point that was put at X, and a displacement d measured along the unit vector a there, belong in truth to
+
+    X* = e^[ω](X − c) + c + τ   and   e^[ω]a,   (ω, τ) ~ N(0, LLᵀ).
+
+To first order d differs from what is predicted for X and a by G(ω, τ), the derivative of (e^[ω]a)·u(X*). And where the
+specimen or the scanner has moved between the undeformed scan and that of load case k, by another motion (ω_k, τ_k), by
+a·(ω_k × (X + u − c) + τ_k). The errors of the data have then the covariance σ² + GLLᵀGᵀ + …: the six unknowns of a
+motion, on which the data depend linearly, are integrated out. The displacements u are the model's: at the mean of the
+prior before the search for the mode, then at the mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from inverse.data.approximation_error import Whitening
+from inverse.data.registration import Rigid, slopes
+from inverse.fields.low_rank import Spectrum
+
+STEP = 1e-4  # of the extent of the points: how far they are moved for derivatives
+DETERMINED = 1.0  # eigenvalue from which on data say more about a motion than the registration
+
+Shared = Callable[[FloatArray], FloatArray]  # parameters (d,) → (k, m), what errors the data share, in their units
+
+
+@dataclass(frozen=True, eq=False)
+class SharedMotion:
+    """Uncertain rigid motions of m data.
+
+    Parameters
+    ----------
+    places
+        Where (m, 3) they are (m).
+    along
+        Directions (m, 3) of what was measured.
+    cases
+        Numbers (m,) of their load cases, in ascending order.
+    root
+        (k, 6): Lᵀ of the registration; may be empty.
+    between
+        Standard deviations (6,) of the motions between scans (rad, m), or zeros.
+    centre
+        c (3,).
+    project
+        Puts points (n, 3) back on the surface; None if they may lie anywhere.
+    """
+
+    places: FloatArray
+    along: FloatArray
+    cases: NDArray[np.int64]
+    root: FloatArray
+    between: FloatArray
+    centre: FloatArray
+    project: Callable[[FloatArray], FloatArray] | None = None
+
+    @cached_property
+    def steps(self) -> FloatArray:
+        """Motions (k, 6) by which points are moved, parallel to the rows of the root; the largest moves are small."""
+        extent = float(np.ptp(self.places, axis=0).max() or 1.0)
+        size = np.linalg.norm(slopes(self.places, self.centre) @ self.root.T, axis=1).max(axis=0, initial=0.0)
+        return np.asarray(self.root * (STEP * extent / np.maximum(size, 1e-300))[:, None])
+
+    @cached_property
+    def observed(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64], FloatArray]:
+        """Places (n, 3), axes (n,), load cases (n,) and directions (n, 3) of what must be known of a state."""
+        m = len(self.places)
+        moved = [Rigid().moved(step, self.centre)(self.places) for step in self.steps]
+        if self.project is not None:
+            moved = [self.project(points) for points in moved]
+        places = np.concatenate([np.repeat(self.places, 3, axis=0), *moved])
+        axes = np.concatenate([np.tile([0, 1, 2], m), np.zeros(m * len(moved), dtype=np.int64)])
+        cases = np.concatenate([np.repeat(self.cases, 3), np.tile(self.cases, len(moved))])
+        along = np.concatenate([np.tile(np.eye(3), (m, 1)), np.tile(self.along, (len(moved), 1))])
+        order = self._order
+        return places[order], axes[order], cases[order], along[order]
+
+    @cached_property
+    def _order(self) -> NDArray[np.intp]:
+        cases = np.concatenate([np.repeat(self.cases, 3), np.tile(self.cases, len(self.root))])
+        return np.argsort(cases, kind="stable")
+
+    def errors(self, outputs: FloatArray) -> FloatArray:
+        """Return what the data share (k, m), given the observed outputs (n,) of a state."""
+        m = len(self.places)
+        values = np.empty(len(outputs))
+        values[self._order] = outputs
+        u = values[: 3 * m].reshape(m, 3)
+        moved = values[3 * m :].reshape(len(self.root), m)
+        rows = []
+        for step, root, there in zip(self.steps, self.root, moved, strict=True):
+            size = np.linalg.norm(root) / np.linalg.norm(step)
+            # (e^[ω]a)·u(X*) is measured as that along a: the direction turns too.
+            turned = np.cross(step[:3], self.along)
+            rows.append(size * (there - (self.along * u).sum(axis=1) + (turned * u).sum(axis=1)))
+        if self.between.any():
+            each = np.einsum("ma,mak->km", self.along, slopes(self.places + u, self.centre)) * self.between[:, None]
+            rows += [row * (self.cases == case) for case in np.unique(self.cases) for row in each]
+        return np.array(rows).reshape(-1, m)
+
+
+def determined(spectrum: Spectrum, whitening: Whitening, shared: FloatArray, root: FloatArray) -> FloatArray:
+    """Return eigenvalues (k,), descending, of what the data say about shared errors, over what is known of them before.
+
+    Parameters
+    ----------
+    spectrum
+        Of the data at the mode: what the unknowns explain cannot be told from a motion.
+    whitening
+        Of the data, with these errors in it.
+    shared
+        (k, m), in the units of the data.
+    root
+        √ (m,) of the weights of the data.
+    """
+    G = root * shared / whitening.sigma
+    images = whitening.undone(spectrum.images)
+    # (I + AAᵀ)⁻¹ = I − Q diag(s²/(1 + s²)) Qᵀ with the images of the whole model, without these errors.
+    _, sizes, rows = np.linalg.svd(images, full_matrices=False)
+    seen = G @ rows.T
+    S: FloatArray = G @ G.T - (seen * (sizes**2 / (1 + sizes**2))) @ seen.T
+    return np.asarray(np.maximum(np.linalg.eigvalsh(S)[::-1], 0.0))
