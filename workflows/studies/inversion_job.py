@@ -294,7 +294,7 @@ def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> Meth
         recorders["/"] = Recorder(evaluate)
         finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
         errors = study.data.errors
-        shared = _shared(both, lambda _: recorders["/"].on(MOVED))
+        shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
         found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say, shared)
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 

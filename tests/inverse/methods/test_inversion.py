@@ -17,6 +17,7 @@ from benchmarks import buckling
 from forward.model import FunctionModel, SolveError, Stability
 from inverse.criticism.chains import weigh_field
 from inverse.data.observations import Components
+from inverse.data.registration import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.invert import Invert
@@ -291,6 +292,49 @@ def test_synthetic_data_say_what_they_are_of(folder):
     assert study.measurements[0].truth["material.mu"] == 1e4
     page = (folder / "made" / "report.html").read_text()
     assert "2 data sets" in page
+
+
+def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
+    """Turned by 5°, shifted by 10 mm, in mm, with a missing component; and a wider one if that is uncertain."""
+    place = folder / "turned"
+    place.mkdir()
+    rows = list(csv.DictReader(line for line in (folder / "data" / "made-2.csv").open() if not line.startswith("#")))
+    turn, shift = turned((0.0, 0.0, 5.0)), np.array([0.01, 0, 0])
+    heads = [*(f"{name} [mm]" for name in ("x", "y", "z", "ux", "uy", "uz", "sigma")), "case"]
+    for name, R, t in (("plain", np.eye(3), np.zeros(3)), ("turned", turn, shift)):
+        lines = [",".join(heads)]
+        for number, row in enumerate(rows):
+            at, motion = (np.array([float(row[f"{u}{axis}"]) for axis in "xyz"]) for u in ("", "u"))
+            cells = [repr(float(x)) for x in 1e3 * np.concatenate([(at - t) @ R, motion @ R])]
+            cells += [repr(1e3 * float(row["sigma"])), row["case"]]
+            if number == 3:
+                cells[5] = ""  # along the axis about which it is turned
+            lines.append(",".join(cells))
+        (place / f"{name}.csv").write_text("\n".join(lines))
+    known = 'data.registration={ kind = "given", rotation = [0, 0, 5], translation = [10, 0, 0], MORE }'
+    found = {}
+    for name, more, changes in (
+        ("plain", "", ["method.mesh_error=false"]),
+        ("turned", "rotation_std = 0", ["method.mesh_error=false"]),
+        ("unsure", "rotation_std = 2, translation_std = 20", []),
+        ("field", "rotation_std = 2, translation_std = 20", ["method.mesh_error=false", "method.draws=10"]),
+    ):
+        study = folder / ("field.toml" if name == "field" else "few.toml")
+        file = "plain" if name == "plain" else "turned"
+        scan = [known.replace("MORE", more), "data.units='mm'"] if more else []
+        asked = load(study, [f"data.files=['turned/{file}.csv']", *scan, *changes])
+        assert run_study(asked, name, place / f"{name}-out", quiet=True, report=False) in {0, 3}
+        found[name] = xr.load_dataset(place / f"{name}-out" / "results.nc").isel(data_set=0)
+    np.testing.assert_allclose(found["turned"]["mode"], found["plain"]["mode"], rtol=1e-6)
+    np.testing.assert_allclose(found["turned"]["laplace_std"], found["plain"]["laplace_std"], rtol=1e-5)
+    wider = found["unsure"]["laplace_std"] / found["turned"]["laplace_std"]
+    assert wider.sel(parameter="material.mu") > 1.5, wider
+    assert found["unsure"].sizes["motion"] == found["field"].sizes["motion"] == 6
+    said = [one["text"] for one in json.loads((place / "unsure-out" / "summary.json").read_text())["findings"]]
+    assert any(
+        "turned: registered: rotated by 0, 0, 5° about x, y and z, shifted by 0.01, 0, 0 m" in one for one in said
+    )
+    assert any("of 6 rigid motions that are uncertain, the data determine" in one for one in said)
 
 
 def test_one_bad_file_does_not_stop_the_others(folder):
