@@ -44,8 +44,9 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     jsonschema.validate(tomllib.loads(study.read_text()), schema)
     checked = run(None, TISSUQ, "check", study)
     assert checked.returncode == 0, checked.stderr
-    done = run(2, TISSUQ, "run", study, "--out", out)
+    done = run(2, TISSUQ, "run", study, "--out", out, "--no-report")
     assert done.returncode == 0, done.stderr
+    assert run(None, TISSUQ, "report", out).returncode == 0
     data = xr.load_dataset(out / "results.nc")
     assert (data["smallest"] > 0).all()
     assert (data["smallest"] < data["largest"]).all()
@@ -57,7 +58,7 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
     assert f"{swept:.4g}" in page
     sources = json.loads((out / "sources.json").read_text())["files"]
     assert {"my_tissue", "my_loads", "my_outputs", "my_methods"} <= sources.keys()
-    again = run(None, TISSUQ, "run", study, "--out", folder / "one")
+    again = run(None, TISSUQ, "run", study, "--out", folder / "one", "--no-report")
     assert again.returncode == 0, again.stderr
     assert (folder / "one" / "results.nc").read_bytes() == (out / "results.nc").read_bytes()
     loads = folder / "my_loads.py"
@@ -72,7 +73,7 @@ def test_a_study_of_a_body_on_two_ranks(folder, schema):
 def test_a_model_with_numbers_of_its_own(folder, schema):
     study = folder / "beam.toml"
     jsonschema.validate(tomllib.loads(study.read_text()), schema)
-    done = run(2, TISSUQ, "run", study, "--out", folder / "beam")
+    done = run(2, TISSUQ, "run", study, "--out", folder / "beam", "--no-report")
     assert done.returncode == 0, done.stderr
     data = xr.load_dataset(folder / "beam" / "results.nc")
     cube = (0.12**4 - 0.08**4) / (4 * 0.04)

@@ -18,7 +18,9 @@ def run(tmp_path):
 
     def run(name, *changes):
         settings = [word for change in changes for word in ("--set", change)]
-        code = main(["run", str(CASES / f"{name}.toml"), "--quiet", "--out", str(tmp_path / "out"), *settings])
+        code = main(
+            ["run", str(CASES / f"{name}.toml"), "--quiet", "--no-report", "--out", str(tmp_path / "out"), *settings]
+        )
         summary = json.loads((tmp_path / "out" / "summary.json").read_text())
         return code, summary, xr.load_dataset(tmp_path / "out" / "results.nc")
 

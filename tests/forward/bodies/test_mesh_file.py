@@ -467,7 +467,7 @@ def test_the_organ(tmp_path):
 
     study = load(ROOT / "configs" / "organ.toml", ["method.samples=16"])
     assert study.model.unknowns >= 10_000
-    assert run(study, "organ", tmp_path / "organ", quiet=True) == 0
+    assert run(study, "organ", tmp_path / "organ", quiet=True, report=False) == 0
     data = xr.load_dataset(tmp_path / "organ" / "results.nc")
     assert -0.01 < float(data["mean"].sel(output="push")) < 0
 

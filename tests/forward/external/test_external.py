@@ -177,22 +177,22 @@ def test_changed_source_is_another_model(tmp_path, monkeypatch):
     blocks = 'parameters={a={kind="uniform", lower=0, upper=1}}', 'model.outputs=["f"]', "model.parameters={a=1.0}"
     changing = parse(tomllib.loads(STUDY.replace("jacobian", "# ")), ["model.function=changing_model.f", *blocks])
     before = sources(changing.model.modules)
-    assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
-    assert run(changing, "changing", tmp_path / "out", quiet=True) == 0
+    assert run(changing, "changing", tmp_path / "out", quiet=True, report=False) == 0
+    assert run(changing, "changing", tmp_path / "out", quiet=True, report=False) == 0
     path.write_text("def f(p):\n    return 2 * p[0]\n")
     assert before != sources(changing.model.modules)
     with pytest.raises(StudyError, match=r"changing_model\.py has changed; choose another --out"):
-        run(changing, "changing", tmp_path / "out", quiet=True)
+        run(changing, "changing", tmp_path / "out", quiet=True, report=False)
     sys.modules.pop("changing_model")
 
 
 @pytest.mark.parametrize("text", [b"{}", b"[]", b"", b"nan", b"\xff", b"[" * 5000, b'{"failed": 0}'])
 def test_a_damaged_summary_is_made_again(tmp_path, text):
     case = study("method.samples=8")
-    assert run(case, "beam", tmp_path / "out", quiet=True) == 0
+    assert run(case, "beam", tmp_path / "out", quiet=True, report=False) == 0
     before = (tmp_path / "out" / "results.nc").read_bytes()
     (tmp_path / "out" / "summary.json").write_bytes(text)
-    assert run(case, "beam", tmp_path / "out", quiet=True) == 0
+    assert run(case, "beam", tmp_path / "out", quiet=True, report=False) == 0
     assert (tmp_path / "out" / "results.nc").read_bytes() == before
     assert read_summary(tmp_path / "out")["failed"] == 0
 
@@ -202,10 +202,10 @@ def test_a_study_that_could_not_begin_leaves_no_directory(tmp_path):
         case = study("method.samples=8", *changes)
         if changes:
             with pytest.raises(ModelError):
-                run(case, "beam", tmp_path / "out", quiet=True)
+                run(case, "beam", tmp_path / "out", quiet=True, report=False)
             assert not (tmp_path / "out").exists()
         else:
-            assert run(case, "beam", tmp_path / "out", quiet=True) == 0
+            assert run(case, "beam", tmp_path / "out", quiet=True, report=False) == 0
 
 
 def test_modules_are_found_beside_the_study(tmp_path, monkeypatch, capsys):

@@ -99,7 +99,7 @@ def tissuq(monkeypatch, capsys):
 @pytest.mark.parametrize("way", WAYS)
 def test_a_module_that_changes_between_interrupt_and_restart_is_refused(tmp_path, tissuq, way):
     write(tmp_path, way)
-    command = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet")
+    command = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     code, said = tissuq(*command)
     assert code == 1, said
     assert any((tmp_path / "out" / "evaluations").glob("*.h5"))
@@ -122,7 +122,7 @@ def test_before_anything_is_computed_the_model_may_change(tmp_path, tissuq):
     write(tmp_path, "helper")
     model = tmp_path / "own_model.py"
     model.write_text(model.read_text().replace("count > 20", "count > 0"))
-    command = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet")
+    command = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     code, said = tissuq(*command)
     assert code == 1, said
     (tmp_path / "own_helper.py").write_text(HELPER.format(3))

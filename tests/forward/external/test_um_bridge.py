@@ -418,7 +418,7 @@ def test_outputs_measured_at_a_server_are_inverted(beam, tmp_path):
         "data": {"outputs": measured, "noise": {"relative": 1e-3}},
         "method": {"kind": "invert", "samples": 32, "starts": 1, "draws": 50},
     }
-    assert run(parse(blocks), "server", tmp_path / "out", quiet=True) in (0, 3)
+    assert run(parse(blocks), "server", tmp_path / "out", quiet=True, report=False) in (0, 3)
     one = xr.load_dataset(tmp_path / "out" / "results.nc", engine="h5netcdf").isel(data_set=0)
     np.testing.assert_allclose(one["predicted"], one["measured"], rtol=1e-3)
     assert (np.abs(one["mode"] - truth) < 3 * one["std"]).all()

@@ -77,7 +77,17 @@ def test_whoever_is_killed_while_compiling_is_not_waited_for(tmp_path):
 def test_a_cache_that_cannot_be_made_is_said_in_one_line(tmp_path):
     (tmp_path / "tissuq").write_text("no folder")
     done = subprocess.run(
-        on_ranks(None, sys.executable, "-m", "workflows", "run", "configs/tiny.toml", "--out", tmp_path / "out"),
+        on_ranks(
+            None,
+            sys.executable,
+            "-m",
+            "workflows",
+            "run",
+            "configs/tiny.toml",
+            "--no-report",
+            "--out",
+            tmp_path / "out",
+        ),
         capture_output=True,
         text=True,
         timeout=100,

@@ -90,15 +90,15 @@ def results(out):
     return xr.load_dataset(out / "results.nc", engine="h5netcdf")
 
 
-def ran(study, out, *changes):
+def ran(study, out, *changes, report=False):
     """Run a study in this process, without its words."""
     sets = [word for change in changes for word in ("--set", change)]
-    return main(["run", str(study), "--out", str(out), "--quiet", *sets])
+    return main(["run", str(study), "--out", str(out), "--quiet", *([] if report else ["--no-report"]), *sets])
 
 
 def test_a_linear_model_has_its_exact_posterior(folder):
     """Mode, standard deviations and evidence; the residuals, repeated measurements among them; nothing of meshes."""
-    assert ran(folder / "stated.toml", folder / "stated") == 0
+    assert ran(folder / "stated.toml", folder / "stated", report=True) == 0
     one = results(folder / "stated").isel(data_set=0)
     mode, covariance, log_evidence = exactly([0, 2, 2], VALUES, SIGMA)
     np.testing.assert_allclose(one["mode"], mode, rtol=1e-8)
@@ -122,7 +122,7 @@ def test_a_linear_model_has_its_exact_posterior(folder):
 def test_tables_are_data_sets_side_by_side(folder):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     files = "data={files='data', noise={relative=0.1}}"
-    assert ran(folder / "stated.toml", folder / "batch", files) == 3
+    assert ran(folder / "stated.toml", folder / "batch", files, report=True) == 3
     found = results(folder / "batch")
     assert found["ok"].to_numpy().tolist() == [True, True, False]
     assert "the model has no output 'ux'" in str(found["why"].values[2])
@@ -175,7 +175,7 @@ def test_files_of_one_name_in_different_folders_are_different_data(folder):
 def test_groups_of_ranks_give_the_same_bytes(folder):
     for name, changes in (("stated", ()), ("batch", ("--set", "data={files='data', noise={relative=0.1}}"))):
         out = folder / f"{name}-shared"
-        done = run_script(2, SCRIPT, "run", folder / "stated.toml", "--out", out, "--quiet", *changes)
+        done = run_script(2, SCRIPT, "run", folder / "stated.toml", "--out", out, "--quiet", "--no-report", *changes)
         assert done.returncode in (0, 3), done.stderr
         one, other = (results(place) for place in (folder / name, out))
         xr.testing.assert_identical(one.drop_attrs(), other.drop_attrs())

@@ -112,7 +112,7 @@ def test_a_candidate_with_a_wrong_jacobian_is_named(folder):
     wrong = LINES.replace("return OTHER\n", "return OTHER * np.array([1.0, 0.9])\n")
     (folder / "rival_wrong.py").write_text(wrong)
     (folder / "wrong.toml").write_text(STUDY.replace("rival_lines", "rival_wrong"))
-    assert main(["run", str(folder / "wrong.toml"), "--out", str(folder / "wrong"), "--quiet"]) == 3
+    assert main(["run", str(folder / "wrong.toml"), "--out", str(folder / "wrong"), "--quiet", "--no-report"]) == 3
     summary = json.loads((folder / "wrong" / "summary.json").read_text())
     errors = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
     assert [text for text in errors if text.startswith("Candidate 'other': ") and "by b 10 % off" in text]
@@ -188,7 +188,10 @@ def test_outputs_that_follow_single_cells_are_named(tmp_path):
 @pytest.mark.fem
 def test_bodies_are_looked_at_on_finer_meshes(tmp_path):
     (tmp_path / "bars.toml").write_text(BARS)
-    assert main(["run", str(tmp_path / "bars.toml"), "--out", str(tmp_path / "out"), "--quiet"]) in (0, 3)
+    assert main(["run", str(tmp_path / "bars.toml"), "--out", str(tmp_path / "out"), "--quiet", "--no-report"]) in (
+        0,
+        3,
+    )
     with xr.open_dataset(tmp_path / "out" / "results.nc", engine="h5netcdf") as found:
         assert found["mesh_checked"].to_numpy().all()
         assert np.isfinite(found["mesh_log_evidence"]).all()

@@ -399,7 +399,7 @@ def test_priors_with_inadmissible_tails_are_no_failures(small):
     told = "note *mooney-rivlin: 23 % of the prior is of materials that are not stable at rest"
     assert re.search(told, "\n".join(plan(load(small))))
     out = small.parent / "out"
-    done = run(None, TISSUQ, "run", small, "--out", out)
+    done = run(None, TISSUQ, "run", small, "--out", out, "--no-report")
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "complete"
@@ -419,7 +419,7 @@ def test_a_chain_that_ends_before_the_data_has_no_likelihood(small):
     )
     small.write_text(text)
     out = small.parent / "out"
-    assert run(None, TISSUQ, "run", small, "--out", out).returncode == 0
+    assert run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["failed"] == 0 < summary["zero_likelihood"]
     assert any("no stress in the test" in one["text"] for one in summary["findings"])
@@ -432,7 +432,7 @@ def test_arviz_reads_results_as_they_are(small):
     rows = "".join(f"uniaxial,{x},{2 * 0.5 * (x - x**-2):.3f}\n" for x in (1.3, 1.5, 1.7, 1.9))
     (small.parent / "table.csv").write_text(TABLE + rows)
     out = small.parent / "out"
-    assert run(None, TISSUQ, "run", small, "--out", out).returncode == 0
+    assert run(None, TISSUQ, "run", small, "--out", out, "--no-report").returncode == 0
     found = xr.load_dataset(out / "results.nc", engine="h5netcdf")
     data = arviz.from_netcdf(out / "results.nc")
     assert {"posterior", "prior", "log_likelihood", "observed_data"} <= set(data.groups())
@@ -501,7 +501,7 @@ def test_a_study_from_the_command_line(small):
     for found in summary["models"].values():
         assert set(found) == {"log_evidence", "log_evidence_error", "probability", "trusted"}
     assert sum(found["probability"] for found in summary["models"].values()) == pytest.approx(1)
-    done = run(2, TISSUQ, "run", small, "--out", small.parent / "two")
+    done = run(2, TISSUQ, "run", small, "--out", small.parent / "two", "--no-report")
     assert done.returncode == 0, done.stderr
     assert (small.parent / "one/results.nc").read_bytes() == (small.parent / "two/results.nc").read_bytes()
     page = (small.parent / "one" / "report.html").read_text()

@@ -286,8 +286,8 @@ def test_a_study_says_what_its_meshes_do(study, monkeypatch):
 @pytest.mark.slow
 def test_a_study_from_the_command_line(study):
     """One rank or two: the same bytes; the report shows what is left of the data."""
-    for name, ranks in (("one", None), ("two", 2)):
-        done = run(ranks, TISSUQ, "run", study, "--out", study.parent / name)
+    for name, ranks, words in (("one", None, ()), ("two", 2, ("--no-report",))):
+        done = run(ranks, TISSUQ, "run", study, "--out", study.parent / name, *words)
         assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (study.parent / "one/results.nc").read_bytes() == (study.parent / "two/results.nc").read_bytes()
     page = (study.parent / "one" / "report.html").read_text()
@@ -300,14 +300,14 @@ def test_a_study_from_the_command_line(study):
 @pytest.mark.slow
 def test_same_bits_after_a_kill(study):
     directory = study.parent / "killed"
-    command = [TISSUQ, "run", study, "--out", directory, "--set", "method.samples=256"]
+    command = [TISSUQ, "run", study, "--out", directory, "--no-report", "--set", "method.samples=256"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     while process.poll() is None and len(list(directory.glob("evaluations/*"))) < 12:
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     for out in (directory, study.parent / "whole"):
-        done = run(None, TISSUQ, "run", study, "--out", out, "--set", "method.samples=256")
+        done = run(None, TISSUQ, "run", study, "--out", out, "--no-report", "--set", "method.samples=256")
         assert done.returncode == 3, done.stderr  # its meshes are too coarse, which is found
     assert (directory / "results.nc").read_bytes() == (study.parent / "whole/results.nc").read_bytes()
 

@@ -570,11 +570,11 @@ def test_the_source_is_beside_the_study(tmp_path, monkeypatch):
     first, again = (tmp_path / "studies" / name for name in ("first.toml", "again.toml"))
     first.write_text(f'{PRODUCT}kind = "monte-carlo"\nsamples = 200\nfields = false\n')
     again.write_text(f'{PRODUCT}kind = "sobol"\ndesign = "given-data"\nsource = "results/first"\nfields = false\n')
-    run_study(load(first), "first", tmp_path / "studies" / "results" / "first", quiet=True)
+    run_study(load(first), "first", tmp_path / "studies" / "results" / "first", quiet=True, report=False)
     beside = load(again)
     assert beside.method.source == str(tmp_path / "studies" / "results" / "first")
     assert parse(document(beside)) == beside
-    run_study(beside, "again", tmp_path / "again", quiet=True)
+    run_study(beside, "again", tmp_path / "again", quiet=True, report=False)
     with xr.open_dataset(tmp_path / "again" / "results.nc", engine="h5netcdf") as found:
         np.testing.assert_allclose(found["sobol_total"][0], 16 / 37, atol=0.05)
         assert found.attrs["stopped"].startswith("from the results of first: ")
@@ -584,5 +584,5 @@ def test_the_source_is_beside_the_study(tmp_path, monkeypatch):
     assert load(moved).method.source == beside.method.source
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"results/first: holds no results\.nc"):
-        run_study(load(moved), "none", tmp_path / "none", quiet=True)
+        run_study(load(moved), "none", tmp_path / "none", quiet=True, report=False)
     assert not (tmp_path / "none").exists()

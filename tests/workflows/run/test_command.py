@@ -138,7 +138,7 @@ def test_another_study_is_refused(finished):
 @pytest.mark.mpi
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 def test_same_bits_on_any_number_of_groups(finished, tmp_path, ranks):
-    done = tissuq("run", TINY, "--out", tmp_path / "out", ranks=ranks)
+    done = tissuq("run", TINY, "--out", tmp_path / "out", "--no-report", ranks=ranks)
     assert done.returncode == 0, done.stderr
     assert_same_bits(finished, tmp_path / "out")
 
@@ -151,6 +151,7 @@ def test_a_model_on_two_ranks_agrees(finished, tmp_path):
         TINY,
         "--out",
         tmp_path / "out",
+        "--no-report",
         "--set",
         "parallel.ranks_per_model=2",
         "--set",
@@ -167,7 +168,7 @@ def test_a_model_on_two_ranks_agrees(finished, tmp_path):
 @pytest.mark.fem
 @pytest.mark.mpi
 def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
-    arguments = ("run", TINY, "--set", "method.samples=160", "--out")
+    arguments = ("run", TINY, "--set", "method.samples=160", "--no-report", "--out")
     whole = tmp_path / "whole"
     assert tissuq(*arguments, whole, ranks=2).returncode == 0
     broken = tmp_path / "broken"
@@ -202,11 +203,12 @@ def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
 @pytest.mark.mpi
 def test_more_ranks_than_work(tmp_path):
     """The others are idle, and the results the same."""
-    done = tissuq("run", TINY, "--out", tmp_path / "out", "--set", "parallel.blocks=1", ranks=2)
+    arguments = ("run", TINY, "--no-report", "--set", "parallel.blocks=1", "--out")
+    done = tissuq(*arguments, tmp_path / "out", ranks=2)
     assert done.returncode == 0, done.stderr
     (said,) = [line for line in done.stderr.splitlines() if line.startswith("note:")]
     assert said.startswith("note: 2 groups of ranks were started for 1 task: 1 of them will be idle")
-    alone = tissuq("run", TINY, "--out", tmp_path / "alone", "--set", "parallel.blocks=1")
+    alone = tissuq(*arguments, tmp_path / "alone")
     assert "note:" not in alone.stderr
     assert_same_bits(tmp_path / "alone", tmp_path / "out")
 

@@ -149,11 +149,11 @@ def test_check_foresees_that_memory_runs_out():
     ],
 )
 def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
-    done = tissuq("run", study, "--out", tmp_path / "out", ranks=ranks, case=case)
+    done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", ranks=ranks, case=case)
     assert done.returncode == 1
     (said,) = reasons(done)
     assert re.fullmatch(re.escape(reason) + r" at a = 0\.\d+", said)  # of a machine that has plenty, no figures
-    again = tissuq("run", study, "--out", tmp_path / "out", ranks=ranks)
+    again = tissuq("run", study, "--out", tmp_path / "out", "--no-report", ranks=ranks)
     assert again.returncode == 0, again.stderr
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["failed"] == 0
 
@@ -162,7 +162,7 @@ def test_a_model_that_ends_the_run(study, tmp_path, ranks, case, reason):
 @pytest.mark.parametrize("ranks", [None, 2])
 def test_a_model_that_never_ends_is_a_failed_solve(study, tmp_path, ranks):
     limited = ("--set", "model.solve_seconds=0.1", "--set", "method.samples=20")
-    done = tissuq("run", study, "--out", tmp_path / "out", *limited, ranks=ranks, case="loop")
+    done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks, case="loop")
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert 0 < summary["failed"] < 20
@@ -223,7 +223,7 @@ def test_a_server_that_never_ends_is_a_failed_solve(study, tmp_path, monkeypatch
         there = STUDY.replace('"python"', '"um-bridge"').replace('function = "endless.value"', f'url = "{url}"')
         study.write_text(there)
         limited = ("--set", "model.solve_seconds=0.2", "--set", "method.samples=20")
-        done = tissuq("run", study, "--out", tmp_path / "out", *limited, ranks=ranks)
+        done = tissuq("run", study, "--out", tmp_path / "out", "--no-report", *limited, ranks=ranks)
         server.shutdown()
     assert done.returncode == 3, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -251,7 +251,7 @@ def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
 def test_an_interrupted_study_says_one_line(study, tmp_path, ranks, number):
     out = tmp_path / "out"
     process = subprocess.Popen(
-        on_ranks(ranks, TISSUQ, "run", study, "--out", out),
+        on_ranks(ranks, TISSUQ, "run", study, "--out", out, "--no-report"),
         env=environment() | {"CASE": "slow"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -269,7 +269,7 @@ def test_an_interrupted_study_says_one_line(study, tmp_path, ranks, number):
     assert process.returncode == 1
     assert printed == ""
     assert said.splitlines() == ["interrupted; the same command continues"]
-    assert tissuq("run", study, "--out", out).returncode == 0
+    assert tissuq("run", study, "--out", out, "--no-report").returncode == 0
 
 
 ON_A_SMALL_DISK = """
@@ -312,14 +312,14 @@ def test_a_file_system_that_is_full(tmp_path):
     if mounted.returncode:
         pytest.skip("cannot mount")
     try:
-        done = tissuq("run", "configs/tiny.toml", "--out", disk / "out")
+        done = tissuq("run", "configs/tiny.toml", "--out", disk / "out", "--no-report")
         assert done.returncode == 1, done.stderr
         (reason,) = reasons(done)
         assert "cannot be written: No space left on device" in reason
         subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
-        again = tissuq("run", "configs/tiny.toml", "--out", disk / "out")
+        again = tissuq("run", "configs/tiny.toml", "--out", disk / "out", "--no-report")
         assert again.returncode == 0, again.stderr
-        whole = tissuq("run", "configs/tiny.toml", "--out", tmp_path / "whole")
+        whole = tissuq("run", "configs/tiny.toml", "--out", tmp_path / "whole", "--no-report")
         assert whole.returncode == 0
         assert (disk / "out" / "results.nc").read_bytes() == (tmp_path / "whole" / "results.nc").read_bytes()
     finally:
@@ -329,7 +329,7 @@ def test_a_file_system_that_is_full(tmp_path):
 @pytest.mark.parametrize("harm", ["missing", "flipped", "cut"])
 def test_lost_results_are_computed_again(study, tmp_path, harm):
     out = tmp_path / "out"
-    assert tissuq("run", study, "--out", out).returncode == 0
+    assert tissuq("run", study, "--out", out, "--no-report").returncode == 0
     whole = (out / "results.nc").read_bytes()
     if harm == "missing":
         (out / "results.nc").unlink()
@@ -342,7 +342,7 @@ def test_lost_results_are_computed_again(study, tmp_path, harm):
         assert said.returncode == 1
         assert len(said.stderr.splitlines()) == 1
         assert "`tissuq run` with the same study and --out makes it again" in said.stderr
-    done = tissuq("run", study, "--out", out)
+    done = tissuq("run", study, "--out", out, "--no-report")
     assert done.returncode == 0, done.stderr
     assert "missing or damaged, the study is computed again" in done.stderr
     assert (out / "results.nc").read_bytes() == whole
@@ -352,14 +352,14 @@ def test_lost_results_are_computed_again(study, tmp_path, harm):
 def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
     """Their summaries have no hash of the results: these count where they can be read."""
     out = tmp_path / "out"
-    assert tissuq("run", study, "--out", out).returncode == 0
+    assert tissuq("run", study, "--out", out, "--no-report").returncode == 0
     summary = json.loads((out / "summary.json").read_text())
     del summary["provenance"]["results_sha256"]
     (out / "summary.json").write_text(json.dumps(summary))
     whole = (out / "results.nc").read_bytes()
     if harm == "cut":
         (out / "results.nc").write_bytes(whole[:2000])
-    again = tissuq("run", study, "--out", out)
+    again = tissuq("run", study, "--out", out, "--no-report")
     assert again.returncode == 0, again.stderr
     assert ("finished before, nothing to do" in again.stdout) == (harm == "none")
     assert ("computed again" in again.stderr) == (harm == "cut")
@@ -376,7 +376,7 @@ def test_what_stands_in_the_way_is_said_and_the_rest_continues(study, tmp_path, 
         pytest.skip("is a file")
     study.write_text(STUDY.replace("endless.value", "tests.functions.cube").replace('["y", "z"]', '["y"]'))
     out = tmp_path / "out"
-    command = ["run", str(study), "--out", str(out), "--quiet"]
+    command = ["run", str(study), "--out", str(out), "--quiet", *([] if name == "report.html" else ["--no-report"])]
     assert main(command) == 0
     (out / "summary.json").unlink()
     thing = out / name

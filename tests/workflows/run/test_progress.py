@@ -84,7 +84,7 @@ def test_the_command_shows_life_though_quiet(tmp_path, ranks):
     """By the first rank, of the solves of all."""
     (tmp_path / "waiting.py").write_text(MODEL)
     (tmp_path / "study.toml").write_text(STUDY)
-    done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet")
+    done = run_script(ranks, HASTE, "run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     assert (done.returncode, done.stdout) == (0, "")
     counts = [re.fullmatch(r"(\d+)/10\d solves, .* per second, .* left", line) for line in done.stderr.splitlines()]
     assert len(counts) >= 2

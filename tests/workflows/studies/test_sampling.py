@@ -35,7 +35,7 @@ samples = 3
 @pytest.mark.fem
 def test_a_specimen_is_sampled_like_any_model(tmp_path):
     study = parse(tomllib.loads(STUDY))
-    assert run(study, "tip", tmp_path / "out", quiet=True) == 0
+    assert run(study, "tip", tmp_path / "out", quiet=True, report=False) == 0
     found = xr.load_dataset(tmp_path / "out" / "results.nc")
     assert found.output.values.tolist() == [f"{case}.tip.0.{axis}" for case in ("shear", "pull") for axis in "xz"]
     assert set(found.unit.values) == {"m"}
@@ -61,7 +61,7 @@ def test_what_was_solved_on_each_mesh_is_in_the_summary(tmp_path):
     method = {"kind": "multilevel-monte-carlo", "samples": 4, "pilot": 4, "levels": 2}
     study = parse({"model": model, "parameters": blocks["parameters"], "method": method})
     assert list(study.models) == ["mesh 1"]
-    assert run(study, "meshes", tmp_path / "out", quiet=True) == 0
+    assert run(study, "meshes", tmp_path / "out", quiet=True, report=False) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [one["unknowns"] for one in summary["meshes"]] == [3 * 27, 3 * 125]
     assert summary["evaluations"] == sum(one["solves"] for one in summary["meshes"]) == study.planned
