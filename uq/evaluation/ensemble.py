@@ -20,9 +20,10 @@ from forward.machine import StopError
 from forward.model import FloatArray, ForwardModel, SolveError
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import BLOCKS, OWN, BlockSolver, Evaluations, Merger, OfModel, Request
-from uq.evaluation.turns import Progress, Turns, abort_all, end_job
+from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
 
 T = TypeVar("T")
+O = TypeVar("O")
 CHEAP = 1e-3  # seconds below which computing a block is faster than writing and reading its file;
 SELDOM = 0.1  # files of such blocks are written at intervals of this length (s)
 SECONDS_FOR_OTHERS = 5.0  # for ranks that fail in the same way to meet
@@ -149,13 +150,18 @@ class Ensemble:
             worker = _Worker(self, _Models(model, others or {}, passing), checkpoint, turns)
             if self.world.rank > 0:
                 with abort_all(self.world):
-                    while (order := self.world.bcast(None)) is not None:
+                    while (order := self.told(None)) is not None:
                         worker.work(order)
                 return None
             try:
                 return task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes))
             finally:
-                self.world.bcast(None)
+                self.told(None)
+
+    def told(self, order: O) -> O:
+        """Return what rank 0 says, for which the others may wait long; collective."""
+        gather_here(self.world)
+        return cast("O", self.world.bcast(order))
 
 
 @dataclass(frozen=True)
@@ -257,7 +263,7 @@ class _Worker:
     def prepare(self, model: str) -> None:
         """Rank 0: have all groups make a model, this one too."""
         with abort_all(self._ensemble.world):
-            self._ensemble.world.bcast(model)
+            self._ensemble.told(model)
             self.models[model]
 
     def dispatch(self, order: _Order, receive: Callable[[int, Evaluations], None], progress: Progress) -> None:
@@ -274,7 +280,7 @@ class _Worker:
 
         with abort_all(self._ensemble.world):
             self._turns.restart()
-            self._ensemble.world.bcast(order)
+            self._ensemble.told(order)
             self._turns.lead(order.pending, self._solving(order, own_progress), accept)
 
     def work(self, order: _Order | str) -> None:

@@ -22,6 +22,7 @@ from forward.model import ModelError, SolveError
 T = TypeVar("T")
 Progress = Callable[[int, int], None]  # told how many solves finished, and failed, since the last call
 _RESULT = 1
+SHORTEST, SHARE, LONGEST = 1e-5, 1.1, 0.01  # pauses (s) while waiting: about a tenth of what one has waited
 SECONDS_BETWEEN_COUNTS = 1.0  # of other groups' solves, while waiting for their results
 
 
@@ -183,6 +184,25 @@ def counter(world: Any) -> Iterator[Counter]:
         yield made
     finally:
         made.free()
+
+
+@contextmanager
+def alone(world: Any) -> Iterator[None]:
+    """Let one rank end its work; the others, which have none, sleep meanwhile; collective."""
+    try:
+        yield
+    finally:
+        gather_here(world)
+
+
+def gather_here(world: Any) -> None:
+    """Return once all ranks are here; who waits for long sleeps, where MPI would poll on a core; collective."""
+    if world.size == 1:
+        return
+    here, pause = world.Ibarrier(), 0.0
+    while not here.Test():
+        time.sleep(pause)
+        pause = min(SHARE * pause + SHORTEST, LONGEST)
 
 
 @contextmanager

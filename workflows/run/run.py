@@ -104,16 +104,19 @@ def run(
 def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: bool, report: bool) -> int:
     from mpi4py import MPI
 
+    from uq.evaluation.turns import alone
+
     world = MPI.COMM_WORLD
     begin = time.monotonic()
     loaded = Loaded() if own_code.modules(study) else None
     finished = _agreed(world, lambda: _prepare(study, directory, world.size))
     if finished is not None:
-        if world.rank == 0:
-            if report and not (directory / "report.html").exists():
-                _report(directory)
-            if not quiet:
-                sys.stdout.write(f"{directory}: finished before, nothing to do\n")
+        with alone(world):
+            if world.rank == 0:
+                if report and not (directory / "report.html").exists():
+                    _report(directory)
+                if not quiet:
+                    sys.stdout.write(f"{directory}: finished before, nothing to do\n")
         return int(finished)
 
     from uq.evaluation.checkpoint import Checkpoint
@@ -136,24 +139,25 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         if world.rank == 0:
             _withdraw(directory, error, checkpoint)
         raise
-    if dataset is None:
-        return DONE
-    progress.close()
-    dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
-    add(dataset, *study.findings)
-    dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
-    evaluations = job.evaluations
-    own_code.keep(directory, study, loaded)
-    add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
-    dataset = study.finished(dataset, evaluations)
-    wall = time.monotonic() - begin
-    summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
-    _leave(directory, dataset, evaluations, summary, checkpoint, job)
-    if report:
-        _report(directory)
-    if not quiet:
-        sys.stdout.write(closing_words(directory, dataset, summary))
-    return exit_code(summary)
+    with alone(world):
+        if dataset is None:
+            return DONE
+        progress.close()
+        dataset = above_rounding(blank_where_still(with_norms(job.labelled(dataset))))
+        add(dataset, *study.findings)
+        dataset.attrs |= {"study": name, "method": study.method.kind, "tissuq": version(), "config": dump(study.kept)}
+        evaluations = job.evaluations
+        own_code.keep(directory, study, loaded)
+        add(dataset, *(findings_of_solves(evaluations.values()) if study.explains else ()))
+        dataset = study.finished(dataset, evaluations)
+        wall = time.monotonic() - begin
+        summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
+        _leave(directory, dataset, evaluations, summary, checkpoint, job)
+        if report:
+            _report(directory)
+        if not quiet:
+            sys.stdout.write(closing_words(directory, dataset, summary))
+        return exit_code(summary)
 
 
 def _warn_of_memory(study: StudyKind, world: Any, *, quiet: bool) -> None:

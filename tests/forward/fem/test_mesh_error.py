@@ -315,24 +315,24 @@ def test_how_is_decided_by_sizes():
 SCRIPT = """
 import sys
 import numpy as np
-from mpi4py import MPI
 from forward.fem.cost import Way
 from tests.bodies import OUTPUTS, loaded_body
+from tests.ranks import groups
 
-comm = MPI.COMM_WORLD
-for form in ("neo-hookean mixed", "mooney-rivlin", "demiray"):
-    spec = loaded_body(form, body={"cells": (3, 2, 2)}, outputs=OUTPUTS[:4])
-    model = spec.build(comm, ())
-    if form == "demiray":
-        model.enriched.way = Way.SMOOTHING
-    solution = model.solve(np.zeros(0))
-    error = solution.mesh_error()
-    assert all(np.array_equal(error.outputs, other) for other in comm.allgather(error.outputs))
-    state = model.space.gather(error.state[None])
-    cells = model.equations.layout.by_cell(solution.mesh_indicators(np.array([0.0, 0.0, 1.0, 0.0])))
-    if comm.rank == 0:
-        found = {"outputs": error.outputs, "sizes": [error.energy, error.relative], "state": state, "cells": cells}
-        np.savez(f"{sys.argv[1]}/{form}.npz", **found)
+for comm in groups(1, 2, 3):
+    for form in ("neo-hookean mixed", "mooney-rivlin", "demiray"):
+        spec = loaded_body(form, body={"cells": (3, 2, 2)}, outputs=OUTPUTS[:4])
+        model = spec.build(comm, ())
+        if form == "demiray":
+            model.enriched.way = Way.SMOOTHING
+        solution = model.solve(np.zeros(0))
+        error = solution.mesh_error()
+        assert all(np.array_equal(error.outputs, other) for other in comm.allgather(error.outputs))
+        state = model.space.gather(error.state[None])
+        cells = model.equations.layout.by_cell(solution.mesh_indicators(np.array([0.0, 0.0, 1.0, 0.0])))
+        if comm.rank == 0:
+            found = {"outputs": error.outputs, "sizes": [error.energy, error.relative], "state": state, "cells": cells}
+            np.savez(f"{sys.argv[1]}/{form} {comm.size}.npz", **found)
 """
 
 
@@ -341,13 +341,9 @@ SHAPES = ("neo-hookean mixed", "mooney-rivlin", "demiray")
 
 @pytest.mark.mpi
 def test_ranks_agree(tmp_path):
-    found = []
-    for ranks in (1, 2, 3):
-        folder = tmp_path / str(ranks)
-        folder.mkdir()
-        done = run_script(ranks, SCRIPT, folder)
-        assert done.returncode == 0, done.stdout + done.stderr
-        found.append([dict(np.load(folder / f"{form}.npz")) for form in SHAPES])
+    done = run_script(3, SCRIPT, tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = [[dict(np.load(tmp_path / f"{form} {ranks}.npz")) for form in SHAPES] for ranks in (1, 2, 3)]
     for other in found[1:]:
         for here, expected in zip(other, found[0], strict=True):
             for name, values in expected.items():

@@ -650,9 +650,8 @@ for control in ("quadratic", "chaos"):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_same_numbers_as_in_one_process(ranks):
-    done = run_script(ranks, RANKS)
+def test_same_numbers_as_in_one_process():
+    done = run_script(2, RANKS)
     assert done.returncode == 0, done.stderr
     assert "same quadratic" in done.stdout
     assert "same chaos" in done.stdout
