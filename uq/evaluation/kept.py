@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import h5py
 import numpy as np
 
 from forward.model import (
@@ -29,11 +28,9 @@ from forward.model import (
 )
 from uq.evaluation.checkpoint import HEAD
 from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, Request, merge
-from uq.evaluation.hdf5 import creation, image, in_memory
+from uq.evaluation.hdf5 import array, creation, image, in_memory
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from uq.evaluation.checkpoint import Checkpoint
 
 T = TypeVar("T")
@@ -249,7 +246,7 @@ class KeptModel(OneByOne):
         """Return derivatives, the stored ones if there are any; those of `states` (k, U_local) are distributed."""
         key = self.checkpoint.key(what)
         self.keys.append(key)
-        kept = self._read(key, lambda key: _rows(self.checkpoint.path(key)))
+        kept = self._read(key, lambda key: array(self.checkpoint.path(key), "rows"))
         if kept is not None:
             return scattered(self.model, kept) if states else kept
         rows = find()
@@ -326,12 +323,6 @@ class KeptSolution:
     def saturation(self) -> Saturation | None:
         """Calibrate estimates of the error of the mesh."""
         return self._solution.saturation()
-
-
-def _rows(path: Path) -> FloatArray:
-    """Derivatives from a file whose checksum was verified."""
-    with h5py.File(path, "r") as file:
-        return np.asarray(file["rows"][()])
 
 
 def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:
