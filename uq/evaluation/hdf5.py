@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
-import numpy as np
 
 from forward.model import FloatArray
 
@@ -133,9 +131,3 @@ def stored_array(path: Path, place: str) -> FloatArray:
     """
     with h5py.File(path, "r") as file:
         return np.asarray(file[place], dtype=float)
-
-
-def array(path: Path, name: str) -> NDArray[np.float64]:
-    """Return an array that a file holds."""
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[name][()])

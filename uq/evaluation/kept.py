@@ -28,7 +28,7 @@ from forward.model import (
 )
 from uq.evaluation.checkpoint import HEAD
 from uq.evaluation.evaluate import BlockSolver, Evaluations, Failure, OfModel, Request, merge
-from uq.evaluation.hdf5 import array, creation, image, in_memory
+from uq.evaluation.hdf5 import creation, image, in_memory, stored_array
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -246,7 +246,7 @@ class KeptModel(OneByOne):
         """Return derivatives, the stored ones if there are any; those of `states` (k, U_local) are distributed."""
         key = self.checkpoint.key(what)
         self.keys.append(key)
-        kept = self._read(key, lambda key: array(self.checkpoint.path(key), "rows"))
+        kept = self._read(key, lambda key: stored_array(self.checkpoint.path(key), "rows"))
         if kept is not None:
             return scattered(self.model, kept) if states else kept
         rows = find()
