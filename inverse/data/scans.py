@@ -133,6 +133,8 @@ class Scan(Reading):
         In place of it: the undeformed surface.
     deformed
         By load case: the deformed surface, of the same numbering.
+    truth
+        By path: true values behind synthetic data.
     sigma, unit, units, field, on_surface, tolerance, beyond, registration, between
         As of `Reading`.
     """
@@ -140,6 +142,7 @@ class Scan(Reading):
     file: str | None = None
     reference: str | None = None
     deformed: dict[str, str] = Field(default={})
+    truth: dict[str, float] = Field(default={})
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from forward.model import FloatArray, SolveError
 from forward.settings import Settings
+from inverse.data.registration import Given, Rigid
+from inverse.data.units import factor
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 
@@ -50,6 +52,12 @@ class Synthesize(Settings):
         Share of the points in each data set; one number for each data set.
     missing
         Share of the components that are missing in addition.
+    format
+        Of the files of displacements: tables, or clouds of points with a file in TOML that says what they are.
+    units
+        Unit of their lengths.
+    frame
+        The rigid motion from their frame to that of the body, as in `data.registration`; lengths in `units`.
     seed
         Of the errors, of the points, and of parameters that have distributions.
     """
@@ -58,7 +66,26 @@ class Synthesize(Settings):
     noise: SyntheticNoise
     fraction: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(default=(1.0,), min_length=1)
     missing: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    format: Literal["csv", "vtu", "vtk", "ply", "xdmf"] = "csv"
+    units: str = "m"
+    frame: Given | None = None
     seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def metres(self) -> float:
+        """How many m a unit of the files is."""
+        return factor(self.units, "m")
+
+    @property
+    def motion(self) -> Rigid:
+        """The motion from the frame of the files to that of the body."""
+        return Rigid() if self.frame is None else self.frame.at(self.metres)
+
+    @field_validator("units")
+    @classmethod
+    def _known(cls, units: str) -> str:
+        factor(units, "m")
+        return units
 
     def truths(self, inputs: Inputs) -> FloatArray:
         """Draw parameters (n, d) for every data set."""

@@ -241,7 +241,7 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     """
     placed, registered, scan = read_on(path, tuple(case.name for case in model.cases), model.body, data)
     found = placed.observations.with_sigma(None)
-    truth, places, stiffness = dict(data.truth), np.zeros((0, 3)), np.zeros(0)
+    truth, places, stiffness = scan.truth | data.truth, np.zeros((0, 3)), np.zeros(0)
     for name, text in found.truth.items():
         if name not in {"stiffness", "inclusions"}:
             truth.setdefault(name, _known(name, text, path))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -201,6 +204,8 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
     """Return the texts of the files of synthetic data, by their names."""
     texts = {}
     points, cases, axes, places = model
+    rigid = study.method.motion
+    frame = (places - rigid.shift) @ rigid.rotation  # where the scanner sees them
     count = found.sizes["data_set"]
     scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
     varies = [
@@ -222,25 +227,79 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
             file.write(f"# truth.stiffness = truth/{label}.csv\n")
             lines = (",".join(f"{x:.6g}" for x in row) for row in one["factor"].values)
             texts[f"truth/{label}.csv"] = "x,y,z,factor\n" + "\n".join(lines) + "\n"
-        file.write("x,y,z,ux,uy,uz,sigma,case\n")
-        values, sigma = one["values"].values, one["sigma"].values
+        method, unit = study.method, study.method.metres
+        values, sigma = one["values"].values / unit, one["sigma"].values / unit
+        if method.format != "csv":
+            arrays = _arrays(study, values, sigma, (points, cases, axes))
+            where = frame / unit
+            texts[f"{label}.{method.format}"] = _cloud(where[arrays.pop("number")], arrays, method.format)
+            texts[f"{label}.toml"] = tomli_w.dumps(
+                {
+                    "file": f"{label}.{method.format}",
+                    "units": method.units,
+                    "truth": {path: truth[path] for path in varies},
+                }
+            )
+            continue
+        said = "" if method.units == "m" else f" [{method.units}]"
+        heads = [f"{head}{said}" for head in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
+        file.write(",".join([*heads, "case"]) + "\n")
         for case, case_name in enumerate(c.name for c in study.model.cases):
             for point in np.unique(points[cases == case]):
                 rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
                 if len(rows) == 0:
                     continue
                 motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
-                where = ",".join(f"{x:.8g}" for x in np.round(places[rows[0]], 12) + 0.0)
+                where = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
                 cells = ",".join(motion.get(axis, "") for axis in range(3))
                 file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}\n")
         texts[f"{label}.csv"] = file.getvalue()
     return texts
 
 
+def _arrays(
+    study: Synthesis, values: FloatArray, sigma: FloatArray, where: tuple[NDArray[np.int64], ...]
+) -> dict[str, NDArray[Any]]:
+    """Return displacements of each load case at the points of a cloud, their errors, and `number`, a row of each."""
+    points, cases, axes = where
+    measured = np.unique(points[np.isfinite(values)])
+    number = np.array([np.flatnonzero(points == point)[0] for point in measured])
+    found: dict[str, NDArray[Any]] = {"number": number}
+    for case, name in enumerate(one.name for one in study.model.cases):
+        rows = np.flatnonzero((cases == case) & np.isin(points, measured))
+        motion, errors = np.full((len(measured), 3), np.nan), np.full(len(measured), np.nan)
+        at = np.searchsorted(measured, points[rows])
+        motion[at, axes[rows]] = values[rows]
+        errors[at] = sigma[rows]
+        if study.method.format == "ply":
+            found |= {f"u{axis}_{name}": motion[:, k] for k, axis in enumerate("xyz")} | {f"sigma_{name}": errors}
+        else:
+            found |= {f"displacement_{name}": motion, f"sigma_{name}": errors}
+    return found
+
+
+def _cloud(places: FloatArray, arrays: Mapping[str, NDArray[Any]], form: str) -> str:
+    """Return the text of a file with points (n, 3) and arrays at them."""
+    import meshio
+
+    mesh = meshio.Mesh(places, [("vertex", np.arange(len(places))[:, None])], point_data=dict(arrays))
+    if form == "ply":
+        mesh.cells = []
+    how: dict[str, Any] = {"data_format": "XML"} if form == "xdmf" else {"binary": False}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"cloud.{form}"
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # that text takes more room
+            meshio.write(path, mesh, **how)
+        return path.read_text(encoding="utf-8")
+
+
 def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
     """The known specimen; collective over the group."""
     model = study.specimen.build(ensemble.group, study.inputs.names)
     places, points = model.space.coordinates, points_of(model)
+    if study.method.frame is not None:  # components along the axes of the scanner
+        along = study.method.motion.rotation.T[model.axes]
+        model = model.observing(model.places, model.axes.tolist(), model.cases.tolist(), along)
     factor = np.ones((len(study.method.fraction), 1))
     if study.model.fields and ensemble.index == 0:
         drawn = model.space.factors(study.method.truths(study.inputs))

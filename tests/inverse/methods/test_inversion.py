@@ -294,6 +294,37 @@ def test_synthetic_data_say_what_they_are_of(folder):
     assert "2 data sets" in page
 
 
+@pytest.mark.parametrize("form", ["csv", "vtu", "vtk", "ply", "xdmf"])
+def test_synthetic_scans_are_read_again(tmp_path, form):
+    """In mm and in a frame of their own, components missing there: what was written is what is read."""
+    changes = [
+        "model.body.cells=[1,1,1]",
+        "method.fraction=0.8",
+        "method.missing=0.2",
+        f'method.format="{form}"',
+        'method.units="mm"',
+        "method.frame={rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}",
+    ]
+    (tmp_path / "made.toml").write_text(MADE)
+    asked = load(tmp_path / "made.toml", [one.replace("0.8", "[0.8]") for one in changes])
+    assert run_study(asked, "made", tmp_path / "out", quiet=True, report=False) == 0
+    made = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
+    (tmp_path / "few.toml").write_text(FEW.replace('files = ["data"]', 'files = ["out/data"]'))
+    registration = 'data.registration={kind="given", rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}'
+    study = load(tmp_path / "few.toml", [registration, "data.units='mm'"])
+    (measurement,) = study.measurements
+    rows = measurement.observations.components()
+    values = made["values"].to_numpy()
+    # Points of an edge are on two boundaries, and are written once.
+    gaps = np.abs(rows.values[:, None] - values[np.isfinite(values)]).min(axis=1)
+    assert len(gaps) > 20
+    assert (gaps <= 1e-5 * np.abs(rows.values)).all()
+    assert rows.sigma.max() == pytest.approx(made["sigma"].to_numpy().max(), rel=1e-4)
+    assert np.abs(rows.places - np.round(rows.places)).max() < 1e-7  # corners of the cube
+    assert measurement.truth["inclusions.lump.contrast"] == 4
+    np.testing.assert_allclose(rows.along[rows.axes == 0], [turned((0, 0, 5.0))[:, 0]] * (rows.axes == 0).sum())
+
+
 def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
     """Turned by 5°, shifted by 10 mm, in mm, with a missing component; and a wider one if that is uncertain."""
     place = folder / "turned"
