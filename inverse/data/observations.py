@@ -61,6 +61,8 @@ class Observations:
         True values by name, as text.
     axes
         Directions (3, 3) in the body along which x, y and z of the displacements are measured, as rows.
+    unit
+        m per unit of the file.
     """
 
     places: FloatArray
@@ -72,6 +74,7 @@ class Observations:
     source: tuple[str, ...] = ()
     truth: dict[str, str] = field(default_factory=dict)
     axes: FloatArray = field(default_factory=lambda: np.eye(3))
+    unit: float = 1.0
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -423,6 +426,7 @@ def of_table(path: Path, cases: tuple[str, ...], unit: float | None = None) -> O
         labels,
         tuple(line for line in found.remarks if not line.startswith(TRUTH)),
         dict(_assignment(line) for line in found.remarks if line.startswith(TRUTH)),
+        unit=unit,
     )
 
 

@@ -101,12 +101,11 @@ class Reading(Settings):
     registration: Registration | None = None
     between: Between | None = None
 
-    @property
-    def moved_between(self) -> tuple[float, float]:
-        """Standard deviations (rad, m) of the motions between scans."""
+    def moved_between(self, unit: float) -> tuple[float, float]:
+        """Return standard deviations (rad, m) of the motions between scans, given m per unit of the file."""
         if self.between is None:
             return (0.0, 0.0)
-        return float(np.radians(self.between.rotation_std)), (self.metres or 1.0) * self.between.translation_std
+        return float(np.radians(self.between.rotation_std)), unit * self.between.translation_std
 
     @property
     def metres(self) -> float | None:
@@ -308,4 +307,4 @@ def _joined(
         rows.append((places[kept], motion[kept], sigma[kept], np.full(len(kept), number), words))
     places, motions, errors, numbers = (np.concatenate([row[k] for row in rows]) for k in range(4))
     labels = tuple(label for row in rows for label in row[4])
-    return Observations(unit * places, unit * motions, unit * errors, cases, numbers, labels)
+    return Observations(unit * places, unit * motions, unit * errors, cases, numbers, labels, unit=unit)

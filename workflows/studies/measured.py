@@ -222,8 +222,7 @@ def read_on(path: Path, cases: Sequence[str], body: Body, usual: Reading) -> tup
     surface = Surface.of(body) if scan.surface or isinstance(scan.registration, ToSurface) else None
     registered = None
     if scan.registration is not None:
-        unit = 1.0 if scan.metres is None else scan.metres
-        registered = register(scan.registration, found.places, unit, surface, extent, path.name)
+        registered = register(scan.registration, found.places, found.unit, surface, extent, path.name)
         found = replace(found, places=registered.motion(found.places), axes=registered.motion.rotation.T)
     allowed = tolerance(body) if scan.tolerance is None else scan.tolerance
     nearest_place = (lambda points: surface.nearest(points)[0]) if scan.surface and surface else body.nearest
@@ -258,7 +257,7 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
         placed.left_out,
         registered,
         scan.surface,
-        scan.moved_between,
+        scan.moved_between(found.unit),
     )
 
 

@@ -57,7 +57,7 @@ class DisplacementFile(Reading):
             placed, registered, scan = read_on(folder / self.file, cases, specimen.body, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        if (registered is not None and registered.uncertain) or any(scan.moved_between):
+        if (registered is not None and registered.uncertain) or scan.between is not None:
             message = f"data: {self.file}: uncertain motions are for inversions, expected a known registration here"
             raise StudyError(message)
         found, moved = placed.observations, placed.distances
