@@ -24,6 +24,8 @@ from uq.inputs.random_parameters import Inputs
 if TYPE_CHECKING:
     import xarray as xr
 
+    from uq.inputs.draws import Draws
+
 FEW = 100.0  # independent draws below which a finding says so
 SHARE = 0.5  # of the square of an error, from which draws decide it
 
@@ -79,14 +81,19 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
 
 
 def findings_of_source(inputs: Inputs) -> Iterator[Finding]:
+    """Say that the draws of some parameters are worth few."""
+    if inputs.draws is not None:
+        yield from findings_of_few(inputs.draws)
+
+
+def findings_of_few(draws: Draws, whose: str = "") -> Iterator[Finding]:
     """Say that draws are worth few."""
-    draws = inputs.draws
-    if draws is not None and draws.effective < FEW:
+    if draws.effective < FEW:
         yield Finding(
             "warning",
-            f"The {len(draws.values):,} draws of {', '.join(draws.names)} are worth {draws.effective:.0f} independent "
-            f"ones, fewer than {FEW:.0f}: errors count that, but tails of the distribution are hardly known. More "
-            "solves in the study that they come from, or a longer chain, help.",
+            f"The {len(draws.values):,} draws of {', '.join(draws.names)}{whose} are worth {draws.effective:.0f} "
+            f"independent ones, fewer than {FEW:.0f}: errors count that, but tails of the distribution are hardly "
+            "known. More solves in the study that they come from, or a longer chain, help.",
         )
 
 

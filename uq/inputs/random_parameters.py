@@ -218,6 +218,20 @@ class Inputs:
         values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
         return np.column_stack(values), np.column_stack(slopes)[:, :, None] * factor
 
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return ln of the density (n,) at points (n, d), unrestricted; −∞ outside."""
+        with np.errstate(divide="ignore"):
+            logs = sum(np.log(m.density(x)) for m, x in zip(self.marginals.values(), points.T, strict=True))
+        found = np.asarray(logs, dtype=float)
+        if self.correlations:
+            from scipy.special import ndtri
+
+            columns = zip(self.marginals.values(), points.T, strict=True)
+            z = ndtri(np.column_stack([m.cumulative(x) for m, x in columns]).clip(1e-300, 1 - 2**-53))
+            matrix = np.linalg.inv(self._copula) - np.eye(len(self.marginals))
+            found += -np.einsum("ni,ij,nj->n", z, matrix, z) / 2 - np.linalg.slogdet(self._copula)[1] / 2
+        return found
+
     def within(self, admissible: Restriction) -> Inputs:
         """Return the same parameters, restricted."""
         return replace(self, admissible=admissible)

@@ -159,6 +159,7 @@ SECTIONS = Kinds(
         "curves": f"{_HERE}.curves:Curves",
         "averages": f"{_HERE}.averages:Averages",
         "constants": f"{_HERE}.constants:Constants",
+        "population": f"{_HERE}.population:PopulationOfSpecimens",
         "batch": f"{_HERE}.batch:Batch",
         "posterior": f"{_HERE}.posterior:Posterior",
         "posterior-field": f"{_HERE}.posterior_field:FieldPosterior",

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from uq.estimators import branch
 from uq.findings import findings
 from workflows.results.summary import summarise
@@ -42,6 +44,7 @@ def summarised(
     seconds = sum(one.seconds for one in outcomes) or float(sum(found.seconds.sum() for found in every))
     source = own_code.digest(study)
     stability = branch.counts(every)
+    none = np.zeros(len(WORK), dtype=np.int64)
     return {
         "study": name,
         "method": study.method.kind,
@@ -53,7 +56,7 @@ def summarised(
         **({"stability": stability} if stability else {}),
         "wall_seconds": wall,
         "cpu_seconds": seconds * study.parallel.ranks_per_model,
-        "work": dict(zip(WORK, sum(found.work.sum(axis=0) for found in every).tolist(), strict=True)),
+        "work": dict(zip(WORK, sum((found.work.sum(axis=0) for found in every), none).tolist(), strict=True)),
         **summarise(dataset),
         "provenance": {
             "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -17,6 +17,7 @@ from forward.settings import nearest
 from inverse.low_dimensional.posterior import NOISE
 from uq.evaluation.hdf5 import variables
 from uq.inputs.draws import Draws
+from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import findings_of_impossible
 from workflows.config.source import KEPT
 from workflows.studies.tables_of_draws import of_table
@@ -89,21 +90,26 @@ def _kept(path: Path) -> Draws:
 
 
 def _of_results(path: Path, group: str | None, model: str | None) -> Draws:
-    try:
-        summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        begun = (path / "study.toml").exists()
-        what = "holds an unfinished study" if begun else "holds no results"
-        message = f"{path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
-        raise ValueError(message) from None
+    summary = _summary(path)
     kind = summary.get("method")
-    if kind not in ("select", "invert"):
-        message = f"{path}: is a study of kind '{kind}', which has no posterior, expected 'select' or 'invert'"
+    if kind not in READERS:
+        message = f"{path}: is a study of kind '{kind}', which has no posterior, expected one of: {', '.join(READERS)}"
         raise ValueError(message)
     content = (path / "results.nc").read_bytes()
     found = {name: one.values for name, one in variables(content)[0].items()}
     digest = sha256(content).hexdigest()[:LETTERS]
-    return (_selected if kind == "select" else _inverted)(path, found, group, model, digest)
+    return READERS[kind](path, found, group, model, digest)
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        begun = (path / "study.toml").exists()
+        what = "holds an unfinished study" if begun else "holds no results" if path.exists() else "is not there"
+        message = f"{path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
+        raise ValueError(message) from None
+    return found
 
 
 def _texts(found: Arrays, name: str) -> list[str]:
@@ -166,6 +172,59 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, d
     names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
     weights = np.full(len(values), 1 / len(values))
     return Draws(names, values, weights, min(len(values), worth) if worth > 0 else len(values), digest)
+
+
+def _of_population(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
+    """Draws of a new specimen or, with its name, of one of the population."""
+    if model is not None:
+        message = f"model = '{model}', but {path} is a population, which has one model"
+        raise ValueError(message)
+    values = np.asarray(found["population_draw"])
+    if group is not None:
+        values = np.asarray(found["specimen_draw"])[_chosen("group", group, _texts(found, "specimen"), path)]
+    weights = np.full(len(values), 1 / len(values))
+    worth = min(float(found["population_effective"]), len(values))
+    return Draws(tuple(_texts(found, "parameter")), values, weights, worth, digest)
+
+
+READERS = {"select": _selected, "invert": _inverted, "population": _of_population}
+
+
+def specimens(file: str, model: str | None) -> dict[str, Draws]:
+    """Return the posteriors of the groups of a comparison, or of the data sets of a batch, by their names.
+
+    Raises
+    ------
+    ValueError
+        As `read`.
+    """
+    path = Path(file)
+    summary = _summary(path)
+    if summary.get("method") not in ("select", "invert"):
+        message = f"{path}: is a study of kind '{summary.get('method')}', expected 'select' or 'invert'"
+        raise ValueError(message)
+    found = variables((path / "results.nc").read_bytes())[0]
+    if summary["method"] == "select":
+        return {name: read(file, name, model) for name in map(str, found["group"].values)}
+    done = np.atleast_1d(found["ok"].values).astype(bool)
+    names = np.atleast_1d(found["data_set"].values)
+    return {str(name): read(file, str(name), model) for name, one in zip(names, done, strict=True) if one}
+
+
+def prior_of(file: str, model: str | None, names: Sequence[str]) -> Inputs:
+    """Return the prior of these parameters, which posteriors in a results directory were found with."""
+    from workflows.config.study import parse
+
+    found, attributes = variables((Path(file) / "results.nc").read_bytes())
+    study: Any = parse(tomllib.loads(str(attributes["config"])), folder=Path(file))
+    if "candidates" in tomllib.loads(str(attributes["config"])):
+        chosen = model
+        if model in (None, BEST):
+            chosen = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
+        inputs: Inputs = study.models[chosen].inputs
+    else:
+        inputs = study.inputs
+    return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
 
 
 # --- numbers of the model --------------------------------------------------------------------------------------------

@@ -191,6 +191,7 @@ STUDIES = Kinds(
         "select": "workflows.studies.selection:Comparison",
         "invert": "workflows.studies.inversion:InversionStudy",
         "synthesize": "workflows.studies.synthesis:SynthesisStudy",
+        "population": "workflows.studies.population:PopulationStudy",
     },
     objection=_objection,
 )

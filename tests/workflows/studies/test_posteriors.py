@@ -13,6 +13,7 @@ import xarray as xr
 from forward.model import FunctionModel
 from tests.launch import TISSUQ, environment
 from tests.launch import run as on_ranks
+from uq.estimators.autocorrelation import effective
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.hdf5 import netcdf
 from uq.inputs.draws import Draws
@@ -22,7 +23,6 @@ from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse, schema
 from workflows.report.page import write_report
 from workflows.run.run import run
-from workflows.studies.tables_of_draws import effective
 
 MODULE = """
 import math
@@ -494,3 +494,58 @@ def test_draws_of_an_inversion_keep_their_dependence(tmp_path, monkeypatch):
         )
         (tmp_path / "other.toml").write_text(text)
         assert said in mistake(tmp_path / "other.toml")
+
+
+# --- populations ------------------------------------------------------------------------------------------------------
+
+
+def population(folder, source, more=""):
+    path = folder / "population.toml"
+    path.write_text(f'[method]\nkind = "population"\nsource = "{source}"\ndraws = 2000\n{more}\n')
+    return path
+
+
+def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    folder, _ = selected
+    study = load(population(tmp_path, folder / "results", 'model = "neo-hookean"'))
+    assert parse(document(study)) == study
+    assert run(study, "population", tmp_path / "population", quiet=True) == 0
+    found = xr.load_dataset(tmp_path / "population" / "results.nc")
+    assert found["specimen"].values.tolist() == ["one", "two"]
+    assert (found["specimen_std"] <= 1.1 * found["own_std"]).all()
+    summary = json.loads((tmp_path / "population" / "summary.json").read_text())
+    assert summary["specimens"] == ["one", "two"]
+    assert any("2 specimens say little on how wide" in one["text"] for one in summary["findings"])
+    assert "new specimen" in (tmp_path / "population" / "report.html").read_text()
+    for block, name in (("", "population_draw"), (', group = "two"', "specimen_draw")):
+        draws = chain(tmp_path, f'{{ file = "population"{block} }}', 'kind = "monte-carlo"\nsamples = 4').draws
+        assert draws.names == ("C1",)
+        right = found[name] if not block else found[name].sel(specimen="two")
+        assert np.array_equal(draws.values, right.to_numpy())
+    again = run(study, "population", tmp_path / "again", quiet=True, report=False)
+    assert again == 0
+    files = [(tmp_path / name / "results.nc").read_bytes() for name in ("population", "again")]
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize(
+    ("source", "more", "said"),
+    [
+        ("nowhere", "", "is not there, expected the directory of a finished study"),
+        ("RESULTS", "", "has several models, expected model = one of"),
+        (
+            "RESULTS",
+            'model = "mooney-rivlin"',
+            "'C2' has draws of both signs, or zero: expected distribution = 'normal'",
+        ),
+        ("draws.csv", "", "expected the directory of a finished study"),
+    ],
+)
+def test_populations_that_cannot_be(selected, tmp_path, source, more, said):
+    folder, _ = selected
+    table(tmp_path / "draws.csv")
+    line = mistake(population(tmp_path, source.replace("RESULTS", str(folder / "results")), more))
+    assert line.startswith("method.source: ")
+    assert said in line

@@ -1,0 +1,265 @@
+"""The distribution of parameters over specimens, from the posterior of each.
+
+Specimens i have posteriors by draws z_is with weights w_is, under a prior π_0 that was the same for all. Over the
+population z is normal, N(m, C). The likelihood of m and C is Π_i ∫ p_i(z)/π_0(z) N(z|m, C) dz, up to a factor, with
+the posterior p_i: no model is solved again (D. W. Hogg, A. D. Myers, J. Bovy, Astrophys. J. 725 (2010) 2166–2175).
+
+A sum over draws alone fails where a population is narrow: few draws lie there, and as C → 0 the nearest decides. So
+each draw has a normal kernel of covariance h² V_i, V_i the covariance of the posterior, and draws are moved towards
+their mean by √(1 − h²), which leaves mean and covariance as they are (M. West, J. R. Stat. Soc. B 55 (1993) 409–422):
+
+    ∫ p_i/π_0 N(z|m, C) dz ≈ Σ_s w_is/π_0(z_is) N(z_is | m, C + h² V_i).
+
+For normal posteriors under a flat prior it is exact for normal kernels of any width. The prior of m is normal, twice
+as wide as π_0, around its mean; standard deviations of the population have half-t priors with 3 degrees of freedom
+and those of π_0 as scale; correlations have density ∝ det R (Lewandowski, Kurowicka and Joe's with η = 2). m, the
+logarithms of standard deviations and the angles of R are sampled by an ensemble of walkers (J. Goodman, J. Weare,
+Commun. Appl. Math. Comput. Sci. 5 (2010) 65–80).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from forward.model import FloatArray
+from uq.estimators.autocorrelation import effective
+
+STRETCH = 2.0  # a of the stretch move
+FREEDOM = 3.0  # of the prior of standard deviations
+WIDER = 2.0  # prior of the mean of a population over that of a specimen
+KEPT = 200  # draws of a specimen that are used
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """The posterior of a specimen.
+
+    Attributes
+    ----------
+    draws
+        z (S, d).
+    weights
+        (S,), of sum 1.
+    log_prior
+        Ln π_0 (S,) at the draws.
+    effective
+        Number of independent draws that they are worth.
+    """
+
+    draws: FloatArray
+    weights: FloatArray
+    log_prior: FloatArray
+    effective: float
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """Mean (d,)."""
+        return np.asarray(self.weights @ self.draws)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance V (d, d)."""
+        deviations = self.draws - self.mean
+        return np.asarray(deviations.T @ (self.weights[:, None] * deviations))
+
+    @property
+    def width(self) -> float:
+        """Width h of the kernels, by B. W. Silverman's rule, at most 1."""
+        d = self.draws.shape[1]
+        return float(min(1.0, (4 / (d + 2) / max(self.effective, 1.0)) ** (1 / (d + 4))))
+
+    @cached_property
+    def shrunken(self) -> FloatArray:
+        """The draws (S, d), moved towards their mean."""
+        return np.asarray(self.mean + np.sqrt(1 - self.width**2) * (self.draws - self.mean))
+
+    @cached_property
+    def log_weights(self) -> FloatArray:
+        """Ln of w/π_0 (S,)."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(self.weights) - self.log_prior)
+
+
+def thinned(one: Specimen, seed: int) -> Specimen:
+    """Return a specimen with at most `KEPT` draws of equal weight, by systematic resampling."""
+    if len(one.draws) <= KEPT:
+        return one
+    places = (np.arange(KEPT) + np.random.default_rng(seed).uniform()) / KEPT
+    which = np.searchsorted(np.cumsum(one.weights), places).clip(max=len(one.weights) - 1)
+    weights = np.full(KEPT, 1 / KEPT)
+    return Specimen(one.draws[which], weights, one.log_prior[which], min(one.effective, KEPT))
+
+
+@dataclass(frozen=True)
+class Hyperprior:
+    """Mean (d,) and standard deviation (d,) of a specimen's prior π_0."""
+
+    mean: FloatArray
+    std: FloatArray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Draws of the distribution of a population.
+
+    Attributes
+    ----------
+    mean
+        m (A, d).
+    covariance
+        C (A, d, d).
+    effective
+        Number of independent draws that they are worth.
+    specimens
+        What it was fitted to.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    effective: float
+    specimens: tuple[Specimen, ...]
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviations (A, d)."""
+        return np.asarray(np.sqrt(np.einsum("aii->ai", self.covariance)))
+
+    def predictive(self, seed: int) -> FloatArray:
+        """Return a draw (A, d) of a new specimen for each draw of the population."""
+        normals = np.random.default_rng([seed, 1]).standard_normal(self.mean.shape)
+        return np.asarray(self.mean + np.einsum("aij,aj->ai", np.linalg.cholesky(self.covariance), normals))
+
+    def estimates(self, number: int, seed: int) -> tuple[FloatArray, float]:
+        """Return draws (A, d) of a specimen under the population, and the effective size of its weights.
+
+        The size is that of the draws of the posterior with the weights that they have over the population.
+        """
+        one, rng = self.specimens[number], np.random.default_rng([seed, 2, number])
+        kernel = one.width**2 * one.covariance
+        logs = _log_kernels(one, self.mean, self.covariance)
+        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        weights /= weights.sum(axis=1, keepdims=True)
+        chosen = (weights.cumsum(axis=1) < rng.random((len(weights), 1))).sum(axis=1).clip(max=weights.shape[1] - 1)
+        kernels = np.broadcast_to(kernel, self.covariance.shape)
+        gain = np.swapaxes(np.linalg.solve(self.covariance + kernel, kernels), 1, 2)
+        at = one.shrunken[chosen]
+        middle = at + np.einsum("aij,aj->ai", gain, self.mean - at)
+        left = kernel - gain @ kernel
+        values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
+        normals = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
+        together = weights.mean(axis=0)
+        return middle + np.einsum("aij,aj->ai", vectors, normals), float(1 / (together**2).sum())
+
+
+def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Ln of w/π_0 N(z | m, C + h² V) (A, S) of all draws."""
+    roots = np.linalg.cholesky(covariances + one.width**2 * one.covariance)
+    deviations = one.shrunken[None] - means[:, None, :]
+    whitened = np.linalg.solve(roots, np.swapaxes(deviations, 1, 2))
+    logs = np.log(np.einsum("aii->ai", roots)).sum(axis=1)
+    return np.asarray(one.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
+
+
+def fitted(specimens: Sequence[Specimen], prior: Hyperprior, draws: int, seed: int, steps: int = 600) -> Fit:
+    """Sample the distribution of a population.
+
+    Parameters
+    ----------
+    specimens
+        At least two.
+    prior
+        That of a specimen.
+    draws
+        Number A of draws that are kept.
+    seed
+        Of the walkers.
+    steps
+        Of each walker; the first third is left out.
+    """
+    few = tuple(thinned(one, seed) for one in specimens)
+    d = len(prior.mean)
+    means = np.array([one.mean for one in few])
+    spread = np.maximum(means.std(axis=0), np.sqrt(np.mean([np.diag(one.covariance) for one in few], axis=0)) / 4)
+    start = np.concatenate([means.mean(axis=0), np.log(spread), np.zeros(d * (d - 1) // 2)])
+    widths = np.concatenate([spread / 2, np.full(start.size - d, 0.3)])
+    rng = np.random.default_rng([seed, 0])
+    walkers = start + widths * rng.standard_normal((max(32, 4 * start.size), start.size))
+    chain = _walked(walkers, lambda x: _log_posterior(x, few, prior), steps, rng)[steps // 3 :]
+    worth = min(
+        effective(chain[:, :, j].T.ravel(), np.repeat(np.arange(chain.shape[1]), len(chain))) for j in range(start.size)
+    )
+    flat = chain.reshape(-1, start.size)
+    chosen = flat[rng.permutation(len(flat))[:draws]]
+    mean, covariance = _population(chosen, d)
+    return Fit(mean, covariance, min(worth, float(len(chosen))), tuple(specimens))
+
+
+def _population(x: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance from the coordinates (A, d + d + d(d − 1)/2) of walkers."""
+    roots = np.exp(x[:, d : 2 * d, None]) * _roots(x[:, 2 * d :], d)[0]
+    return x[:, :d], roots @ np.swapaxes(roots, 1, 2)
+
+
+def _roots(y: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
+    """Cholesky factors (A, d, d) of correlation matrices from real numbers (A, d(d − 1)/2), and ln of det R dR/dy.
+
+    Partial correlations are tanh y (D. Lewandowski, D. Kurowicka, H. Joe, J. Multivar. Anal. 100 (2009) 1989–2001):
+    that of column k has the density ∝ (1 − p²)^(1 + (d − 2 − k)/2) for η = 2, and dp/dy = 1 − p².
+    """
+    partial = np.tanh(y)
+    root, logs, place = np.zeros((len(y), d, d)), np.zeros(len(y)), 0
+    root[:, 0, 0] = 1.0
+    for i in range(1, d):
+        left = np.ones(len(y))
+        for k in range(i):
+            p = partial[:, place]
+            root[:, i, k] = p * np.sqrt(left)
+            rest = np.maximum(1 - p**2, 1e-300)
+            left = left * rest
+            logs += (2 + (d - 2 - k) / 2) * np.log(rest)
+            place += 1
+        root[:, i, i] = np.sqrt(left)
+    return root, logs
+
+
+def _log_posterior(x: FloatArray, specimens: Sequence[Specimen], prior: Hyperprior) -> FloatArray:
+    """Ln of the density (A,) at coordinates (A, …) of walkers."""
+    d = len(prior.mean)
+    mean, covariance = _population(x, d)
+    logs = x[:, d : 2 * d]
+    found = -(((mean - prior.mean) / (WIDER * prior.std)) ** 2).sum(axis=1) / 2
+    ratio = np.exp(np.clip(logs - np.log(prior.std), -50, 50))
+    found += (logs - (FREEDOM + 1) / 2 * np.log1p(ratio**2 / FREEDOM)).sum(axis=1) + _roots(x[:, 2 * d :], d)[1]
+    possible = np.isfinite(found) & (np.abs(logs - np.log(prior.std)) < 15).all(axis=1)
+    possible &= (np.abs(x[:, 2 * d :]) < 8).all(axis=1)
+    found[~possible] = -np.inf
+    for one in specimens:
+        kernels = _log_kernels(one, mean[possible], covariance[possible])
+        top = kernels.max(axis=1)
+        found[possible] += top + np.log(np.exp(kernels - top[:, None]).sum(axis=1))
+    return np.asarray(found)
+
+
+def _walked(
+    walkers: FloatArray, log_density: Callable[[FloatArray], FloatArray], steps: int, rng: np.random.Generator
+) -> FloatArray:
+    """Positions (steps, K, q) of K walkers that stretch towards each other, half of them at a time."""
+    walkers = walkers.copy()
+    K, q = walkers.shape
+    logs = log_density(walkers)
+    chain = np.empty((steps, K, q))
+    for step in range(steps):
+        halves = np.array_split(rng.permutation(K), 2)
+        for here, others in (halves, halves[::-1]):
+            z = ((STRETCH - 1) * rng.random(len(here)) + 1) ** 2 / STRETCH
+            partner = walkers[rng.choice(others, len(here))]
+            proposed = partner + z[:, None] * (walkers[here] - partner)
+            new = log_density(proposed)
+            accepted = np.log(rng.random(len(here))) < (q - 1) * np.log(z) + new - logs[here]
+            walkers[here[accepted]], logs[here[accepted]] = proposed[accepted], new[accepted]
+        chain[step] = walkers
+    return chain

@@ -1,0 +1,63 @@
+"""A population of specimens: typical and new ones, and each specimen by itself and as one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from forward.words import number, with_error
+from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.section import Results, Section
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class PopulationOfSpecimens(Section):
+    """Tables of the population and of its specimens."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether there is one."""
+        return "population_draw" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """The population, then the specimens."""
+        of = results.dataset
+        yield Heading("The population")
+        what = "ln |parameter| is normal" if int(of["logarithmic"]) else "parameters are normal"
+        yield Text(
+            f"Over specimens, {what}. Intervals hold 95 %: that of the typical specimen is what is not known of it, "
+            "that of a new one has the spread of the population too."
+        )
+        rows = [
+            (name, *(_interval(of[f"{which}_quantiles"].sel(parameter=name)) for which in ("typical", "scale", "new")))
+            for name in results.parameters
+        ]
+        yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
+        pairs = [(a, b) for i, a in enumerate(results.parameters) for b in results.parameters[i + 1 :]]
+        if pairs:
+            correlations = of["correlation_quantiles"]
+            cells = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
+            yield Table(("parameter", "with", "correlation"), cells, text=frozenset({0, 1}))
+        yield Heading("Its specimens")
+        yield Text(
+            "By its own data alone, and with what the others say on what specimens are like. The effective number is "
+            "that of the draws that the population leaves."
+        )
+        lines = []
+        for specimen in map(str, of["specimen"].values):
+            one = of.sel(specimen=specimen)
+            for name in results.parameters:
+                here = one.sel(parameter=name)
+                alone, shrunken = (
+                    with_error(float(here[f"{who}_mean"]), float(here[f"{who}_std"])) for who in ("own", "specimen")
+                )
+                lines.append((specimen, name, alone, shrunken, number(float(one["specimen_effective"]), 3)))
+        head = ("specimen", "parameter", "by itself", "of the population", "effective")
+        yield Table(head, lines, text=frozenset({0, 1}))
+
+
+def _interval(quantiles: xr.DataArray) -> str:
+    """Write a median with the ends of an interval."""
+    lower, middle, upper = (number(float(x)) for x in quantiles.to_numpy())
+    return f"{middle} ({lower} to {upper})"
