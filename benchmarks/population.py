@@ -1,7 +1,7 @@
 """Coverage of populations: synthetic specimens of a known one, by draws of their own posteriors.
 
-Each population has 8 specimens of two numbers, normal with standard deviations 0.3 and 0.2 and correlation 0.5. They are
-measured with normal errors between 0.05 and 0.3 under a prior N(0, 1), and known by 100 draws each.
+Each population has 8 specimens of two numbers, normal with standard deviations 0.3 and 0.2 and correlation 0.5, which
+are measured with normal errors between 0.05 and 0.3 under a prior N(0, 1), and known by 100 draws each.
 """
 
 from __future__ import annotations
