@@ -1,8 +1,22 @@
-"""What every test gets."""
+"""What every test gets, and in which order they run."""
 
 import sys
+from collections import Counter
 
 import pytest
+
+
+def pytest_configure(config):
+    """Let pytest-xdist keep the order below; its own begins with the files of most tests, which are the short ones."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Files that start most programs come first, since they take longest: workers end with short files together."""
+    launching = Counter(item.path for item in items if item.get_closest_marker("mpi"))
+    solving = Counter(item.path for item in items if item.get_closest_marker("fem"))
+    items.sort(key=lambda item: (-launching[item.path], -solving[item.path]))
 
 
 @pytest.fixture(autouse=True)

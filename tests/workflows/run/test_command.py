@@ -221,6 +221,7 @@ def test_failed_solves_are_recorded_and_exit_with_3(tmp_path):
         "parameters.loads.gravity.density={kind='gamma', shape=1, scale=800, shift=100}",  # a long tail
         "model.solver.minimum_load_step=1.0",
         "model.solver.iterations=10",
+        "method.fields=false",
     )
     done = tissuq("run", TINY, "--out", tmp_path / "out", *(word for c in changes for word in ("--set", c)))
     assert done.returncode == 3, done.stderr
