@@ -1,4 +1,4 @@
-"""The specification of a specimen: one body in several load cases, with observed displacements."""
+"""The specification of a specimen: one body in several load cases, with observed displacements and other outputs."""
 
 from __future__ import annotations
 
@@ -42,12 +42,15 @@ class LoadCase(Settings):
         Used in names of observations.
     clamp, displacements, loads
         As in `Hyperelastic`.
+    outputs
+        What is measured beside displacements, such as the force of a tool: by its name in tables of data.
     """
 
     name: str = Field(pattern=r"^[^.\s]+$")
     clamp: tuple[str, ...] = ()
     displacements: tuple[Displacement, ...] = ()
     loads: tuple[Load, ...] = ()
+    outputs: tuple[Output, ...] = ()
 
 
 class Observed(Settings):
@@ -87,7 +90,7 @@ class Observed(Settings):
 
 
 class _Loaded(Hyperelastic):
-    """The body in one load case; observations are not outputs."""
+    """The body in one load case; observed displacements are not outputs."""
 
     outputs: tuple[Output, ...] = ()
 
@@ -125,12 +128,17 @@ class Specimen(ModelSpec):
     def loaded(self, case: LoadCase) -> Hyperelastic:
         """Return the body in one load case."""
         shared = {name: getattr(self, name) for name in SHARED}
-        acting = {name: getattr(case, name) for name in ("clamp", "displacements", "loads")}
+        acting = {name: getattr(case, name) for name in ("clamp", "displacements", "loads", "outputs")}
         return _Loaded(formulation=self.formulation, **shared, **acting)
 
     def seen(self, case: LoadCase) -> tuple[Observed, ...]:
         """Return what is measured in one load case."""
         return tuple(item for item in self.observed if not item.cases or case.name in item.cases)
+
+    @property
+    def measurable(self) -> dict[str, dict[str, str]]:
+        """Load cases by name, with the units of what is measured in them beside displacements, by name."""
+        return {case.name: {output.name: output.unit for output in case.outputs} for case in self.cases}
 
     @property
     def scalars(self) -> dict[str, Scalar]:
@@ -199,14 +207,14 @@ class Specimen(ModelSpec):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Displacements of the observed points, case after case.
+        """Displacements of the observed points and other outputs, case after case.
 
         Raises
         ------
         ModelError
             If nodes of a boundary are observed: only the mesh knows which these are.
         """
-        found = []
+        found: list[Output] = []
         for i, item in enumerate(self.observed):
             if item.on is not None:
                 message = f"observed[{i}].on: its nodes are not known before there is a mesh, expected points ('at')"
@@ -217,6 +225,7 @@ class Specimen(ModelSpec):
                     for axis in (one for one in AXES if one in item.components):
                         name = f"{case.name}.{item.label}.{i}.{axis}"
                         found.append(PointDisplacement(name=name, at=at, component=axis))
+            found += [output.model_copy(update={"name": f"{case.name}.{output.name}"}) for output in case.outputs]
         return tuple(found)
 
     def cost(self) -> Times:
@@ -268,7 +277,11 @@ class Specimen(ModelSpec):
                     if i == 0 or not common:  # what is wrong with the body is wrong in every case
                         place = line["loc"] if common else ("cases", i, *line["loc"])
                         yield _mistake(place, line["msg"], line["input"])
-            if self.observed and not self.seen(case):
+            for k, output in enumerate(case.outputs):
+                if output.name in AXES:
+                    message = "the name of a component of displacements, expected another one"
+                    yield _mistake(("cases", i, "outputs", k, "name"), message, output.name)
+            if self.observed and not self.seen(case) and not case.outputs:
                 yield _mistake(("cases", i), "nothing is measured in this load case", case.name)
         for i, item in enumerate(self.observed):
             yield from self._mistakes_of(i, item)

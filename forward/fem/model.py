@@ -387,12 +387,26 @@ class FiniteElementSolution:
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
-        du = self.state_tangent(direction)
-        return self._model.equations.total(du @ self._gradients.T) + direction @ self._partials.T
+        return self.along(self.state_tangent(direction), direction)
+
+    def along(self, state: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along changes of state (U_local,) and parameters (d,); collective.
+
+        For k of both, (k, m).
+        """
+        return self._model.equations.total(state @ self._gradients.T) + direction @ self._partials.T
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        return self.state_adjoint(weights @ self._gradients) + weights @ self._partials
+        return self.state_adjoint(self.loads(weights)) + self.directly(weights)
+
+    def loads(self, weights: FloatArray) -> FloatArray:
+        """Return the derivative (U_local,) of outputs weighted by `weights` (m,) by the state; (k, U_local) of k."""
+        return np.asarray(weights @ self._gradients)
+
+    def directly(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) at this state of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
+        return np.asarray(weights @ self._partials)
 
     def state_adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the state weighted by `weights` (U_local,), or (k, d) for k of them; collective.

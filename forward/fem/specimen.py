@@ -1,7 +1,7 @@
 """A specimen as a model: every load case has its own model, and with it its own factor.
 
 Products with the derivatives of all cases, in any order, use the factors of one solution. The observations of a case
-are Bu with a sparse B.
+are Bu with a sparse B; other outputs of a case, such as the force of a tool, follow its displacements.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix
 
 from forward.bodies.geometry import AXES
 from forward.fem.dolfinx import spaces
-from forward.fem.enriched import Enriched, relative
+from forward.fem.enriched import Enriched, EnrichedState, relative
 from forward.fem.equations import Discretisation
 from forward.fem.layout import Layout, vertices_of
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
@@ -46,11 +46,11 @@ class SpecimenModel(OneByOne):
     parameters, outputs
         Names.
     places
-        Points (n, 3) at which the outputs are observed (m, undeformed).
+        Points (n, 3) at which the outputs are observed (m, undeformed); NaN of those at no point.
     axes
-        Their components (n,): 0, 1 or 2.
+        Their components (n,): 0, 1 or 2; 3 and more are the other outputs of the load case, in its order.
     directions
-        Unit vectors (n, 3) along which these are measured.
+        Unit vectors (n, 3) along which these are measured; zeros of other outputs.
     cases
         Their load cases (n,), by number.
     models
@@ -59,6 +59,8 @@ class SpecimenModel(OneByOne):
         Indices of the parameters of each case among all.
     observations
         B (n, U_local) of each case, sparse.
+    others, which
+        Of each case, which of its observations are other outputs than displacements, and their numbers among these.
     distances
         Distances (n,) of the points from the mesh (m); outside it, the displacement of the nearest point is observed.
     """
@@ -90,8 +92,12 @@ class SpecimenModel(OneByOne):
                 places.append(np.repeat(where, len(item.components), axis=0))
                 axes += [AXES.index(axis) for axis in item.components] * len(where)
                 cases += [number] * len(where) * len(item.components)
+            names += [f"{case.name}.{output.name}" for output in case.outputs]
+            places.append(np.full((len(case.outputs), 3), np.nan))
+            axes += [len(AXES) + i for i in range(len(case.outputs))]
+            cases += [number] * len(case.outputs)
         where = np.concatenate(places) if places else np.zeros((0, 3))
-        self._observing(where, axes, cases, np.eye(3)[axes].reshape(-1, 3), tuple(names))
+        self._observing(where, axes, cases, _directions(axes), tuple(names))
 
     def observing(
         self, places: FloatArray, axes: Sequence[int], cases: Sequence[int], directions: FloatArray | None = None
@@ -101,17 +107,20 @@ class SpecimenModel(OneByOne):
         Parameters
         ----------
         places
-            Points (n, 3) at which displacements are observed, in the undeformed body (m).
+            Points (n, 3) at which displacements are observed, in the undeformed body (m); those of other outputs do
+            not count.
         axes
-            Their components (n,): 0, 1 or 2.
+            Their components (n,): 0, 1 or 2; 3 and more are the other outputs of the load case, in its order.
         cases
             Their load cases (n,) by number, in ascending order.
         directions
-            Unit vectors (n, 3) along which the components are measured, by default the axes of the body.
+            Unit vectors (n, 3) along which the components are measured, by default the axes of the body; zeros of other
+            outputs.
         """
         other = copy.copy(self)
-        along = np.eye(3)[np.asarray(axes, dtype=np.int64)].reshape(-1, 3) if directions is None else directions
-        labels = [(self.spec.cases[case].name, AXES[axis]) for case, axis in zip(cases, axes, strict=True)]
+        along = _directions(axes) if directions is None else directions
+        of_cases = [(case.name, (*AXES, *(output.name for output in case.outputs))) for case in self.spec.cases]
+        labels = [(of_cases[case][0], of_cases[case][1][axis]) for case, axis in zip(cases, axes, strict=True)]
         names = tuple(f"{case}.{i}.{axis}" for i, (case, axis) in enumerate(labels))
         other._observing(places, axes, cases, along, names)
         return other
@@ -128,6 +137,9 @@ class SpecimenModel(OneByOne):
         self.axes, self.cases = (np.array(numbers, dtype=np.int64) for numbers in (axes, cases))
         numbers = range(len(self.models))
         self._ends = np.searchsorted(self.cases, numbers, side="right")[:-1]
+        axes_of = [self.axes[self.cases == number] for number in numbers]
+        self.others = [np.flatnonzero(mine >= len(AXES)) for mine in axes_of]
+        self.which = [mine[rows] - len(AXES) for mine, rows in zip(axes_of, self.others, strict=True)]
         found = [
             _interpolation(model.equations, self.places[self.cases == number], self.directions[self.cases == number])
             for number, model in zip(numbers, self.models, strict=True)
@@ -232,7 +244,9 @@ class SpecimenSolution:
         self._model = model
         self.solutions = solutions
         self.state = np.concatenate([solution.state for solution in solutions])
-        self.outputs = self._observe([solution.state for solution in solutions], model.observations)
+        self.outputs = self._observe(
+            [solution.state for solution in solutions], model.observations, [solution.outputs for solution in solutions]
+        )
         for array in (self.state, self.outputs):
             array.flags.writeable = False
         self.residual = max(solution.residual for solution in solutions)
@@ -248,9 +262,19 @@ class SpecimenSolution:
         """Cost of the solutions of all cases so far."""
         return Work.sum_of(solution.work for solution in self.solutions)
 
-    def _observe(self, states: list[FloatArray], observations: list[csr_matrix]) -> FloatArray:
-        parts = zip(self._model.models, observations, states, strict=True)
-        return np.concatenate([model.equations.total((B @ u.T).T) for model, B, u in parts], axis=-1)
+    def _observe(
+        self, states: list[FloatArray], observations: list[csr_matrix], outputs: Sequence[FloatArray | None]
+    ) -> FloatArray:
+        """What is observed (…, n) of states (…, U_local) and other outputs (…, m) of the cases."""
+        model = self._model
+        found = [
+            case.equations.total((B @ u.T).T) for case, B, u in zip(model.models, observations, states, strict=True)
+        ]
+        for seen, rows, which, values in zip(found, model.others, model.which, outputs, strict=True):
+            if len(rows):
+                assert values is not None
+                seen[..., rows] = values[..., which]
+        return np.concatenate(found, axis=-1)
 
     def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
         parts = zip(self.solutions, self._model.positions, strict=True)
@@ -262,16 +286,29 @@ class SpecimenSolution:
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (n,) along a `direction` (d,), or (k, n) for k of them; collective."""
-        return self._observe(self._state_tangents(direction), self._model.observations)
+        states, model = self._state_tangents(direction), self._model
+        parts = zip(self.solutions, states, model.positions, model.others, strict=True)
+        outputs = [one.along(du, direction[..., where]) if len(rows) else None for one, du, where, rows in parts]
+        return self._observe(states, model.observations, outputs)
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (n,), or (k, d) for k of them; collective."""
         model = self._model
         gradients = np.zeros((*np.shape(weights)[:-1], len(model.parameters)))
         parts = zip(self.solutions, model.positions, model.observations, model.values(weights), strict=True)
-        for solution, where, B, w in parts:
-            gradients[..., where] += solution.state_adjoint((B.T @ w.T).T)
+        for k, (solution, where, B, w) in enumerate(parts):
+            loads, rows = (B.T @ w.T).T, model.others[k]
+            if len(rows):
+                of_outputs = w[..., rows] @ (model.which[k][:, None] == np.arange(len(solution.outputs)))
+                loads = loads + solution.loads(of_outputs)
+                gradients[..., where] += solution.directly(of_outputs)
+            gradients[..., where] += solution.state_adjoint(loads)
         return gradients
+
+    def _enriched_outputs(self, bodies: Sequence[Enriched], states: Sequence[EnrichedState]) -> list[FloatArray | None]:
+        """The other outputs of the cases, where they are observed, at states in elements of a higher degree."""
+        parts = zip(self.solutions, bodies, states, self._model.others, strict=True)
+        return [body.values(one, state) if len(rows) else None for one, body, state, rows in parts]
 
     def mesh_error(self) -> MeshError:
         """Estimate the error of the mesh in the observations and the states of all cases; collective.
@@ -283,7 +320,8 @@ class SpecimenSolution:
         """
         model, found = self._model, [solution.enriched_state for solution in self.solutions]
         observations = model.enriched_observations([case.enriched for case in model.models])
-        outputs = self._observe([one.state for one in found], observations) - self.outputs
+        others = self._enriched_outputs([case.enriched for case in model.models], found)
+        outputs = self._observe([one.state for one in found], observations, others) - self.outputs
         parts = zip(model.models, found, strict=True)
         state = np.concatenate([case.enriched.down(one.change) for case, one in parts])
         energy, stored = sum(one.energy for one in found), sum(one.stored for one in found)
@@ -308,9 +346,12 @@ class SpecimenSolution:
         if len(known) < len(found):
             return typical(seen, degree)
         observations = model.enriched_observations([twice for twice, *_ in known])
-        more = self._observe([one.state for _, one, _, _ in known], observations) - self.outputs
+        states = [one for _, one, _, _ in known]
+        others = self._enriched_outputs([twice for twice, *_ in known], states)
+        more = self._observe([one.state for one in states], observations, others) - self.outputs
         of_states = float(np.mean([factor for _, _, factor, _ in known]))
-        small = np.abs(seen) < SMALL * np.abs(seen).max(initial=0.0)
+        moved = np.where(model.axes < len(AXES), np.abs(seen), 0.0)  # other outputs have other units
+        small = (moved < SMALL * moved.max(initial=0.0)) & (model.axes < len(AXES))
         outputs = np.where(small, of_states, factors(seen, more, degree, of_states))
         return Saturation(outputs, of_states, float(np.mean([factor for *_, factor in known])))
 
@@ -324,12 +365,18 @@ def _places(model: HyperelasticModel, item: Observed) -> FloatArray:
     return np.asarray(layout.coordinates[np.unique(np.concatenate(equations.comm.allgather(mine)))])
 
 
+def _directions(axes: Sequence[int]) -> FloatArray:
+    """Axes (n, 3) of components; zeros of other outputs."""
+    known = np.eye(len(AXES) + 1, len(AXES))
+    return np.asarray(known[np.minimum(np.asarray(axes, dtype=np.int64), len(AXES))].reshape(-1, 3))
+
+
 def _interpolation(
     equations: Discretisation, places: FloatArray, directions: FloatArray
 ) -> tuple[csr_matrix, FloatArray]:
     """Return B (n, U_local) of components along directions (n, 3) at points (n, 3), and their distances (n,).
 
-    Distances are from the mesh; collective.
+    Distances are from the mesh; rows without a direction, of other outputs, are empty; collective.
 
     Raises
     ------
@@ -337,13 +384,15 @@ def _interpolation(
         If a point is farther from the mesh than the mesh can be from the body.
     """
     layout = equations.layout
-    different, which = np.unique(places, axis=0, return_inverse=True) if len(places) else (places, np.arange(0))
+    moving = np.flatnonzero(directions.any(axis=1))
+    none = (places[:0], np.arange(0))
+    different, which = np.unique(places[moving], axis=0, return_inverse=True) if len(moving) else none
     which = which.ravel()
     held, distances = BodySpace(equations).interpolation(different)
     local = np.full(len(layout.coordinates), -1)
     local[layout.positions] = np.arange(len(layout.positions))
     rows, columns, values = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for row, (i, along) in enumerate(zip(which, directions, strict=True)):
+    for row, i, along in zip(moving, which, directions[moving], strict=True):
         at, w = held[i]
         owned = local[at] >= 0
         for axis in np.flatnonzero(along):
@@ -351,4 +400,6 @@ def _interpolation(
             columns.append(3 * local[at][owned] + axis)
             values.append(along[axis] * w[owned])
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(entries, shape=(len(places), equations.size)), distances[which]
+    far = np.zeros(len(places))
+    far[moving] = distances[which]
+    return csr_matrix(entries, shape=(len(places), equations.size)), far

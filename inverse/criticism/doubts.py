@@ -32,6 +32,7 @@ BIASED, WRONG = (
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
 OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
+EXPANDED = 0.3  # error of an expansion over that of a datum that makes intervals wider by more than 4 %
 GRID = np.linspace(-40.0, 40.0, 8001)
 
 
@@ -320,3 +321,24 @@ def change_in_words(change: float, shift: float) -> str:
     return (
         f"a lot ({change:+.2g} to first order, which does not hold where unknowns move by {abs(shift):.2g} deviations)"
     )
+
+
+def expansion_off(error: Any, solves: Any) -> list[Doubt]:
+    """Doubt an expansion that misses left-out samples by a large part of the errors of the data.
+
+    Parameters
+    ----------
+    error
+        Root mean square error of the datum that it misses most, over the standard deviation of its error.
+    solves
+        Number of solves that it was fitted to.
+    """
+    if not float(error) > EXPANDED:
+        return []
+    error = float(error)
+    text = (
+        f"the expansion that the data sets share, of {int(solves)} solves, misses a datum by {error:.2g} of its error, to "
+        "which that is added: intervals are wider than need be; raise method.expansion, or let every data set have "
+        "solves of its own"
+    )
+    return [Doubt("error" if error > 1 else "warning", text, "the expansion that the data sets share is not accurate")]

@@ -75,7 +75,7 @@ class Places:
     groups
         Numbers (m,) of load case and component, or of the output.
     points
-        Places (m, 3); None where there are none.
+        Places (m, 3), NaN of data at no place; None where there are none.
     """
 
     groups: NDArray[np.int64]
@@ -99,8 +99,12 @@ def uncertain(error: FloatArray, between: FloatArray, places: Places) -> FloatAr
     """
     shapes, points, groups = [np.ones(len(between))], places.points, places.groups
     if points is not None:
-        low, high = points.min(axis=0), points.max(axis=0)
-        shapes += list((2 * (points - low) / np.where(high > low, high - low, 1.0) - (high > low)).T)
+        somewhere = np.isfinite(points).all(axis=1)
+        seen = points[somewhere] if somewhere.any() else np.zeros((1, 3))
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        across = np.zeros((len(between), 3))
+        across[somewhere] = 2 * (points[somewhere] - low) / np.where(high > low, high - low, 1.0) - (high > low)
+        shapes += list(across.T)
     patterns = (OF_DIFFERENCE * between, OF_ERROR * error)
     rows = [
         pattern * shape * (groups == group) for pattern in patterns for group in np.unique(groups) for shape in shapes

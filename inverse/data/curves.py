@@ -2,7 +2,9 @@
 
 A column says where on the path each row is: a number that has steps (``depth``, or its whole path), or ``step``. The
 others are measured outputs (``force``), with ``sigma_force`` or ``sigma`` for the standard deviations of their errors.
-Heads may state units: ``depth [mm]``. A cell may be empty where nothing was measured.
+Heads may state units, all or none: ``depth [mm]``. A cell may be empty where nothing was measured. Rows are in the
+order of the path, since a table that turns back holds unloading, which a material without memory does not tell from
+loading; a place may occur several times in a row, where a measurement was repeated.
 """
 
 from __future__ import annotations
@@ -70,11 +72,24 @@ def as_rows(table: Table, name: str, steps: Steps) -> Table:
     heads = {split_head(head)[0]: head for head in table.columns}
     where = [column for column in heads if column in places]
     rows, lines, wrong = [], [], []
+    before: tuple[int, int] | None = None  # step and line of the row before
+    first: dict[tuple[int, str, str], int] = {}  # lines by what was measured
     for row, line in zip(table.rows, table.lines, strict=True):
         at = _step(row, f"{name}: line {line}", {column: heads[column] for column in where}, places, scales)
         if isinstance(at, str):
             wrong.append(at)
             continue
+        if before is not None and at < before[0] and "step" not in heads:
+            head = heads[where[0]]
+            message = f"{where[0]} = {row[head]} after that of line {before[1]}, which is farther along the path"
+            wrong.append(f"{name}: line {line}: {message}; expected loading only, in order")
+        before = at, line
+        for output in (one for one in steps.units if one in heads and row[heads[one]]):
+            key = at, output, row[heads[output]]
+            if key in first:
+                message = f"'{output}' of line {first[key]} again, expected each measurement once"
+                wrong.append(f"{name}: line {line}: {message}")
+            first.setdefault(key, line)
         for output in (one for one in steps.units if one in heads and row[heads[one]]):
             sigma = next((heads[one] for one in (f"sigma_{output}", "sigma") if one in heads), None)
             rows.append(
@@ -120,10 +135,10 @@ def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
         wrong.append(f"{name}: no column says where on the path a row is, expected one of: {', '.join(places)}")
     if not set(named) & set(steps.units):
         wrong.append(f"{name}: no column is a measured output, expected one of: {', '.join(steps.units)}")
-    lengths = [(column, unit) for column, unit in columns if column in {**places, **steps.units} and column != "step"]
-    if len({unit is None for _, unit in lengths}) > 1:
-        stated = next(column for column, unit in lengths if unit is not None)
-        silent = next(column for column, unit in lengths if unit is None)
+    measured = [(column, unit) for column, unit in columns if column != "step"]
+    if len({unit is None for _, unit in measured}) > 1:
+        stated = next(column for column, unit in measured if unit is not None)
+        silent = next(column for column, unit in measured if unit is None)
         wrong.append(
             f"{name}: '{stated}' states a unit and '{silent}' does not, expected units of all columns or of none"
         )
@@ -154,7 +169,12 @@ def _step(
         return int(near.argmax()) + 1
     known = ", ".join(f"{value:g}" for value in places[next(iter(where))][1])
     ways = "no step of the model" if not near.any() else "more than one step of the model"
-    return f"{label}: {', '.join(told)} is {ways}; its steps are {next(iter(where))} = {known}"
+    hint = ""
+    for column, head in where.items():
+        values, given = places[column][1], float(row[head])
+        if places[column][0] == "m" and (np.abs(values - 1e-3 * given) <= CLOSE * np.abs(values).max()).any():
+            hint = f" (in millimetres? then its head is '{column} [mm]', and all heads state units)"
+    return f"{label}: {', '.join(told)} is {ways}; its steps are {next(iter(where))} = {known}{hint}"
 
 
 def _scaled(text: str, scale: float) -> str:

@@ -4,7 +4,8 @@ A table of comma-separated values has the columns x, y, z (of the undeformed bod
 sigma, or sigma_x, sigma_y, sigma_z (standard deviations of the errors), and case (name of the load case). Heads may
 state the unit of all lengths: ``x [mm]``, ``ux [mm]``. Empty cells and ``nan`` mean that a component was not measured.
 Lines that begin with # state the source of the data, and lines ``# truth.NAME = VALUE`` the true values behind
-synthetic data. Other files: `inverse.data.scans`.
+synthetic data. Rows may hold measured outputs of load cases, such as forces of tools, in place of displacements:
+`inverse.data.readings`. Other files: `inverse.data.scans`.
 
 Most of the module describes what may be wrong with a table, each mistake with its line.
 """
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import iglob
 from itertools import count
@@ -26,6 +27,7 @@ from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
+from inverse.data.readings import Readings, Units, split
 from inverse.data.table import DataError, Table, others, read_table
 from inverse.data.units import factor, split_head
 
@@ -63,6 +65,8 @@ class Observations:
         Directions (3, 3) in the body along which x, y and z of the displacements are measured, as rows.
     unit
         m per unit of the file.
+    readings
+        Measured outputs of the load cases.
     """
 
     places: FloatArray
@@ -75,6 +79,7 @@ class Observations:
     truth: dict[str, str] = field(default_factory=dict)
     axes: FloatArray = field(default_factory=lambda: np.eye(3))
     unit: float = 1.0
+    readings: Readings = field(default_factory=Readings)
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -138,6 +143,8 @@ class Observations:
         DataError
             If points are farther away, all of them are left out, or displacements are larger than the body.
         """
+        if not len(self.places):
+            return Placed(self, np.zeros(0))
         mistakes = []
         largest = np.nanmax(np.abs(self.displacements))
         if largest > extent:
@@ -166,31 +173,37 @@ class Observations:
         return Placed(kept, distance[~far], tuple(f"{self.labels[i]} ({distance[i]:.3g} m)" for i in lost))
 
     def data_labels(self) -> list[str]:
-        """Say for each of the `components` its location in the file, place, load case and axis."""
-        which, axes = self._order
-        return [
+        """Say for each of the `components` its location in the file, place, load case, and axis or output."""
+        which, axes = np.nonzero(self.measured)
+        found = [
             f"{self.labels[i]} at ({', '.join(f'{x:.4g}' for x in self.places[i])}) m, {self.cases[self.case[i]]}, "
             f"{MOTION[axis]}"
             for i, axis in zip(which, axes, strict=True)
         ]
+        more = self.readings
+        found += [
+            f"{label}, {self.cases[case]}, {name}"
+            for label, case, name in zip(more.labels, more.case, more.names, strict=True)
+        ]
+        return [found[i] for i in self._order]
 
     @property
-    def _order(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Points and axes of what was measured, load case after load case."""
-        which, axes = np.nonzero(self.measured)
-        order = np.argsort(self.case[which], kind="stable")
-        return which[order], axes[order]
+    def _order(self) -> NDArray[np.intp]:
+        """Measured components of displacements, then readings, in the order of their load cases."""
+        which, _ = np.nonzero(self.measured)
+        return np.argsort(np.concatenate([self.case[which], self.readings.case]), kind="stable")
 
     def components(self) -> Components:
-        """Return what was measured, component by component, load case after load case."""
-        which, axes = self._order
+        """Return what was measured, load case after load case: displacements by component, then other outputs."""
+        (which, axes), more, order = np.nonzero(self.measured), self.readings, self._order
+        nowhere = np.zeros((len(more), 3))
         return Components(
-            self.places[which],
-            axes.astype(np.int64),
-            self.case[which],
-            self.displacements[which, axes],
-            self.sigma[which, axes],
-            None if np.array_equal(self.axes, np.eye(3)) else self.axes[axes],
+            np.concatenate([self.places[which], nowhere + np.nan])[order],
+            np.concatenate([axes.astype(np.int64), len(MOTION) + more.which])[order],
+            np.concatenate([self.case[which], more.case])[order],
+            np.concatenate([self.displacements[which, axes], more.values])[order],
+            np.concatenate([self.sigma[which, axes], more.sigma])[order],
+            None if np.array_equal(self.axes, np.eye(3)) else np.concatenate([self.axes[axes], nowhere])[order],
         )
 
 
@@ -222,20 +235,20 @@ def _of_another(distance: FloatArray, extent: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Measured components of displacements, load case after load case.
+    """Measured components of displacements and other outputs, load case after load case.
 
     Attributes
     ----------
     places
-        Where (m, 3), in m.
+        Where (m, 3), in m; NaN of other outputs.
     axes
-        Which component (m,): 0, 1 or 2.
+        Which component (m,): 0, 1 or 2; 3 and more are the other outputs of the load case, in its order.
     cases
         Numbers (m,) of the load cases.
     values, sigma
-        What was measured (m,), and the standard deviations (m,) of the errors, in m.
+        What was measured (m,), and the standard deviations (m,) of the errors, in m or in the unit of the output.
     directions
-        Unit vectors (m, 3) in the body along which; by default its axes.
+        Unit vectors (m, 3) in the body along which; by default its axes, and zeros of other outputs.
     """
 
     places: FloatArray
@@ -248,7 +261,8 @@ class Components:
     @property
     def along(self) -> FloatArray:
         """Unit vectors (m, 3) in the body along which they are measured."""
-        return np.eye(3)[self.axes] if self.directions is None else self.directions
+        n = len(MOTION)
+        return np.eye(n + 1, n)[np.minimum(self.axes, n)] if self.directions is None else self.directions
 
     @property
     def which(self) -> None:
@@ -264,11 +278,20 @@ class Components:
     @property
     def spread(self) -> Places:
         """Where they are, by load case and component."""
-        return Places(3 * self.cases + self.axes, self.places)
+        return Places(self._kinds, self.places)
 
     def neighbours(self) -> Neighbours:
-        """Return pairs of neighbouring data of the same component and load case."""
-        return neighbours(self.places, 3 * self.cases + self.axes)
+        """Return pairs of neighbouring data of the same component and load case, and repeated measurements."""
+        return neighbours(np.nan_to_num(self.places), self._kinds)
+
+    @property
+    def _kinds(self) -> NDArray[np.int64]:
+        return kinds(self.cases, self.axes)
+
+
+def kinds(cases: NDArray[np.int64], axes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a number (m,) for each pair of a load case and a component or output."""
+    return np.asarray(max(int(axes.max(initial=0)) + 1, len(MOTION)) * cases + axes)
 
 
 def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
@@ -339,8 +362,10 @@ def mistakes_of(found: Observations, name: str) -> list[str]:
     mistakes = []
     for number, case in enumerate(found.cases):
         of_case = found.case == number
-        if not found.measured[of_case].any():
+        if not found.measured[of_case].any() and number not in found.readings.case:
             mistakes.append(f"{name}: no data in load case '{case}', expected some in every load case of the model")
+    if not len(found.places):
+        return mistakes
     bad = np.flatnonzero((found.sigma <= 0).any(axis=1))
     if bad.size:
         value = found.sigma[bad[0]][found.sigma[bad[0]] <= 0][0]
@@ -363,15 +388,15 @@ def mistakes_of(found: Observations, name: str) -> list[str]:
     return mistakes
 
 
-def of_table(path: Path, cases: tuple[str, ...], unit: float | None = None) -> Observations:
-    """Read a table of displacements.
+def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) -> Observations:
+    """Read a table of displacements, and of other outputs.
 
     Parameters
     ----------
     path
         The table.
-    cases
-        Names of the load cases.
+    known
+        Names of the load cases, and what is measured in them beside displacements.
     unit
         m per unit of the file, if it does not state that.
 
@@ -380,8 +405,14 @@ def of_table(path: Path, cases: tuple[str, ...], unit: float | None = None) -> O
     DataError
         With every kind of mistake in the file.
     """
-    name = path.name
-    found, unit = _without_units(read_table(path), name, unit)
+    name, cases = path.name, tuple(known)
+    table, readings = split(read_table(path), name, known)
+    remarks = tuple(line for line in table.remarks if not line.startswith(TRUTH))
+    truth = dict(_assignment(line) for line in table.remarks if line.startswith(TRUTH))
+    if not table.rows:
+        none = np.zeros((0, 3))
+        return Observations(none, none, none, cases, np.zeros(0, dtype=np.int64), (), remarks, truth, readings=readings)
+    found, unit = _without_units(table, name, unit)
     columns = found.columns
     wrong = [
         f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
@@ -424,9 +455,10 @@ def of_table(path: Path, cases: tuple[str, ...], unit: float | None = None) -> O
         cases,
         np.array([cases.index(case) for case in given_cases]),
         labels,
-        tuple(line for line in found.remarks if not line.startswith(TRUTH)),
-        dict(_assignment(line) for line in found.remarks if line.startswith(TRUTH)),
+        remarks,
+        truth,
         unit=unit,
+        readings=readings,
     )
 
 

@@ -23,7 +23,7 @@ first order only; what the tangential displacement adds is of second order, but 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -42,6 +42,7 @@ from inverse.data.observations import (
     mistakes_of,
     of_table,
 )
+from inverse.data.readings import Units
 from inverse.data.registration import Registration
 from inverse.data.scan_files import Points, points_of
 from inverse.data.table import DataError
@@ -70,6 +71,8 @@ class Reading(Settings):
     ----------
     sigma
         Standard deviation (m) of the errors, if a file does not state it.
+    sigma_of
+        The same of other outputs, such as forces, by their names and in their units.
     unit
         m per unit of the files.
     units
@@ -92,6 +95,7 @@ class Reading(Settings):
     """
 
     sigma: Annotated[float, Field(gt=0)] | None = None
+    sigma_of: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
     unit: Annotated[float, Field(gt=0)] | None = None
     units: str | None = None
     field: str | None = None
@@ -166,7 +170,7 @@ class Scan(Reading):
         return self
 
 
-def read(folder: Path, scan: Scan, cases: Sequence[str]) -> Observations:
+def read(folder: Path, scan: Scan, known: Sequence[str] | Mapping[str, Units]) -> Observations:
     """Read the files of a scan.
 
     Parameters
@@ -175,15 +179,15 @@ def read(folder: Path, scan: Scan, cases: Sequence[str]) -> Observations:
         Where they are.
     scan
         The scan.
-    cases
-        Names of the load cases.
+    known
+        Names of the load cases, and what is measured in them beside displacements (nothing if only names are given).
 
     Raises
     ------
     DataError
         With every kind of mistake in the files.
     """
-    cases, unit = tuple(cases), scan.metres
+    cases, unit = tuple(known), scan.metres
     if scan.file is None:
         found = _pairs(folder, scan, cases, 1.0 if unit is None else unit)
     else:
@@ -191,7 +195,7 @@ def read(folder: Path, scan: Scan, cases: Sequence[str]) -> Observations:
         if path.suffix not in TABLES + MESHES:
             raise DataError(f"{path.name}: unknown kind of file, expected one of: {', '.join(TABLES + MESHES)}")
         if path.suffix in TABLES:
-            found = of_table(path, cases, unit)
+            found = of_table(path, known if isinstance(known, Mapping) else {case: {} for case in cases}, unit)
         else:
             found = _mesh(path, scan.field, cases, 1.0 if unit is None else unit)
     mistakes = mistakes_of(found, Path(scan.file or scan.reference or "").name)

@@ -101,6 +101,8 @@ DIMS: dict[str, tuple[str, ...]] = {
     "start_mode": ("start", "parameter"),
     "start_log_posterior": ("start",),
     "zero_likelihood": (),
+    "expansion_error": (),
+    "expansion_solves": (),
     "draw": ("sample", "parameter"),
     "draw_log_likelihood": ("sample", "datum"),
     # of a field

@@ -105,7 +105,8 @@ class Synthesize(Settings):
         evaluate
             The specimen.
         cases, points
-            Numbers of the load case and of the point of each output (m,).
+            Number of the group of each output (m,), whose root mean square relative errors are shares of, such as the
+            load case; and of its point, -1 of those that every data set has.
 
         Raises
         ------
@@ -132,7 +133,9 @@ class Synthesize(Settings):
             kept = np.zeros(points.max() + 1, dtype=bool)
             number = max(round(share * len(kept)), 1)
             kept[np.sort(rng.permutation(len(kept))[:number])] = True
-            values[k, ~kept[points] | (rng.uniform(size=m) < self.missing)] = np.nan
+            seen = np.append(kept, True)[points]
+            left_out = ~seen | (rng.uniform(size=m) < self.missing)
+            values[k, left_out & (points >= 0)] = np.nan
         return xr.Dataset(
             {
                 "clean": (("data_set", "output"), found.outputs),

@@ -97,6 +97,9 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         words = f"of {count} rigid motions that are uncertain, the data determine {seen} better than was known before"
         rest = "" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise"
         found.append(criticism.Doubt("note", words + rest, ""))
+    found += (
+        criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
+    )
     if "mesh_checked" not in one:
         return found
     found += criticism.not_estimable(study.not_estimable(number))

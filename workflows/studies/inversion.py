@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from forward.bodies.inclusions import log_factor
+from forward.model import Finding
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import nearest
@@ -35,7 +36,7 @@ from workflows.studies.predictions import has_mesh, meshes_of
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    from forward.model import Finding, FloatArray
+    from forward.model import FloatArray
     from forward.spec import ModelSpec
     from inverse.data.observations import Components
     from inverse.data.shared_motion import SharedMotion
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from workflows.studies.measured import Measurement
 
 SOLVES_OF_FIELD = 12  # for a mode
+OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
 class InversionStudy(StudyKind):
@@ -117,7 +119,7 @@ class InversionStudy(StudyKind):
     @property
     def together(self) -> bool:
         """Whether all groups of ranks work on one data set, point by point."""
-        return len(self.data.sets) == 1 and self.parallel.ranks_per_model == 1
+        return len(self.data.sets) == 1 and self.parallel.ranks_per_model == 1 and self.method.expansion is None
 
     @property
     def planned(self) -> int:
@@ -128,6 +130,8 @@ class InversionStudy(StudyKind):
     def solves(self) -> int:
         """Approximate number of solves for all data sets: the searches for the modes are not predictable."""
         method, field = self.method, self.field
+        if method.expansion is not None:
+            return method.expansion
         each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
         return each * sum(measurement is not None for measurement in self.measurements)
@@ -279,7 +283,38 @@ class Inversion(InversionStudy):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the specimen before anything is solved."""
-        return (*self.model.findings, *self.model.locking(ranges(self.parameters)), *findings_of_materials(self.inputs))
+        return (
+            *self.model.findings,
+            *self.model.locking(ranges(self.parameters)),
+            *findings_of_materials(self.inputs),
+            *self._ratios_alone(),
+        )
+
+    def _ratios_alone(self) -> Iterator[Finding]:
+        """Find that no force acts or is measured: then displacements do not change if all stiffnesses are doubled."""
+        pressed = any(not load.contact for case in self.model.cases for load in case.loads)
+        units = self.model.measurable
+        seen = [found.observations.readings for found in self.measurements if found is not None]
+        names = {(self.parts[case], name) for one in seen for case, name in zip(one.case, one.names, strict=True)}
+        if pressed or any(units[case][name] not in OF_GEOMETRY for case, name in names):
+            return
+        moduli = [
+            path
+            for path, number in self.model.scalars.items()
+            if number.unit == "Pa" and path.startswith(("material.", "regions."))
+        ]
+        unknown = [path for path in moduli if path in self.parameters]
+        fields = [field.label for field in self.model.fields if field.of == "stiffness"]
+        known = [path for path in moduli if path not in self.parameters]
+        if not unknown and not fields:
+            return
+        sought = ", ".join([*unknown, *(f"the mean of the field '{label}'" for label in fields)])
+        source = f"{', '.join(known)} as stated" if known and not fields else "the prior alone"
+        yield Finding(
+            "warning",
+            "No force acts on the specimen or is among the data, so displacements tell ratios of stiffnesses only: "
+            f"the absolute size of {sought} comes from {source}. Measure a force too (outputs of a load case).",
+        )
 
     @property
     def field(self) -> bool:
@@ -351,4 +386,7 @@ class Inversion(InversionStudy):
             yield ("data", "errors"), message, self.data.errors.kind
         if not self.parameters and not self.model.fields:
             yield ("parameters",), "nothing is unknown, expected at least one prior, or one of model.fields", {}
+        if self.method.expansion is not None:
+            message = "data sets of a specimen are observed at places of their own, expected outputs of another model"
+            yield ("method", "expansion"), message, self.method.expansion
         yield from super()._mistakes()

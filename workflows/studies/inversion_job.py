@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -14,6 +14,7 @@ from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
+from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
     from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
+    from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import Shared, SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -184,6 +186,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     names = [one.name for one in study.data.sets]
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
+    expanded = cache(partial(_expanded, study, made, ensemble, checkpoint))
     invert_field = _inverting_field(study, made) if study.field else None
 
     def beside(name: str, model: ForwardModel) -> KeptEvaluate:
@@ -195,6 +198,11 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
+        if method.expansion is not None:
+            found, log = expanded()
+            if all(one is None for one in study.measurements[:number]):  # those of the first data set that can be used
+                solved += log
+            return _by_expansion(study, found, number, ensemble.say)
         observed = made.observing(number)
         finer = _solved(made.finer(observed), lambda model: solved_by(beside(f"{names[number]}/{FINER}", model)))
         shared = _shared(made.shared(number), lambda model: beside(f"{names[number]}/{MOVED}", model))
@@ -229,6 +237,33 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         arviz_groups=partial(arviz_groups, study),
         texts=lambda found: {BATCH: batch_table(found)},
     )
+
+
+def _expanded(
+    study: InversionStudy, made: _Made, ensemble: Ensemble, checkpoint: Checkpoint
+) -> tuple[SharedExpansion, list[Evaluations]]:
+    """Solve for the expansion that all data sets share; every group does so, or reads what others have solved."""
+
+    def kept(model: ForwardModel, label: str) -> KeptEvaluate:
+        return KeptEvaluate(model, ensemble.group, checkpoint, label, ensemble.count)
+
+    there, samples = made.finer(made.model), study.method.expansion
+    model, why = (None, "") if there is None else there
+    fine = None if model is None else kept(model, f"expansion, {FINER}")
+    assert samples is not None
+    own = kept(made.model, "expansion")
+    return shared_expansion(study.inputs, own, fine, samples, why), own.log
+
+
+def _by_expansion(study: InversionStudy, found: SharedExpansion, number: int, say: Callable[[str], None]) -> xr.Dataset:
+    """Invert a data set with the expansion, whose errors are among those of the data."""
+    data = cast("OutputData", study.measured(number))
+    missed = found.error[list(data.which)]
+    wider = replace(data, sigma=np.hypot(data.sigma, missed))
+    errors = study.data.errors
+    one = invert_by_group(study.inputs, found.model, wider, study.method, None, errors, found.finer, say=say)
+    size, count = float((missed / data.sigma).max()), found.solves + found.finer_solves
+    return one.assign(solves=0.0, expansion_error=size, expansion_solves=float(count))
 
 
 def _inverting_field(study: InversionStudy, made: _Made) -> _InvertField:

@@ -184,7 +184,8 @@ def summary(found: xr.Dataset) -> dict[str, Any]:
     """Return the part of summary.json that follows from the results; a single data set's is also at the top level."""
     sets = {str(name): _one(found.sel(data_set=name)) for name in found.data_set.values}
     only = next(iter(sets.values())) if len(sets) == 1 else {}
-    return {**only, "solves": int(np.nansum(found["solves"])), "data_sets": sets}
+    shared = int(np.nanmax(found["expansion_solves"])) if "expansion_solves" in found else 0
+    return {**only, "solves": int(np.nansum(found["solves"])) + shared, "data_sets": sets}
 
 
 def _one(found: xr.Dataset) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -19,6 +19,7 @@ from forward.bodies.surface import Surface
 from forward.settings import Settings, one_line
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.observations import SCANS, Observations, Placed
+from inverse.data.readings import Units
 from inverse.data.registration import Registered, ToSurface, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
@@ -64,8 +65,9 @@ class DataFiles(Reading):
         Names of files, folders of files, or patterns such as ``data/*.csv``, beside the study or else in the working
         directory; a single one may be given as a string. Each file is a data set and is inverted separately. A file in
         TOML says which files of a scan belong together, and any of what follows for it alone.
-    sigma, unit, units, field, on_surface, tolerance, beyond, registration, between
-        What the files do not say themselves (`inverse.data.scans`): standard deviation (m) of the errors, unit, array
+    sigma, sigma_of, unit, units, field, on_surface, tolerance, beyond, registration, between
+        What the files do not say themselves (`inverse.data.scans`): standard deviations of the errors (m, and by the
+        names of other outputs such as forces), unit, array
         of displacements, whether the points lie on the surface, how far (m) points may lie from the body, what is
         done about others, the rigid motion from the frame of the files to that of the body, and what is
         unknown of motions between scans.
@@ -195,7 +197,9 @@ class Measurement:
         return tuple(found)
 
 
-def read_on(path: Path, cases: Sequence[str], body: Body, usual: Reading) -> tuple[Placed, Registered | None, Scan]:
+def read_on(
+    path: Path, cases: Mapping[str, Units], body: Body, usual: Reading
+) -> tuple[Placed, Registered | None, Scan]:
     """Read a scan, and put it on a body.
 
     Parameters
@@ -203,7 +207,7 @@ def read_on(path: Path, cases: Sequence[str], body: Body, usual: Reading) -> tup
     path
         Its file, or its description.
     cases
-        Names of the load cases.
+        Names of the load cases, and what is measured in them beside displacements.
     body
         The body.
     usual
@@ -218,6 +222,7 @@ def read_on(path: Path, cases: Sequence[str], body: Body, usual: Reading) -> tup
     found = read(path.parent, scan, cases)
     if scan.sigma is not None:
         found = found.with_sigma(scan.sigma)
+    found = replace(found, readings=found.readings.stated(scan.sigma_of))
     extent = max(high - low for low, high in body.bounds)
     surface = Surface.of(body) if scan.surface or isinstance(scan.registration, ToSurface) else None
     registered = None
@@ -238,8 +243,13 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     DataError
         With every kind of mistake in the file.
     """
-    placed, registered, scan = read_on(path, tuple(case.name for case in model.cases), model.body, data)
+    placed, registered, scan = read_on(path, model.measurable, model.body, data)
     found = placed.observations.with_sigma(None)
+    found = replace(found, readings=found.readings.with_sigma({}))
+    uncertain = (registered is not None and registered.uncertain) or any(scan.moved_between)
+    if len(found.readings) and uncertain:
+        message = "forces beside points of uncertain registration, expected a known registration, or data files apart"
+        raise DataError(f"{path.name}: {message}")
     truth, places, stiffness = scan.truth | data.truth, np.zeros((0, 3)), np.zeros(0)
     for name, text in found.truth.items():
         if name not in {"stiffness", "inclusions"}:

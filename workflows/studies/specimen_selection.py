@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import AXES, Vector
@@ -38,6 +39,8 @@ class DisplacementFile(Reading):
     sigma
         Standard deviation (m) of the errors, if the file does not state it; not needed if the method's noise is given
         otherwise.
+    sigma_of
+        The same of other outputs, such as forces, by their names.
     unit, units, field, on_surface, tolerance, beyond, registration, between
         As of an inversion.
     """
@@ -52,9 +55,10 @@ class DisplacementFile(Reading):
         StudyError
             If the file cannot be used.
         """
-        cases = tuple(case.name for case in specimen.cases)
+        measurable = specimen.measurable
+        cases = tuple(measurable)
         try:
-            placed, registered, scan = read_on(folder / self.file, cases, specimen.body, self)
+            placed, registered, scan = read_on(folder / self.file, measurable, specimen.body, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
         if (registered is not None and registered.uncertain) or scan.between is not None:
@@ -66,8 +70,10 @@ class DisplacementFile(Reading):
         truth = [f"truth: {name} = {value}" for name, value in found.truth.items()]
         return {
             "source": [*found.source, *truth],
-            "places": data.places.tolist(),
-            "components": [AXES[axis] for axis in data.axes],
+            "places": np.nan_to_num(data.places).tolist(),
+            "components": [
+                (*AXES, *measurable[cases[case]])[axis] for axis, case in zip(data.axes, data.cases, strict=True)
+            ],
             **({} if registered is None else {"axes": found.axes.tolist()}),
             "cases": [cases[case] for case in data.cases],
             "measured": data.values.tolist(),
@@ -82,13 +88,13 @@ class MeasuredDisplacements(Settings):
     Parameters
     ----------
     places
-        Where in the undeformed body (m).
+        Where in the undeformed body (m); zeros of other outputs, which are measured at no place.
     components, cases
-        Component and load case of each.
+        Component, or name of the output, and load case of each.
     measured
-        Displacements (m).
+        Displacements (m), and values of the outputs in their units.
     sigma
-        Standard deviations (m) of their errors, if known.
+        Standard deviations of their errors in the same units, if known.
     axes
         Directions in the body of x, y and z, along which components were measured; by default its own.
     source
@@ -98,7 +104,7 @@ class MeasuredDisplacements(Settings):
     """
 
     places: tuple[Vector, ...] = Field(min_length=1)
-    components: tuple[Literal["x", "y", "z"], ...]
+    components: tuple[str, ...]
     cases: tuple[str, ...]
     measured: tuple[float, ...]
     sigma: tuple[Positive, ...] | None = None
@@ -159,7 +165,9 @@ class SpecimenSelection(ModelSelection):
     def data_groups(self) -> dict[str, Data]:
         """Data by group; load cases are tests, whose data are distinguished by their number."""
         data, cases = self.data, list(dict.fromkeys(self.data.cases))
-        kinds = 3 * np.array([cases.index(case) for case in data.cases]) + self._axes
+        pairs = list(zip(data.cases, data.components, strict=True))
+        numbers = {pair: i for i, pair in enumerate(dict.fromkeys(pairs))}
+        kinds = np.array([numbers[pair] for pair in pairs])
         counted: dict[str, int] = dict.fromkeys(cases, 0)
         at = []
         for case in data.cases:
@@ -168,9 +176,12 @@ class SpecimenSelection(ModelSelection):
         sigma = None if data.sigma is None else np.array(data.sigma)
         return {WHOLE: Data(np.array(data.measured), sigma, data.cases, np.array(at), np.array(data.places), kinds)}
 
-    @property
-    def _axes(self) -> Any:
-        return np.array([AXES.index(axis) for axis in self.data.components])
+    def _axes(self, specimen: Specimen) -> NDArray[np.int64]:
+        """Components, and numbers of other outputs, as a specimen observes them; -1 of those that it does not have."""
+        known = {name: (*AXES, *outputs) for name, outputs in specimen.measurable.items()}
+        found = [known.get(case, AXES) for case in self.data.cases]
+        pairs = zip(found, self.data.components, strict=True)
+        return np.array([of.index(one) if one in of else -1 for of, one in pairs], dtype=np.int64)
 
     def tests(self, group: str) -> tuple[str, ...]:
         """Names of the tests in a group."""
@@ -201,7 +212,9 @@ class SpecimenSelection(ModelSelection):
         numbers = {case.name: i for i, case in enumerate(specimen.cases)}
         model: SpecimenModel = specimen.build(comm, tuple(self.candidates[name].parameters))
         cases = [numbers[case] for case in self.data.cases]
-        return model.observing(np.array(self.data.places), self._axes, cases, np.array(self.data.axes)[self._axes])
+        axes = self._axes(specimen)
+        along = np.vstack([self.data.axes, np.zeros(3)])[np.minimum(axes, len(AXES))]
+        return model.observing(np.array(self.data.places), axes.tolist(), cases, along)
 
     def _mistakes(self) -> Iterator[Mistake]:
         if self.method.check is not None:
@@ -215,3 +228,10 @@ class SpecimenSelection(ModelSelection):
         strange = next((case for case in self.data.cases if case not in known), None)
         if strange is not None:
             yield ("cases",), f"no load case '{strange}', of which there are data", known
+            return
+        units = cast("Specimen", spec).measurable
+        for case, name in dict.fromkeys(zip(self.data.cases, self.data.components, strict=True)):
+            if name not in (*AXES, *units[case]):
+                message = f"load case '{case}' has no output '{name}', of which there are data"
+                yield ("cases",), message, list(units[case])
+                return

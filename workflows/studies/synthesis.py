@@ -16,10 +16,12 @@ import tomli_w
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from forward.bodies.geometry import AXES
 from forward.bodies.inclusions import log_factor
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.specimen import Specimen
+from inverse.data.observations import kinds
 from inverse.methods.synthesize import Synthesize
 from uq.evaluation.evaluate import Recorder
 from uq.inputs.distributions import Distribution, Normal
@@ -160,8 +162,12 @@ class Synthesis(SynthesisStudy):
         return job(self, ensemble, name)
 
     def _mistakes(self) -> Iterator[Mistake]:
-        if not self.model.observed:
-            yield ("model", "observed"), "nothing is observed, expected boundaries or points", ()
+        if not self.model.observed and not any(case.outputs for case in self.model.cases):
+            message = "nothing is observed, expected boundaries or points, or outputs of load cases"
+            yield ("model", "observed"), message, ()
+        if self.method.format != "csv" and any(case.outputs for case in self.model.cases):
+            message = "outputs of load cases are written to tables, expected 'csv'"
+            yield ("method", "format"), message, self.method.format
         yield from super()._mistakes()
 
 
@@ -182,8 +188,13 @@ def _with_values(inclusion: Any, values: Mapping[str, float]) -> dict[str, Any]:
 
 
 def points_of(model: SpecimenModel) -> NDArray[np.int64]:
-    """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases."""
-    return np.asarray(np.unique(np.round(model.places, 12), axis=0, return_inverse=True)[1].ravel())
+    """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases.
+
+    It is -1 of outputs that are measured at no point.
+    """
+    found, at = np.full(len(model.axes), -1), model.axes < len(AXES)
+    found[at] = np.unique(np.round(model.places[at], 12), axis=0, return_inverse=True)[1].ravel()
+    return found
 
 
 def with_factor(study: Synthesis, found: xr.Dataset, places: FloatArray, fields: Any) -> xr.Dataset:
@@ -243,16 +254,23 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
             continue
         said = "" if method.units == "m" else f" [{method.units}]"
         heads = [f"{head}{said}" for head in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
-        file.write(",".join([*heads, "case"]) + "\n")
+        apart = points < 0  # outputs of load cases, in units of their own
+        more = ["output", "value", "sigma_value"] if apart.any() else []
+        file.write(",".join([*heads, "case", *more] if not apart.all() else ["case", *more]) + "\n")
         for case, case_name in enumerate(c.name for c in study.model.cases):
-            for point in np.unique(points[cases == case]):
+            for point in np.unique(points[(cases == case) & (points >= 0)]):
                 rows = np.flatnonzero((cases == case) & (points == point) & np.isfinite(values))
                 if len(rows) == 0:
                     continue
                 motion = {int(axes[row]): f"{values[row]:.6e}" for row in rows}
                 where = ",".join(f"{x:.8g}" for x in np.round(frame[rows[0]] / unit, 12) + 0.0)
                 cells = ",".join(motion.get(axis, "") for axis in range(3))
-                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}\n")
+                file.write(f"{where},{cells},{sigma[rows[0]]:.4e},{case_name}{',' * len(more)}\n")
+            names = tuple(output.name for output in study.model.cases[case].outputs)
+            for row in np.flatnonzero((cases == case) & apart):
+                output, empty = names[axes[row] - len(AXES)], "" if apart.all() else "," * len(heads)
+                value, error = (float(one[key].values[row]) for key in ("values", "sigma"))
+                file.write(f"{empty}{case_name},{output},{value:.8g},{error:.4e}\n")
         texts[f"{label}.csv"] = file.getvalue()
     return texts
 
@@ -309,7 +327,8 @@ def job(study: Synthesis, ensemble: Ensemble, name: str) -> MethodJob:
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        return study.method.run(study.inputs, recorders["/"], model.cases, points)
+        groups = np.where(points < 0, len(model.models) + kinds(model.cases, model.axes), model.cases)
+        return study.method.run(study.inputs, recorders["/"], groups, points)
 
     def texts(found: xr.Dataset) -> dict[str, str]:
         made = synthetic_files(study, name, found, (points, model.cases, model.axes, model.places))

@@ -58,6 +58,11 @@ def test_long_tables_of_the_same_data_are_read_too(tmp_path):
     assert found.truth == {"material.mu": 1000.0}
 
 
+def test_measurements_may_be_repeated_and_steps_numbered(tmp_path):
+    assert read(tmp_path, "z,force\n-1e-3,1\n-1e-3,1.1\n-2e-3,2\n").names == ("force.1", "force.1", "force.2")
+    assert read(tmp_path, "step,force\n2,1\n1,2\n").names == ("force.2", "force.1")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -65,6 +70,14 @@ def test_long_tables_of_the_same_data_are_read_too(tmp_path):
         ("z,force [kPa]\n-1e-3,1\n", "column 'force' has the unit 'kPa', expected N, mN or µN"),
         ("z [N],force [N]\n-1e-3,1\n", "column 'z' has the unit 'N', expected m, mm or µm"),
         ("z [mm],force\n-1,1\n", "'z' states a unit and 'force' does not"),
+        ("z [mm],force [mN],sigma_force\n-1,1,0.1\n", "'z' states a unit and 'sigma_force' does not"),
+        ("z,force_needle\n-1e-3,1\n", "unknown column 'force_needle'; did you mean"),
+        ("z,force,sigma\n-1e-3,1,-0.1\n", "line 2: sigma is '-0.1', expected a number more than 0"),
+        ("z,force,sigma\n-1e-3,1,0\n", "line 2: sigma is '0', expected a number more than 0"),
+        ("z,force\n-1e-3,1\n-2e-3,2\n-1e-3,0.9\n", "line 4: z = -1e-3 after that of line 3, which is farther"),
+        ("z,force\n-1e-3,1\n-2e-3,2\n-2e-3,2\n", "line 4: 'force' of line 3 again, expected each measurement once"),
+        ("z,force\n-1,1\n", "(in millimetres? then its head is 'z [mm]', and all heads state units)"),
+        ("z,force,force\n-1e-3,1,1\n", "several columns 'force'"),
         ("force\n1\n", "no column says where on the path a row is"),
         ("z,sigma\n-1e-3,1\n", "sigma of several units"),
         ("z\n-1e-3\n", "no column is a measured output, expected one of: force, bulge"),

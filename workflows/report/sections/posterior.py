@@ -119,7 +119,11 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
         words = "they have mixed" if int(one["chains"]) else "they have not mixed"
         said = f"R̂ up to {float(one['chain_rhat']):.3f}, effective draws from {float(one['chain_effective']):.0f}"
         yield "chains", f"{said}: {words}"
-    yield "solves", f"{int(one['solves']):,}"
+    if "expansion_error" in one and np.isfinite(one["expansion_error"]):
+        off = number(float(one["expansion_error"]), 2)
+        yield "expansion", f"of {int(one['expansion_solves'])} solves, which all data sets share; off by up to {off} σ"
+    else:
+        yield "solves", f"{int(one['solves']):,}"
 
 
 def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
