@@ -69,6 +69,7 @@ ALL = {
     "indentation": indentation.main,
 }
 WITH_OPTIONS = {
+    "calibration": calibration.main,
     "indentation": indentation.main,
     "chaos": chaos.main,
     "tails": tails.main,

@@ -8,6 +8,8 @@ data and inverts them: what is tested is the inference, not the mesh.
 from __future__ import annotations
 
 import time
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
+from benchmarks import calibration_forces
 from benchmarks.beams import CONFIG
 from forward.fem.specimen import SpecimenModel
 from forward.specimen import Specimen
@@ -84,7 +87,19 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
     return Posterior(inputs, SerialEvaluate(model), np.array(solution.outputs), sigma, start=start)
 
 
-def main(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:
+def main(given: Sequence[str] = ()) -> None:
+    """Print how uniform the ranks are; with --forces, how many intervals hold the truth, from curves of force."""
+    parser = ArgumentParser(prog="calibration")
+    parser.add_argument("--forces", action="store_true", help="curves of force over depth, with data of another mesh")
+    parser.add_argument("--specimens", type=int, default=SPECIMENS)
+    options = parser.parse_args(given)
+    if options.forces:
+        calibration_forces.main(options.specimens)
+    else:
+        inclusions(options.specimens)
+
+
+def inclusions(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:
     """Print how uniform the ranks are, write and draw them."""
     begin = time.process_time()
     found = calibrate(problem(), specimens, samples=samples, starts=1)

@@ -381,7 +381,8 @@ class Hyperelastic(ModelSpec):
     def cost(self, factors: int = 2) -> Times:
         """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
         predicted = self.solver.kind != "newton"
-        return times(self.body, mixed=self.mixed, symmetric=self.symmetric, predicted=predicted, factors=factors)
+        contact, mixed, symmetric = any(load.contact for load in self.loads), self.mixed, self.symmetric
+        return times(self.body, mixed=mixed, symmetric=symmetric, predicted=predicted, factors=factors, contact=contact)
 
     def mesh_error_cost(self) -> Estimate:
         """Predict what an estimate of the error of the mesh takes, and what calibrates it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pydantic import Field, GetJsonSchemaHandler, model_validator
@@ -149,8 +149,8 @@ class Path(Hyperelastic):
         return tuple(dict.fromkeys((*super().findings, *too_far(self.body, ends))))
 
     def cost(self, factors: int = 1) -> Times:
-        """Predict the cost of a solve of all steps, each with a factor of its own."""
-        return sum_of([super().cost(factors)] * self.count)
+        """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
+        return sum_of([replace(super().cost(factors), contact=False)] * self.count)
 
     def mesh_error_cost(self) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all steps."""

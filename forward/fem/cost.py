@@ -73,6 +73,8 @@ CALL = 2e-4  # of any of these on a vanishingly small body
 SLENDER = 3.0  # longest extent over the shortest
 NEWTON = {True: 5.5, False: 4.0}  # factorisations from zero
 CORRECTIONS = {True: 10, False: 7}  # with a reference factor
+# The same where tools touch the body: the depth is reached in steps, and the area in contact changes meanwhile.
+NEWTON_IN_CONTACT, CORRECTIONS_IN_CONTACT = 18, 35
 ACTIONS = 7  # products with the stiffness for the screen of a sample, each like a residual
 DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
@@ -141,6 +143,8 @@ class Times:
         Whether the body is.
     predicted
         Whether samples are solved from predictions rather than by the textbook solver.
+    contact
+        Whether tools are pressed against it from afar, rather than a step at a time.
     bytes
         Memory of mesh, matrices and factors.
     """
@@ -153,6 +157,7 @@ class Times:
     slender: bool
     predicted: bool = True
     bytes: float = 0.0
+    contact: bool = False
 
     @property
     def sample(self) -> float:
@@ -162,7 +167,8 @@ class Times:
     @property
     def textbook(self) -> float:
         """A solve by Newton's method from zero."""
-        return NEWTON[self.slender] * (self.assembly + self.factorisation + self.substitution + 2 * self.residual)
+        count = NEWTON_IN_CONTACT if self.contact else NEWTON[self.slender]
+        return count * (self.assembly + self.factorisation + self.substitution + 2 * self.residual)
 
     @property
     def first(self) -> float:
@@ -172,6 +178,9 @@ class Times:
     @property
     def corrected(self) -> float:
         """A solve from a prediction with the factor of a reference, and the screen of its stability."""
+        if self.contact:  # every other sample takes a factor of its own
+            more = (self.assembly + self.factorisation) / 2 + CORRECTIONS_IN_CONTACT * self.residual
+            return more + CORRECTIONS_IN_CONTACT * (self.substitution + self.residual)
         corrections = CORRECTIONS[self.slender]
         return (corrections + 2) * self.substitution + (corrections + ACTIONS) * self.residual
 
@@ -192,8 +201,16 @@ class Times:
         return NEAR * parameters * (self.substitution + self.residual)
 
 
-def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool = True, factors: int = 1) -> Times:
-    """Predict the cost of solves of a body, with a given number of factors.
+def times(
+    body: Meshed,
+    *,
+    mixed: bool,
+    symmetric: bool = True,
+    predicted: bool = True,
+    factors: int = 1,
+    contact: bool = False,
+) -> Times:
+    """Predict the cost of solves of a body, with a given number of factors; `contact` as of `Times`.
 
     If the stiffness is not symmetric, each comes with a factor of the symmetric part, for the stability test.
     """
@@ -210,6 +227,7 @@ def times(body: Meshed, *, mixed: bool, symmetric: bool = True, predicted: bool 
         max(extents) > SLENDER * min(extents),
         predicted,
         BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * size,
+        contact,
     )
 
 

@@ -163,6 +163,7 @@ SECTIONS = Kinds(
         "batch": f"{_HERE}.batch:Batch",
         "posterior": f"{_HERE}.posterior:Posterior",
         "posterior-field": f"{_HERE}.posterior_field:FieldPosterior",
+        "places": f"{_HERE}.places:Places",
         "priors": f"{_HERE}.priors:Priors",
         "failures": f"{_HERE}.failures:Failures",
         "run-time": f"{_HERE}.run_time:RunTime",

@@ -24,7 +24,7 @@ def plan(study: Inversion) -> list[str]:
 
     spec, sets = study.specimen, study.data.sets
     usable = [m for m in study.measurements if m is not None]
-    counts = [int(m.observations.measured.sum()) for m in usable]
+    counts = [int(m.observations.measured.sum()) + len(m.observations.readings) for m in usable]
     moved = [int((m.moved > 0).sum()) for m in usable]
     cases = [times_of(spec.loaded(case)) for case in spec.cases]
     each, textbook = sum(one.corrected for one in cases), sum(one.textbook for one in cases)

@@ -68,3 +68,28 @@ def test_newton_from_zero_takes_longer_than_corrections():
     seconds = [{part.what.partition(",")[0]: part.seconds for part in parts(one)} for one in (study, textbook)]
     assert seconds[1]["256 further solves"] > 5 * seconds[0]["256 further solves"]
     assert "reference factor" not in seconds[1]
+
+
+CONTACT = """
+[model]
+kind = "KIND"
+body = { kind = "box", size = [0.01, 0.01, 0.01], cells = [4, 4, 4], degree = 2 }
+material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 1e3 }
+clamp = ["z-min"]
+outputs = [{ name = "force", kind = "force" }]
+loads = [{ kind = "indenter", shape = "sphere", radius = 0.005, on = "z-max", at = [0.005, 0.005, 0.01], direction = [0, 0, -1], depth = DEPTH }]
+
+[method]
+kind = "synthesize"
+noise = { relative = 0.03 }
+"""  # noqa: E501
+
+
+def test_tools_that_are_pressed_from_afar_cost_more_than_a_step_further(tmp_path):
+    (tmp_path / "once.toml").write_text(CONTACT.replace("KIND", "hyperelastic").replace("DEPTH", "1e-3"))
+    (tmp_path / "steps.toml").write_text(CONTACT.replace("KIND", "path").replace("DEPTH", "[0.5e-3, 1e-3]"))
+    once, steps = (load(tmp_path / f"{name}.toml").spec.cost() for name in ("once", "steps"))
+    assert once.contact
+    assert once.textbook > 2 * steps.textbook / 2
+    assert once.corrected > 2 * steps.corrected / 2
+    assert once.factorisation == pytest.approx(steps.factorisation / 2)
