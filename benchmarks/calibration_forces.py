@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -21,7 +21,7 @@ from forward.model import FloatArray
 from inverse.data.outputs import OutputData
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_by_group
-from inverse.methods.shared import Shared, shared
+from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load
@@ -51,15 +51,15 @@ def study(changes: list[str]) -> OutputInversion:
     return found
 
 
-def expanded() -> tuple[OutputInversion, Shared, Shared]:
+def expanded() -> tuple[OutputInversion, SharedExpansion, SharedExpansion]:
     """Return the study, the expansions that all specimens share, and that of the other mesh."""
     own, other = study(OWN), study(OTHER)
     names = own.inputs.names
-    model = own.spec.build(MPI.COMM_SELF, names)
+    model: Any = own.spec.build(MPI.COMM_SELF, names)
     finer = SerialEvaluate(extrapolated(model, own.inputs.mean).restricted())
-    mine = shared(own.inputs, SerialEvaluate(model), finer, SOLVES)
+    mine = shared_expansion(own.inputs, SerialEvaluate(model), finer, SOLVES)
     truth = other.spec.build(MPI.COMM_SELF, names)
-    return own, mine, shared(own.inputs, SerialEvaluate(truth), None, SOLVES)
+    return own, mine, shared_expansion(own.inputs, SerialEvaluate(truth), None, SOLVES)
 
 
 def main(specimens: int = 200) -> None:
@@ -102,7 +102,7 @@ def main(specimens: int = 200) -> None:
 
 
 def _inverted(
-    inputs: Inputs, mine: Shared, clean: FloatArray, noise: float, rng: np.random.Generator
+    inputs: Inputs, mine: SharedExpansion, clean: FloatArray, noise: float, rng: np.random.Generator
 ) -> tuple[xr.Dataset, float]:
     """Measure a curve with errors, and invert it; also their standard deviation (N)."""
     outputs, size = mine.model.outputs, noise * float(np.sqrt((clean**2).mean()))
@@ -112,7 +112,7 @@ def _inverted(
     return invert_by_group(inputs, mine.model, data, method, None, finer=mine.finer), size
 
 
-def _mesh(mine: Shared, truth: FloatArray, clean: FloatArray, size: float) -> float:
+def _mesh(mine: SharedExpansion, truth: FloatArray, clean: FloatArray, size: float) -> float:
     """Root mean square difference of the own mesh and the other one, over the noise."""
     return float(np.sqrt(((np.asarray(mine.model.solve(truth).outputs) - clean) ** 2).mean()) / size)
 

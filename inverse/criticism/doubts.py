@@ -329,16 +329,17 @@ def expansion_off(error: Any, solves: Any) -> list[Doubt]:
     Parameters
     ----------
     error
-        Root mean square error of the datum that it misses most, over the standard deviation of its error.
+        Root mean square error of the datum that it misses most, over the standard deviation of its error; None
+        without an expansion.
     solves
         Number of solves that it was fitted to.
     """
-    if not float(error) > EXPANDED:
+    if error is None or not float(error) > EXPANDED:
         return []
-    error = float(error)
+    off = float(error)
     text = (
-        f"the expansion that the data sets share, of {int(solves)} solves, misses a datum by {error:.2g} of its error, to "
-        "which that is added: intervals are wider than need be; raise method.expansion, or let every data set have "
-        "solves of its own"
+        f"the expansion that the data sets share, of {int(solves)} solves, misses a datum by {off:.2g} of its error, "
+        "to which that is added: intervals are wider than need be; raise method.expansion, or let every data set "
+        "have solves of its own"
     )
-    return [Doubt("error" if error > 1 else "warning", text, "the expansion that the data sets share is not accurate")]
+    return [Doubt("error" if off > 1 else "warning", text, "the expansion that the data sets share is not accurate")]
