@@ -246,7 +246,7 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     placed, registered, scan = read_on(path, model.measurable, model.body, data)
     found = placed.observations.with_sigma(None)
     found = replace(found, readings=found.readings.with_sigma({}))
-    uncertain = (registered is not None and registered.uncertain) or any(scan.moved_between)
+    uncertain = (registered is not None and registered.uncertain) or scan.between is not None
     if len(found.readings) and uncertain:
         message = "forces beside points of uncertain registration, expected a known registration, or data files apart"
         raise DataError(f"{path.name}: {message}")
