@@ -193,6 +193,10 @@ class Observations:
         which, _ = np.nonzero(self.measured)
         return np.argsort(np.concatenate([self.case[which], self.readings.case]), kind="stable")
 
+    def by_datum(self, values: FloatArray) -> FloatArray:
+        """Return values (n,) of the points for each of the `components`."""
+        return np.asarray(values[self._order[0]])
+
     def components(self) -> Components:
         """Return what was measured, load case after load case: displacements by component, then other outputs."""
         (which, axes), more, order = np.nonzero(self.measured), self.readings, self._order

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from forward.machine import write_whole
 from workflows.results.norms import squares
+from workflows.results.points import points_grid
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -141,13 +142,17 @@ def mesh_grid(dataset: xr.Dataset) -> Any:
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
 
-    Displacements are in one file; what each data set says about the interior is in one file each; a mesh that was
+    Displacements are in one file; what each data set says about the interior is in one file each, its
+    points with what was measured and predicted there in another; a mesh that was
     refined is in one with what its cells add to errors.
     """
     grids: dict[str, Callable[[], Any]] = {}
     if "cell_nodes" in dataset and "data_set" in dataset.dims:
         names = dataset.data_set.values
         grids = {str(name): partial(body_grid, dataset.sel(data_set=name)) for name in names}
+        if "datum_axis" in dataset:
+            solved = [str(name) for name in names if bool(dataset["ok"].sel(data_set=name))]
+            grids |= {f"points-{name}": partial(points_grid, dataset.sel(data_set=name)) for name in solved}
     elif "cell_nodes" in dataset:
         grids = {"displacement": partial(body_grid, dataset)}
     path = None

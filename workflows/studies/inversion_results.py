@@ -95,12 +95,23 @@ def _of_specimen(
         "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found]),
         "rms_move": ("data_set", [0.0 if m is None else float(np.sqrt((m.moved**2).mean())) for m in found]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
+        "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
         "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
         **_volumes(study, record, found),
         "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
+
+
+def _moves(found: Sequence[Measurement | None], count: int) -> FloatArray:
+    """Return how far (n, count) the point of each datum was moved (m)."""
+    whole = np.full((len(found), count), np.nan)
+    for row, one in zip(whole, found, strict=True):
+        if one is not None:
+            moves = one.observations.by_datum(one.moved)
+            row[: len(moves)] = moves
+    return whole
 
 
 def _volumes(study: Inversion, record: Mapping[str, FloatArray], found: list[Any]) -> dict[str, Any]:

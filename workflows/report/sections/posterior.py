@@ -11,6 +11,7 @@ from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Folded, Heading, Pairs, Picture, Pictures, Table, Text
 from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
+from workflows.report.plots import residuals
 from workflows.report.section import Results, Section
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 10  # that a table lists
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
+SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
 DRAWN = 8  # data sets that have more than a row in the table
 
 
@@ -262,6 +264,12 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
         drawn = ", ".join(plots.panels(one))
         yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {drawn}."
     yield of_spectrum(one)
+    words = (
+        "Measured minus predicted displacements at the mode: as arrows, and over their errors, on the box of the body"
+    )
+    yield residuals.residuals(one), f"{words}; fields/points-{one.data_set.item()}.vtu for ParaView."
+    if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
+        yield residuals.distances(one), "How far points were from the body before they were moved onto it."
 
 
 def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:

@@ -1,0 +1,84 @@
+"""Measured points of a specimen, from the data of an inversion component by component."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPoints:
+    """The points of a load case.
+
+    Attributes
+    ----------
+    case
+        Its name.
+    places
+        Where (n, 3) they are on the body (m).
+    measured, predicted
+        Displacements (n, 3) in the axes of the body (m); components that were not measured are zero in both.
+    over
+        Root mean square (n,) of the residuals of a point over their standard deviations.
+    moved
+        How far (n,) it was moved onto the body (m).
+    """
+
+    case: str
+    places: FloatArray
+    measured: FloatArray
+    predicted: FloatArray
+    over: FloatArray
+    moved: FloatArray
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted displacements (n, 3) (m)."""
+        return self.measured - self.predicted
+
+
+def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
+    """Return the points of each load case of one data set that was inverted, ``dataset.sel(data_set=name)``."""
+    seen = np.isfinite(one["measured"].to_numpy())
+    axes = one["datum_axis"].to_numpy()[seen].astype(int)
+    along = one["datum_direction"].to_numpy()[seen] if "datum_direction" in one else np.eye(3)[axes]
+    numbers = {name: one[name].to_numpy()[seen] for name in ("measured", "predicted", "residual", "datum_case")}
+    moved = one["datum_move"].to_numpy()[seen] if "datum_move" in one else np.zeros(seen.sum())
+    places = one["place"].to_numpy()[seen]
+    found = []
+    for number, case in enumerate(one.case.values):
+        rows = np.flatnonzero(numbers["datum_case"] == number)
+        points, first, which = np.unique(places[rows], axis=0, return_index=True, return_inverse=True)
+        which = which.ravel()
+        sums: dict[str, FloatArray] = {name: np.zeros((len(points), 3)) for name in ("measured", "predicted")}
+        squares, counts = np.zeros(len(points)), np.zeros(len(points))
+        for name, values in sums.items():
+            np.add.at(values, which, numbers[name][rows, None] * along[rows])
+        np.add.at(squares, which, numbers["residual"][rows] ** 2)
+        np.add.at(counts, which, 1.0)
+        over = np.sqrt(squares / np.maximum(counts, 1))
+        found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[rows][first]))
+    return found
+
+
+def points_grid(one: xr.Dataset) -> Any:
+    """Return the points of all load cases as a pyvista grid: a vertex for each point and load case."""
+    import pyvista
+
+    parts = [part for part in measured_points(one) if len(part.places)]
+    places = np.concatenate([part.places for part in parts])
+    vertices = np.column_stack([np.ones(len(places), dtype=np.int64), np.arange(len(places))]).ravel()
+    grid: Any = pyvista.UnstructuredGrid(vertices, np.ones(len(places), dtype=np.uint8), places)
+    for name in ("measured", "predicted", "residuals", "over", "moved"):
+        grid.point_data["residual_over_error" if name == "over" else name] = np.concatenate(
+            [getattr(part, name) for part in parts]
+        )
+    grid.point_data["load_case"] = np.repeat(np.arange(len(parts)), [len(part.places) for part in parts])
+    return grid
