@@ -135,6 +135,7 @@ SECTIONS = Kinds(
         "nominal": f"{_HERE}.nominal:Nominal",
         "path": f"{_HERE}.path:Curve",
         "error-against-cost": f"{_HERE}.error_against_cost:ErrorAgainstCost",
+        "candidates": f"{_HERE}.candidates:AveragedCandidates",
         "moments": f"{_HERE}.moments:Moments",
         "control-variate": f"{_HERE}.control_variate:ControlVariate",
         "total-errors": f"{_HERE}.total_errors:TotalErrors",

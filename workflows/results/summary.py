@@ -110,6 +110,12 @@ def _sobol(dataset: xr.Dataset) -> Part:
     return found
 
 
+def _averaged(dataset: xr.Dataset) -> Part:
+    names = ("mean", "mean_error", "std", "std_error", "within", "between")
+    outputs = dataset.output.values
+    return {"outputs": {str(one): {name: _number(dataset[name].sel(output=one)) for name in names} for one in outputs}}
+
+
 def _shapley(dataset: xr.Dataset) -> Part:
     return {"shapley": _by(dataset, "parameter", _with_errors(dataset, "shapley", "value"))}
 
@@ -241,6 +247,7 @@ _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what ea
     ({"sobol_first"}, _sobol),
     ({"sobol_second"}, _second),
     ({"shapley"}, _shapley),
+    ({"candidate_mean"}, _averaged),
     ({"total_bound"}, _bounds),
     ({"derivative"}, _local),
     ({"derivative", "nominal_corrected"}, _nominal),

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Arrays = Mapping[str, Any]
 LETTERS = 16  # of a hash
-BEST, AVERAGED = "best", "averaged"
+BEST = "best"
 
 
 def read(file: str, group: str | None, model: str | None) -> Draws:
@@ -129,12 +129,6 @@ def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> i
 def _selected(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
     """Weighted points of one candidate in one group of data."""
     models, parameters = _texts(found, "model"), _texts(found, "parameter")
-    if model == AVERAGED:
-        message = (
-            f"model = 'averaged': candidates of {path} have numbers of their own, expected "
-            f"'best' or one of: {', '.join(models)}; `[average]` predicts with all of them"
-        )
-        raise ValueError(message)
     k = int(np.nanargmax(found["probability"])) if model == BEST else _chosen("model", model, models, path)
     g = _chosen("group", group, _texts(found, "group"), path)
     weights = np.nan_to_num(found["point_weight"][k, g])
@@ -185,6 +179,45 @@ def _of_population(path: Path, found: Arrays, group: str | None, model: str | No
     weights = np.full(len(values), 1 / len(values))
     worth = min(float(found["population_effective"]), len(values))
     return Draws(tuple(_texts(found, "parameter")), values, weights, worth, digest)
+
+
+class NamedCandidate(NamedTuple):
+    """A candidate of a comparison: its probability with the error of that, and the block of its material."""
+
+    name: str
+    probability: float
+    error: float
+    material: dict[str, Any]
+
+
+def candidates(file: str) -> list[NamedCandidate]:
+    """Return the candidates of a comparison, the most probable first.
+
+    Raises
+    ------
+    ValueError
+        If it is none of materials: one line.
+    """
+    path = _directory(file)
+    kind = _summary(path).get("method")
+    if kind != "select":
+        message = f"{path}: is a study of kind '{kind}', expected 'select' for model = 'averaged'"
+        raise ValueError(message)
+    found = variables((path / "results.nc").read_bytes())[0]
+    shares = zip(found["model"].values, found["probability"].values, found["probability_error"].values, strict=True)
+    every = [NamedCandidate(str(m), float(p), float(e), material(file, str(m))) for m, p, e in shares]
+    without = [one.name for one in every if "kind" not in one.material]
+    if without:
+        message = f"{path}: candidates {', '.join(without)} have no material, expected a comparison of materials"
+        raise ValueError(message)
+    return sorted(every, key=lambda one: -one.probability)
+
+
+def digest_of(file: str) -> str:
+    """Return the hash of a source; a ValueError says that it is not there."""
+    path = _directory(file)
+    _summary(path)
+    return sha256((path / "results.nc").read_bytes()).hexdigest()[:LETTERS]
 
 
 READERS = {"select": _selected, "invert": _inverted, "population": _of_population}
@@ -272,10 +305,10 @@ def mistakes(source: Source, model: ModelSpec, own: Sequence[str]) -> Iterator[M
                 f"has a distribution, and is in {source.file} too, expected only one of them",
                 path,
             )
-    material, mine = material_of(source), getattr(model, "material", None)
-    if material and mine is not None and material.get("kind") != mine.kind and not source.names:
+    block, mine = material_of(source), getattr(model, "material", None)
+    if block and mine is not None and block.get("kind") != mine.kind and not source.names:
         clean = False
-        message = f"constants are of the material '{material.get('kind')}' in {source.file}, expected it in the model"
+        message = f"constants are of the material '{block.get('kind')}' in {source.file}, expected it in the model"
         yield ("model", "material", "kind"), message, mine.kind
     if clean:
         try:
@@ -293,12 +326,10 @@ def findings(study: Study, source: Source) -> Iterator[Finding]:
     materials = study.spec.materials(study.given)
     if inputs.draws is not None:
         yield from findings_of_impossible(scalars, inputs.draws, () if materials is None else materials.names)
-    material, mine = material_of(source), getattr(study.model, "material", None)
-    if material and mine is not None:
+    block, mine = material_of(source), getattr(study.model, "material", None)
+    if block and mine is not None:
         fixed = {
-            name: float(v)
-            for name, v in material.items()
-            if isinstance(v, int | float) and name not in source.drawn.names
+            name: float(v) for name, v in block.items() if isinstance(v, int | float) and name not in source.drawn.names
         }
         here = mine.model_dump()
         other = [
@@ -309,24 +340,31 @@ def findings(study: Study, source: Source) -> Iterator[Finding]:
             yield Finding("warning", text)
 
 
+def _directory(file: str) -> Path:
+    path = Path(file)
+    return path.parent if path.name == "results.nc" else path
+
+
 def material_of(source: Source) -> dict[str, Any]:
     """Return the block of the material that was calibrated, as far as it is known."""
-    path = Path(source.file)
-    path = path.parent if path.name == "results.nc" else path
-    if not path.is_dir():
-        return {}
+    return material(source.file, source.model) if _directory(source.file).is_dir() else {}
+
+
+def material(file: str, model: str | None) -> dict[str, Any]:
+    """Return the block of the material of a candidate, or of an inversion; empty where there is none."""
+    path = _directory(file)
     found, attributes = variables((path / "results.nc").read_bytes())
     config = tomllib.loads(str(attributes["config"]))
     if "candidates" not in config:
         chosen = config.get("model", {})
     else:
-        name = source.model
+        name = model
         if name in (None, BEST):
             name = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
         candidate = config["candidates"].get(name, {})
         chosen = {**config.get("model", {}), **candidate.get("model", candidate)}
-    material = chosen.get("material", {})
-    return dict(material) if isinstance(material, dict) else {}
+    block = chosen.get("material", {})
+    return dict(block) if isinstance(block, dict) else {}
 
 
 def draws_of(source: Source, scalars: Mapping[str, Scalar]) -> Draws | None:

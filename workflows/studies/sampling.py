@@ -28,7 +28,7 @@ from workflows.config.priors import (
     ranges,
 )
 from workflows.config.report import Report
-from workflows.config.source import KEPT, READER, Source
+from workflows.config.source import AVERAGED, KEPT, READER, Source
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -79,6 +79,16 @@ class Study(StudyKind):
     accuracy: Accuracy = Accuracy()
     parallel: Parallel = Parallel()
     report: Report | None = None
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Study:
+        """Check the blocks of a study, or of one that is averaged over the candidates of a comparison."""
+        parameters = blocks.get("parameters")
+        source = parameters.get("from") if isinstance(parameters, Mapping) else None
+        if isinstance(source, Mapping) and source.get("model") == AVERAGED:
+            of_all: type[Study] = named("workflows.studies.averaged:AveragedStudy")
+            return of_all.model_validate(blocks)
+        return cls.model_validate(blocks)
 
     @property
     def inputs(self) -> Inputs:
@@ -260,7 +270,9 @@ class Study(StudyKind):
     @property
     def beside(self) -> Mapping[str, bytes]:
         """The draws, as they were read."""
-        return {} if self.source is None else {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
+        if self.source is None or self.source.model == AVERAGED:
+            return {}
+        return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
 
     @model_serializer(mode="wrap")
     def _source_among_parameters(self, handler: Any) -> dict[str, Any]:

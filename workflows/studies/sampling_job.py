@@ -49,10 +49,8 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
             within: Callable[..., xr.Dataset] = named("workflows.studies.within:within")
-            return _with_errors_of_draws(
-                study, within(study, method, inputs, evaluate, recorders, estimates, directory)
-            )
-        found = _with_errors_of_draws(study, method.run(inputs, recorders["/"]))
+            return with_errors_of_draws(study, within(study, method, inputs, evaluate, recorders, estimates, directory))
+        found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
         return (
             _with_mesh_errors(study, found, inputs, evaluate, recorders["/"], estimates) if study.estimates else found
         )
@@ -126,7 +124,7 @@ def _with_mesh_errors(
     return with_mesh_errors(found, inputs, centre, errors, told_of(study))
 
 
-def _with_errors_of_draws(study: Study, found: xr.Dataset) -> xr.Dataset:
+def with_errors_of_draws(study: Study, found: xr.Dataset) -> xr.Dataset:
     """Add to the errors what draws are responsible for, if some parameters are given by draws."""
     if study.source is None:
         return found

@@ -14,6 +14,7 @@ from forward.model import FunctionModel
 from tests.launch import TISSUQ, environment
 from tests.launch import run as on_ranks
 from uq.estimators.autocorrelation import effective
+from uq.estimators.averaged import average
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.hdf5 import netcdf
 from uq.inputs.draws import Draws
@@ -549,3 +550,88 @@ def test_populations_that_cannot_be(selected, tmp_path, source, more, said):
     line = mistake(population(tmp_path, source.replace("RESULTS", str(folder / "results")), more))
     assert line.startswith("method.source: ")
     assert said in line
+
+
+# --- averages over candidates -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.fem
+def test_predictions_are_averaged_over_candidates(selected, tmp_path):
+    folder, _ = selected
+    source = {"file": str(folder / "results"), "group": "one", "model": "averaged"}
+    blocks = BODY | {"parameters": {"from": source}, "method": {"kind": "monte-carlo", "samples": 8}}
+    study = parse(blocks)
+    assert parse(document(study)) == study
+    assert run(study, "average", tmp_path / "out", quiet=True) in (0, 3)
+    found = xr.load_dataset(tmp_path / "out" / "results.nc")
+    alone = []
+    for name in found["candidate"].values:
+        own = parse(
+            blocks
+            | {"parameters": {"from": source | {"model": name}}, "accuracy": {"mesh_error": False}}
+            | {"model": blocks["model"] | {"material": study.parts[name].model.material.model_dump()}}
+        )
+        alone.append(own.run())
+    with xr.open_dataset(folder / "results" / "results.nc") as compared:
+        p = compared["probability"].sel(model=found["candidate"].to_numpy()).to_numpy()
+    assert study.parts["neo-hookean"].model.material.D1 == 1e4  # of the model
+    means = np.array([float(one["mean"][0]) for one in alone])
+    stds = np.array([float(one["std"][0]) for one in alone])
+    np.testing.assert_allclose(found["candidate_mean"][:, 0], means, rtol=1e-12)
+    np.testing.assert_allclose(found["mean"], p @ means, rtol=1e-12)
+    np.testing.assert_allclose(found["within"], p @ stds**2, rtol=1e-12)
+    np.testing.assert_allclose(found["between"], p @ (means - p @ means) ** 2, rtol=1e-12)
+    np.testing.assert_allclose(found["std"] ** 2, found["within"] + found["between"], rtol=1e-12)
+    fields = np.array([one["field_mean"].to_numpy() for one in alone])
+    np.testing.assert_allclose(found["field_mean"], np.tensordot(p, fields, axes=1), atol=1e-18)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["candidates"] == pytest.approx(
+        dict(zip(found["candidate"].values.tolist(), p.tolist(), strict=True))
+    )
+    assert summary["outputs"]["up"]["between"] == pytest.approx(float(found["between"][0]))
+    assert any("Which candidate is right makes of the variance" in one["text"] for one in summary["findings"])
+    assert "Averaged over candidates" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_errors_of_averages_are_those_of_repeats():
+    """Two models with Gaussian estimates of their moments, and of their probabilities."""
+    rng = np.random.default_rng(0)
+    p, mean, std = np.array([0.7, 0.3]), np.array([[1.0], [2.0]]), np.array([[0.3], [0.5]])
+    errors = {"p": 0.02, "mean": np.array([[0.02], [0.05]]), "std": np.array([[0.01], [0.03]])}
+    stated = average(p, np.full(2, errors["p"] / np.sqrt(2)), mean, errors["mean"], std, errors["std"])
+    repeats = []
+    for _ in range(4000):
+        shift = errors["p"] * rng.standard_normal()
+        moved = np.array([p[0] + shift, p[1] - shift])
+        found = average(
+            moved, np.zeros(2), rng.normal(mean, errors["mean"]), mean * 0, rng.normal(std, errors["std"]), std * 0
+        )
+        repeats.append([found["mean"][0], found["std"][0]])
+    # Probabilities that move against each other move a mean by up to √2 as much as independent ones.
+    for got, name in zip(np.std(repeats, axis=0), ("mean_error", "std_error"), strict=True):
+        assert 0.75 * got < stated[name][0] < 1.3 * got
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"accuracy": {"tolerance": 0.1}}, "model = 'averaged' does not go with accuracy.tolerance"),
+        ({"method": {"kind": "local-sensitivity"}}, "model = 'averaged' does not go with method.kind"),
+        (
+            {"parameters": {"material.C1": {"kind": "normal", "mean": 1.0, "std": 0.1}}},
+            "material.C1: has a distribution",
+        ),
+    ],
+)
+def test_averages_that_cannot_be(selected, change, said):
+    folder, _ = selected
+    source = {"file": str(folder / "results"), "group": "one", "model": "averaged"}
+    parameters = {"from": source} | change.get("parameters", {})
+    with pytest.raises(StudyError, match=said):
+        parse(BODY | change | {"parameters": parameters})
+
+
+def test_only_comparisons_can_be_averaged(folder):
+    line = mistake(study(folder, 'from = { file = "draws.csv", model = "averaged" }'))
+    assert line.startswith("parameters.from: ")
+    assert "expected the directory of a finished study" in line

@@ -7,6 +7,7 @@ Functions with an argument `ax` draw there, or on a new figure that needs no dis
 
 from workflows.report.plots import inversion, selection
 from workflows.report.plots.against_cost import Cost, errors
+from workflows.report.plots.averaged import parts_of_variance
 from workflows.report.plots.budget import error_budget
 from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span
 from workflows.report.plots.indices import (
@@ -56,6 +57,7 @@ __all__ = [
     "mesh_mean",
     "mesh_samples",
     "mesh_variance",
+    "parts_of_variance",
     "png",
     "refinement",
     "running_estimates",

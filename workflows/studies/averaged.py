@@ -1,0 +1,203 @@
+"""A study that predicts with all candidates of a comparison, each with its own posterior, averaged by probability."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from pydantic import ValidationError
+
+from forward.materials.material import constants
+from forward.model import Finding
+from forward.scalars import Mistake
+from uq.estimators import branch
+from uq.estimators.averaged import averaged
+from uq.evaluation.evaluate import Evaluate, Recorder
+from uq.findings import add
+from workflows.config.mistakes import lines
+from workflows.results.directory import label
+from workflows.studies.job import Job, MethodJob
+from workflows.studies.posteriors import NamedCandidate, candidates, read
+from workflows.studies.sampling import Study
+from workflows.studies.sampling_job import with_errors_of_draws
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.fem.model import HyperelasticModel
+    from forward.spec import ModelSpec
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.evaluate import Evaluations
+    from uq.inputs.distributions import Distribution
+    from uq.inputs.draws import Draws
+    from uq.inputs.random_parameters import Inputs
+
+LEAST = 1e-3  # probability of candidates that are left out
+
+
+class AveragedStudy(Study):
+    """The study of a body whose material is one of several, by the probabilities that a comparison has given them.
+
+    The blocks are those of `Study`; `parameters.from` has ``model = "averaged"``, and constants that candidates do not
+    have (D1) are those of the material in the model.
+    """
+
+    @cached_property
+    def candidates(self) -> tuple[NamedCandidate, ...]:
+        """The candidates that are not improbable, with probabilities of sum 1."""
+        assert self.source is not None
+        every = candidates(self.source.file)
+        kept = [one for one in every if one.probability >= LEAST]
+        total = sum(one.probability for one in kept)
+        return tuple(one._replace(probability=one.probability / total, error=one.error / total) for one in kept)
+
+    @cached_property
+    def parts(self) -> dict[str, Study]:
+        """The study of each candidate alone."""
+        found = {}
+        for one in self.candidates:
+            blocks = self.model_dump(mode="json", exclude_none=True)
+            assert self.source is not None
+            drawn = read(self.source.file, self.source.group, one.name)
+            typical = dict(
+                zip((name.rpartition(".")[2] for name in drawn.names), drawn.weights @ drawn.values, strict=True)
+            )
+            blocks["model"]["material"] = _completed(one.material, blocks["model"].get("material", {}) | typical)
+            blocks["parameters"]["from"] |= {"model": one.name}
+            blocks["accuracy"] = {"mesh_error": False}
+            found[one.name] = Study.model_validate(blocks)
+        return found
+
+    @property
+    def _first(self) -> Study:
+        return next(iter(self.parts.values()))
+
+    @property
+    def inputs(self) -> Inputs:
+        """Those of the most probable candidate."""
+        return self._first.inputs
+
+    @cached_property
+    def draws(self) -> Draws | None:
+        """Those of the most probable candidate."""
+        return self._first.draws
+
+    @property
+    def given(self) -> dict[str, Distribution]:
+        """Those of the most probable candidate."""
+        return self._first.given
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """That of the most probable candidate."""
+        return self._first.spec
+
+    @property
+    def planned(self) -> int:
+        """Number of solves of all candidates."""
+        return sum(part.planned for part in self.parts.values())
+
+    @property
+    def estimates(self) -> int:
+        """There are none of the error of the mesh."""
+        return 0
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model of each candidate."""
+        return tuple(part.spec for part in self.parts.values())
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about each candidate, and about those that are left out."""
+        found = [
+            one._replace(text=f"Candidate '{name}': {one.text}")
+            for name, part in self.parts.items()
+            for one in part.findings
+        ]
+        if self.model.meshed:
+            text = "The error of the mesh is not estimated of averaged predictions: a study of one candidate tells it."
+            found.append(Finding("note", text))
+        return tuple(found)
+
+    def plan(self, rank_groups: int) -> list[str]:
+        """Say what is averaged, and what the first candidate is."""
+        shares = ", ".join(f"{one.name} ({100 * one.probability:.3g} %)" for one in self.candidates)
+        return [f"averaged    {shares}; below, the first", *self._first.plan(rank_groups)]
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the random parameters of a candidate."""
+        return self.parts[label].inputs.names
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """One model for each candidate, at the points of the method; collective over the group."""
+        parts, recorders = self.parts, dict[str, Recorder]()
+
+        def task(evaluate: Evaluate) -> xr.Dataset:
+            found = {}
+            for one, part in parts.items():
+                recorders[one] = Recorder(evaluate if part is self._first else evaluate.on(one))
+                found[one] = with_errors_of_draws(part, part.method.run(part.inputs, recorders[one]))
+            p, errors = zip(*((one.probability, one.error) for one in self.candidates), strict=True)
+            return _told(averaged(found, p, errors))
+
+        others = {one: partial(part.spec.build, ensemble.group, part.inputs.names) for one, part in parts.items()}
+        model = others.pop(next(iter(parts)))()
+        units = {output.name: output.unit for output in self.model.returned}
+        if not self.model.meshed:
+            return MethodJob(model, others, task, recorders, lambda found: label(found, units, None, None, 0))
+        space = cast("HyperelasticModel", model).space
+        cells, kind = space.cells()
+        return MethodJob(
+            model, others, task, recorders, lambda found: label(found, units, space.coordinates, cells, kind)
+        )
+
+    def finished(self, dataset: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
+        """Say of each candidate where it has no answer."""
+        for name, found in evaluations.items():
+            told = branch.findings(self.parts[name].inputs, found, continued=False)
+            add(dataset, *(one._replace(text=f"Candidate '{name}': {one.text}") for one in told))
+        return dataset
+
+    def summary(self, job: Job) -> dict[str, Any]:
+        """Return the probabilities."""
+        return {"candidates": {one.name: one.probability for one in self.candidates}}
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        place = ("parameters", "from")
+        for what, wrong in (
+            ("accuracy.tolerance", self.accuracy.tolerance is not None),
+            ("model.adapt", self.model.unrefined),
+            (f"method.kind = '{self.method.kind}'", self.method.kind not in AVERAGED_METHODS),
+        ):
+            if wrong:
+                yield place, f"model = 'averaged' does not go with {what}, expected a name of a candidate", "averaged"
+                return
+        try:
+            _ = self.parts
+        except ValidationError as error:
+            for line in lines(error):
+                yield place, f"of a candidate, {line}", "averaged"
+        except ValueError as error:
+            yield place, str(error), "averaged"
+
+
+AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")
+
+
+def _completed(material: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the block of a candidate's material, with the constants that it lacks."""
+    known = constants(str(material["kind"]))
+    return {key: float(value) for key, value in others.items() if key in known} | dict(material)
+
+
+def _told(dataset: xr.Dataset) -> xr.Dataset:
+    """Say which part of the variances is which model it is."""
+    shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])
+    parts = [f"{name} {100 * float(share):.2g} %" for name, share in zip(dataset.output.values, shares, strict=True)]
+    add(dataset, Finding("note", f"Which candidate is right makes of the variance of each output: {', '.join(parts)}."))
+    return dataset
