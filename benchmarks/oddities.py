@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import coverage
+from benchmarks import coverage, held_out
 from benchmarks.coverage import Case, measure
 from uq.inputs.distributions import LogNormal, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -191,18 +191,22 @@ def methods() -> dict[str, Any]:
     }
 
 
+LISTS = {"odd": cases, "held-out": held_out.first, "held-out-2": held_out.second}
+
+
 def main(arguments: Sequence[str] = ()) -> None:
     """Print shares (%): intervals of mean and std that hold the truth; in brackets those that miss it in silence."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks oddities")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     parser.add_argument("--cases", default="")
     parser.add_argument("--methods", default="")
+    parser.add_argument("--list", choices=LISTS, default="odd")
     options = parser.parse_args(arguments)
     chaos.DRAWN, coverage.REFERENCE = 10, 14  # quantiles are not looked at
     chosen = {name: method for name, method in methods().items() if options.methods in name}
     print("| function | " + " | ".join(chosen) + " |")
     print("|" + "---|" * (1 + len(chosen)), flush=True)
-    for case in cases():
+    for case in LISTS[options.list]():
         if options.cases in case.name:
             cells = [_cell(case, name, method, options.repeats) for name, method in chosen.items()]
             print(f"| {case.name} | " + " | ".join(cells) + " |", flush=True)

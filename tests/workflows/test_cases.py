@@ -45,7 +45,7 @@ def test_a_borehole(run):
     assert within(flow, "mean", 73.73894)
     assert within(flow, "std", 28.5958)
     assert flow["mean_error"] < 0.01
-    assert flow["std_error"] < 0.02
+    assert flow["std_error"] < 0.0125  # most of it bounds what is beyond all samples
 
 
 def test_a_parameter_without_influence_has_no_index(run):

@@ -340,7 +340,8 @@ def expansion_dataset(
         left = relative_of_field(field)
         add(dataset, *of_field(left, TRUSTED, NOTHING))
         reach = np.array([beyond_of_field(field)])
-        add(dataset, *of_reach(["the displacement field"], reach, np.array([left]), len(data.points)))
+        within = np.array([left])
+        add(dataset, *of_reach(["the displacement field"], reach, within, within, len(data.points)))
     dataset.attrs["stopped"] = expanded.stopped
     failed = int((~evaluations.ok).sum())
     if failed:

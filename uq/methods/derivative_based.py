@@ -37,7 +37,7 @@ from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
 from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
-from uq.estimators.tails import counted
+from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.findings import add
 from uq.inputs.distributions import (
@@ -283,26 +283,31 @@ class _Samples:
             reasons = "; ".join(sorted(self._reasons)[:3])
             message = f"{some.sum()} of {len(some)} scrambles have an answer, expected more: {reasons}"
             raise SolveError(message)
-        ok = ok[some]
-        centre, points = self._centre, self.points[some, :each]
-        deviation = np.where(ok[..., None], self.outputs[some, :each] - centre.middle, 0.0)
+        ok, points = ok[some], self.points[some, :each]
         tangents = np.where(ok[..., None, None], self.tangents[some, :each], 0.0)
-        scaled = tangents * centre.coordinates.steps(points)[:, :, None, :]
+        scaled = tangents * self._centre.coordinates.steps(points)[:, :, None, :]
         d = scaled.shape[-1]
-        first, second = deviation, deviation**2
-        if ok.all():
-            # The tangent at the mean parameters is a control variate of both, as in `uq.estimators.moments`.
-            prediction = centre.coordinates.of(points) @ centre.output_slopes.T
-            variance = (centre.output_slopes**2).sum(axis=1)
-            first, second = deviation - prediction, second - prediction**2 + variance
+        first, second = (np.where(ok[..., None], one[some], 0.0) for one in self._controlled(each))
         parts = [
             first[..., None],
             second[..., None],
             tangents**2,
             (tangents * points[:, :, None, :]) ** 2,
-            (scaled[..., :, None] * scaled[..., None, :]).reshape(*deviation.shape, d * d),
+            (scaled[..., :, None] * scaled[..., None, :]).reshape(*first.shape, d * d),
         ]
         return np.swapaxes(np.concatenate(parts, axis=-1).sum(axis=1), 1, 2), ok.sum(axis=1).astype(float)
+
+    def _controlled(self, each: int) -> tuple[FloatArray, FloatArray]:
+        """Samples (R, n, m) of the first two moments of deviations; of those without an answer anything.
+
+        The tangent at the mean parameters is a control variate of both, as in `uq.estimators.moments`.
+        """
+        centre = self._centre
+        deviation = self.outputs[:, :each] - centre.middle
+        if not self.ok[:, :each].all():
+            return deviation, deviation**2
+        prediction = centre.coordinates.of(self.points[:, :each]) @ centre.output_slopes.T
+        return deviation - prediction, deviation**2 - prediction**2 + (centre.output_slopes**2).sum(axis=1)
 
     def _from_means(self, means: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Measures and bounds (…, m, d) and matrices (…, m, d, d) from means (J, …, m)."""
@@ -346,7 +351,9 @@ class _Samples:
         sums, counts = self._sums(each)
         means = sums / counts[:, None, None]
         found = estimate_from_replicates(np.array([means[:, 0], means[:, 1]]), self._centre.middle)
-        return counted(found, self._inputs, self.outputs[:, :each][self.ok[:, :each]])
+        ok = self.ok[:, :each]
+        first, second = (one[ok] for one in self._controlled(each))
+        return counted(found, self._inputs, self.outputs[:, :each][ok], (first, second))
 
     def _in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
         """Flatten (R, n, …) to (n R, …), first points of all scrambles first: a shorter study is a prefix."""
@@ -394,7 +401,8 @@ class _Samples:
                         dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
                 dataset["loo_error"] = (("output",), regression.fit.relative)
                 add(dataset, *of_indices(dataset))
-        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
+        moved = influences(*(self._in_order(one)[ok] for one in self._controlled(self.each)))
+        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error, moved))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
         return dataset

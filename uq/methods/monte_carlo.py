@@ -224,15 +224,15 @@ def _scalar_moments(
     predictions = centre.coordinates.of(evaluations.points[ok]) @ slopes.T
     variance = np.einsum("mi,ij,mj->m", slopes, inputs.correlation, slopes)
     found = estimate_from_samples(deviations, predictions, centre.middle, variance, *control)
-    return counted(found, inputs, values, _influences(evaluations, centre, found))
+    return counted(found, inputs, values, _controlled(evaluations, centre, found))
 
 
-def _influences(evaluations: Evaluations, centre: Linearisation, found: Estimates) -> FloatArray:
-    """By how much each sample (n, m) that has an answer moves the variance, with the tangent as control."""
+def _controlled(evaluations: Evaluations, centre: Linearisation, found: Estimates) -> tuple[FloatArray, FloatArray]:
+    """Samples (n, m) of the first two moments that have an answer, with the tangent as control."""
     ok = evaluations.ok
     first = evaluations.outputs[ok] - centre.middle
     predicted = centre.coordinates.of(evaluations.points[ok]) @ centre.output_slopes.T
-    return influences(first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2)
+    return first - found.coefficient * predicted, first**2 - found.second_coefficient * predicted**2
 
 
 def _field_moments(
@@ -295,7 +295,7 @@ def _dataset(
     if control is not None:
         if control[1] == "quadratic":
             add(dataset, *of_control(evaluate.outputs, "tangent", scalars))
-        moved = _influences(evaluations, centre, scalars)
+        moved = influences(*_controlled(evaluations, centre, scalars))
     add(dataset, *of_tails(evaluate.outputs, values, scalars.relative_std_error, moved))
     if not ok.all():
         which = "plain estimates" if control else "all estimates"

@@ -31,7 +31,7 @@ from uq.estimators.moments import (
     ratio,
     student,
 )
-from uq.estimators.tails import counted, influences, of_influences
+from uq.estimators.tails import counted, influences, of_influences, skewed
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request, Start
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from uq.accuracy.goal import Goal
 
 Pair = tuple[FloatArray, FloatArray]
+LITTLE = 1e-3  # of the standard deviation: errors of means that may be claimed too large
 ORDER = 6  # largest order of the expansions tried as control
 FIT = 2**32 - 1  # number of the scramble to which the control is fitted; no sample belongs to it
 
@@ -268,7 +269,8 @@ class QuasiMonteCarlo(MonteCarlo):
             add(dataset, *of_control(evaluate.outputs, self.control, scalars))
         if fitted is not None:
             dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
-        moved = samples.influences(scalars, samples.each)
+        controlled = samples.controlled(scalars, samples.each)
+        moved = None if controlled is None else influences(*controlled)
         add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, moved))
         field = samples.field()
         if field is not None:
@@ -420,15 +422,20 @@ class _Samples:
         means = products[:, some] / ok.sum(axis=1)[some, None]
         found = estimate_from_replicates(means, centre.outputs, expected, self._method.coefficient)
         # A tangent grows no faster than a normal quantity; controls that grow faster tell what lies beyond the samples.
-        moved = self.influences(found, each)
-        tails = counted(found, self._inputs, self.outputs[:, :each][ok], moved)
-        if moved is None or self._method.control == "tangent":
+        controlled = self.controlled(found, each)
+        tails = counted(found, self._inputs, self.outputs[:, :each][ok], controlled)
+        if controlled is None or self._method.control == "tangent":
             return tails
         of_mean, of_std = self._unseen(each)
-        known = np.hypot(found.std_error, np.maximum(of_std, of_influences(found, self._inputs, moved)))
+        moved = influences(*controlled)
+        further = np.maximum(of_std, of_influences(found, self._inputs, moved))
+        known = np.hypot(found.std_error * skewed(moved), further)
+        # What a polynomial leaves rises too steeply at its outermost samples to say much of its mean beyond them.
+        most = np.hypot(found.mean_error, np.maximum(found.mean_error, LITTLE * found.std))
+        within = np.minimum(tails.mean_error, most)
         return replace(
             found,
-            mean_error=np.where(found.coefficient == 0, found.mean_error, np.hypot(found.mean_error, of_mean)),
+            mean_error=np.where(found.coefficient == 0, tails.mean_error, np.hypot(within, of_mean)),
             std_error=np.where(found.second_coefficient == 0, tails.std_error, known),
         )
 
@@ -486,15 +493,15 @@ class _Samples:
         told = 2 * np.abs(whole - held) > np.maximum(np.abs(whole), np.abs(held))
         return np.asarray(np.where(told, whole**2 - held**2, 0.0).sum(axis=0) > 0)
 
-    def influences(self, found: Estimates, each: int) -> FloatArray | None:
-        """By how much each of the first samples (n, m) that has an answer moves the variance, with controls."""
+    def controlled(self, found: Estimates, each: int) -> Pair | None:
+        """Samples (n, m) of both moments, the first of them that have an answer, with controls."""
         known = self._controls(each)
         if known is None:
             return None
         ok = self.ok[:, :each]
         C, D = (control[ok] for control in known[0])
         first = self.outputs[:, :each][ok] - self._centre.outputs
-        return influences(first - found.coefficient * C, first**2 - found.second_coefficient * D)
+        return first - found.coefficient * C, first**2 - found.second_coefficient * D
 
     def field_doubts(self, found: Estimates) -> Iterator[Finding]:
         """Find what speaks against the estimates of the displacements."""

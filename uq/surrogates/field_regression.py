@@ -129,7 +129,7 @@ class Deviations:
     reach
         Lowest and highest coordinates (2, d) of the samples that were fitted.
     rest
-        Norms (m,) of what the functions miss in the outputs, see `Regression.rest`; None if no parameter has a tail.
+        Norms (m,) of what the functions miss in the outputs, see `Regression.missing`; None if no parameter has a tail.
     """
 
     basis: Basis
@@ -172,7 +172,7 @@ def deviations(regression: Regression, evaluations: Evaluations, centre: Lineari
         prediction = StateExpansion.fitted(basis, fit, evaluations.fields, centre)
     t = regression.inputs.coordinates.of(data.points)
     reach = np.array([t.min(axis=0), t.max(axis=0)])
-    rest = regression.rest()
+    rest = regression.missing()
     return Deviations(basis, outputs, state, fit.relative, evaluations.ok, prediction, reach, rest)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import Finding, FloatArray, SolveError
-from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_tails
+from uq.estimators.doubts import of_constants, of_expansion, of_reach, of_shape, of_tails
 from uq.estimators.indices import Analysis, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.estimators.tails import influences
@@ -46,6 +46,7 @@ CLOSE = 0.03  # relative leave-one-out error above which the tails of the sample
 TRUSTED = 0.3  # relative leave-one-out error up to which moments are those of the fit
 NOTHING = 0.8  # the same, above which a fit tells nothing about which parameters matter
 POINTS = 4096  # at which the origin of the variance of an expansion is computed
+SYMMETRIC = 0.01  # share of even powers up to which a function is odd, and the reverse
 COMMON = 2  # parameters of which what is missed in their tails adds up
 PATIENCE = 30  # functions selected without a gain before the selection ends
 
@@ -623,6 +624,11 @@ class Regression:
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
 
     def rest(self) -> FloatArray | None:
+        """Return the norms (m,) of what a fit leaves of outputs; None if no parameter has a tail."""
+        missing = self.missing()
+        return None if missing is None else np.maximum(self.fit.loo, missing)
+
+    def missing(self) -> FloatArray | None:
         """Return the norms (m,) of what the basis misses in outputs; None if no parameter has a tail.
 
         On a bounded range samples reach the ends, and the leave-one-out error shows what is missing. In tails they do
@@ -634,16 +640,21 @@ class Regression:
         if not tails.size:
             return None
         basis, data = self.basis, self.data
-        powers = np.zeros((2 * tails.size, basis.indices.shape[1]), dtype=np.int64)
-        which = np.arange(tails.size)
-        for more in (1, 2):  # an odd function has no next even power
-            powers[which + (more - 1) * tails.size, tails] = basis.indices[:, tails].max(axis=0) + more
-        following, left = data.left(orthonormal(self.inputs, powers)), data.left(basis)
+        degrees = basis.indices[:, tails]
+        powers = np.zeros((2, tails.size, basis.indices.shape[1]), dtype=np.int64)
+        following = degrees.max(axis=0) + 1
+        powers[:, np.arange(tails.size), tails] = following, following + 1
+        functions, left = data.left(orthonormal(self.inputs, powers.reshape(-1, powers.shape[2]))), data.left(basis)
         rows = left.shape[0] * left.shape[1]
         q, _ = np.linalg.qr(left.reshape(rows, -1))
-        columns = following.reshape(rows, -1)
-        residual = columns - q @ (q.T @ columns)
-        return np.maximum(self.fit.loo, np.sqrt(shares(self.fit.squares, (residual**2).sum(axis=0).min())))
+        columns = functions.reshape(rows, -1)
+        next_one, after = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0).reshape(2, tails.size, 1)
+        # An odd function, or one beside a slope, has no even powers, and lacks the one after the next.
+        squares = self.fit.coefficients**2
+        alike = ((degrees > 1) & (degrees % 2 == following % 2)).T @ squares
+        lacks = alike <= SYMMETRIC * ((degrees > 1).T @ squares)
+        least = np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0)
+        return np.sqrt(shares(self.fit.squares, least))
 
     @property
     def beyond(self) -> FloatArray:
@@ -660,14 +671,20 @@ class Regression:
         n = len(self.data.points)
         yield from of_constants(names, self.data.values)
         yield from of_expansion(names, self.fit.relative, TRUSTED, NOTHING, n)
-        yield from of_reach(names, self.beyond, self.fit.relative, n)
+        rest = self.rest()
+        whole = self.fit.relative if rest is None else shares(rest, self.data.values.std(axis=0))
+        yield from of_reach(names, self.beyond, self.fit.relative, whole, n)
+        trusted = np.flatnonzero(self.fit.relative <= TRUSTED)
+        drawn = self.inputs.points(sobol_points(0, 0, 0, POINTS, len(self.inputs.names)))
+        values = self.basis.values(drawn) @ self.fit.coefficients[:, trusted]
+        yield from of_shape([names[i] for i in trusted], values, self.fit.relative[trusted], n)
         if np.ptp(self.data.weights) == 0:
             which = np.flatnonzero(self.fit.relative > CLOSE)
             first, second, _ = _unseen_samples(self.fit, self.largest.indices, self.data)
             yield from of_tails(
                 [names[i] for i in which],
                 self.data.values[:, which],
-                np.ones(which.size),
+                1.0 * self.controlled[which],  # of others the shape tells more than so few samples
                 influences(first, second)[:, which],
                 expanded=True,
             )

@@ -113,10 +113,11 @@ def test_a_constant_that_does_not_settle_is_bounded_from_above():
 def test_an_inert_log_normal_parameter_has_no_index(cv):
     """It had one of 1, from polynomials of itself, beside a bound of 0."""
     inputs = Inputs({"a": Normal(mean=1.0, std=0.3), "inert": LogNormal(mean=1.0, std=cv)})
-    data = run(DerivativeBased(samples=128), inputs, lambda p: np.exp(p[0]) + 1e-6 * np.log(p[1]))
+    # With 128 samples the tail of exp(a) is a warning in two of three runs.
+    data = run(DerivativeBased(samples=512), inputs, lambda p: np.exp(p[0]) + 1e-6 * np.log(p[1]))
     assert data["sobol_total"][0, 1] < 1e-6
     assert data["total_bound"][0, 1] < 1e-6
-    assert all(found.severity == "warning" for found in findings.findings(data))  # of the tail of exp(a)
+    assert findings.findings(data) == []
 
 
 def test_an_index_above_its_own_bound_is_an_error(monkeypatch):
