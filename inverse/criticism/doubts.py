@@ -309,6 +309,17 @@ def meshes_too_coarse(
     return [Doubt("warning", f"{text}: {ADVICE}", "meshes too coarse")]
 
 
+def meshes_not_alike(corrected: Sequence[str], unknown: Sequence[str]) -> list[Doubt]:
+    """Doubt evidences of candidates, by name, of which some are corrected for their meshes and some not looked at."""
+    if not corrected or not unknown:
+        return []
+    text = (
+        f"the meshes of {', '.join(corrected)} are corrected, and those of {', '.join(unknown)} could not be looked "
+        "at: their evidences do not compare, since a mesh alone may make a candidate win or lose"
+    )
+    return [Doubt("warning", text, "meshes are not corrected alike")]
+
+
 def certain(change: Any, shift: Any) -> Any:
     """Whether a change of ln Z is small, and known: to first order, at shifts of 3 deviations, it was off by 1.6."""
     return (np.abs(change) <= MOVED) & (np.abs(shift) <= LINEAR)

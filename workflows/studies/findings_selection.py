@@ -196,6 +196,11 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
     left = dataset["mesh_log_evidence"].where(~dataset["mesh_corrected"], 0.0)  # of what is corrected nothing
     values, added = weights.to_series().to_dict(), left.sum("group", skipna=False)
+    added = added.where(~dataset["mesh_corrected"].all("group"))  # of these nothing is left to say
+    corrected, unknown = (
+        [str(name) for name in dataset.model.values[which.to_numpy()]]
+        for which in (dataset["mesh_corrected"].any("group"), ~dataset["mesh_checked"].all("group"))
+    )
     said = [
         Finding("warning", f"{model}: not checked for the mesh: {one['mesh_why'].item()}.")
         for model in map(str, dataset.model.values)
@@ -212,7 +217,8 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     ]
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
-    doubts = criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
+    doubts = criticism.meshes_not_alike(corrected, unknown)
+    doubts += criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
     return said + [Finding(doubt.severity, f"{doubt.text[0].upper()}{doubt.text[1:]}.") for doubt in doubts]
 
 

@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from forward.model import FunctionModel, SolveError
-from inverse.criticism.doubts import certain, meshes_too_coarse
+from inverse.criticism.doubts import certain, meshes_not_alike, meshes_too_coarse
 from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import Places
 from inverse.low_dimensional.laplace import laplace
@@ -102,6 +102,14 @@ def test_meshes_that_decide_are_an_error():
     (note,) = meshes_too_coarse(values, {"soft": np.nan, "stiff": 0.5}, near)
     assert note.severity == "note"
     assert not meshes_too_coarse(values, {"soft": np.nan, "stiff": np.nan}, near)
+
+
+def test_candidates_of_which_only_some_are_corrected_do_not_compare():
+    assert not meshes_not_alike(["soft"], [])
+    assert not meshes_not_alike([], ["stiff"])
+    (doubt,) = meshes_not_alike(["soft"], ["stiff", "other"])
+    assert doubt.severity == "warning"
+    assert "the meshes of soft are corrected, and those of stiff, other could not be looked at" in doubt.text
 
 
 def test_beyond_two_deviations_only_that_it_is_large():

@@ -226,6 +226,12 @@ def test_a_corrected_candidate_has_the_evidence_of_a_finer_one(study):
     assert trusted_on_meshes(far)["trusted"].values[1 - second].item() is True
     texts = [one.text for one in doubts_of_selection(far, inputs, None) if "It decides on the result" in one.text]
     assert [text.partition(":")[0] for text in texts] == [str(found["model"].values[second])]
+    # Evidences of candidates that are corrected are not said to move; one that could not be looked at does not compare.
+    assert not any("Finer meshes move" in text or "could not be looked at" in text for text in said)
+    blind = found.assign({name: found[name].copy() for name in ("mesh_checked", "mesh_corrected")})
+    blind["mesh_checked"][second] = blind["mesh_corrected"][second] = False
+    text = f"those of {found['model'].values[second]} could not be looked at"
+    assert any(text in one.text for one in doubts_of_selection(blind, inputs, None))
 
 
 def test_finer_meshes_of_one_candidate_at_a_time_are_in_memory(study, monkeypatch):
