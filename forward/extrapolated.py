@@ -33,6 +33,8 @@ class Extrapolated(OneByOne):
         Parameters (d,) that are solved for first: other solves begin at what their linearisation predicts.
     begun
         States there, and their derivatives, on both meshes, once they are known; models of the same meshes share it.
+    otherwise
+        The same on other meshes, for parameters at which these have no answer; for all if they have none at the start.
 
     Notes
     -----
@@ -44,6 +46,7 @@ class Extrapolated(OneByOne):
     share: float
     start: FloatArray | None = None
     begun: list[Begun | None] = field(default_factory=list)
+    otherwise: Extrapolated | None = None
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -71,15 +74,25 @@ class Extrapolated(OneByOne):
         Raises
         ------
         SolveError
-            Where one of them has no answer.
+            Where one of them has no answer, and the others have none.
         """
+        if self.otherwise is None:
+            return self._solve(parameters)
+        if self.begun and self.begun[0] is None:
+            return self.otherwise.solve(parameters)
+        try:
+            return self._solve(parameters)
+        except SolveError:
+            return self.otherwise.solve(parameters)
+
+    def _solve(self, parameters: FloatArray) -> ExtrapolatedSolution:
         if self.start is not None and not self.begun:
             at_start = np.array_equal(parameters, self.start)
             try:
                 here = self._begin(self.start)
             except SolveError:
                 self.begun.append(None)
-                if at_start:
+                if at_start or self.otherwise is not None:
                     raise
             else:
                 if at_start:

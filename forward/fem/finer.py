@@ -8,8 +8,9 @@ fields are those of the mesh itself, interpolated.
 Finer meshes are quadratic, with as many nodes where the body is linear, and never coarser than a few cells: the
 differences of linear or very coarse meshes tell neither how fast the error falls nor what is left of it
 (docs/decisions/0017-mesh-error.md). Where a tool touches a body cells are halved, and graded as those of the body: the
-edge of the contact may be anywhere. Where there are random fields cells are halved too, and the other mesh is that of
-the body: a mesh that does not contain its vertices has another field.
+edge of the contact may be anywhere. Where thin cells at a rim are squeezed until there is no equilibrium, meshes
+without them take their place. Where there are random fields cells are halved too, and the other mesh is that of the
+body: a mesh that does not contain its vertices has another field.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
 TIMES = 1.5  # cells along an edge, over those of the body
 LEAST = {TIMES: 5, 1.0: 3}  # cells along an edge of the finer and of the coarser mesh
-OF_TOUCHED = 1.6  # order with which errors fall where a tool touches
+OF_EQUAL = 1.6  # order with which errors fall where cells are not graded towards what causes them
 OF_LINEAR = 0.1  # what quadratic cells of the same size still miss, over what they add to linear ones
 QUADRATIC = {"degree": 2, "quadrature_degree": None}
 HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
@@ -77,7 +78,7 @@ def share(spec: AnyBody) -> float:
     fine, coarse = finer(spec).body, (graded(spec) or spec).body
     times = (fine.cell_count / coarse.cell_count) ** (1 / 3)
     # Displacements converge like h^(degree + 1) where meshes are graded as singular stresses want it.
-    return float(1 / (times ** (OF_TOUCHED if _touched(spec) else fine.degree + 1) - 1))
+    return float(1 / (times ** (OF_EQUAL if _touched(spec) else fine.degree + 1) - 1))
 
 
 def held(spec: AnyBody) -> tuple[str, ...]:
@@ -95,7 +96,7 @@ def _cases(spec: Any) -> tuple[Any, ...]:
     return getattr(spec, "cases", (spec,))
 
 
-def _on(spec: AnyBody, times: float) -> Any:
+def _on(spec: AnyBody, times: float, *, thin: bool = True) -> Any:
     if not hasattr(spec, "body"):
         raise ModelError(f"a model of kind '{spec.kind}' has no body that could be meshed again")
     body, linear = spec.body, spec.body.degree == 1
@@ -108,6 +109,8 @@ def _on(spec: AnyBody, times: float) -> Any:
     else:
         if _touched(spec):  # the edge of the contact decides, wherever that is
             body = body.with_cells((2.0 if times > 1 else 1.0) / (2 if linear else 1))
+        elif not thin:
+            body = body.with_cells(times / 2 if linear else times)
         else:
             body = body.finer(times / 2 if linear else times, held(spec), HELD, BESIDE)
         cells = {"cells": tuple(max(n, LEAST[times]) for n in body.cells)}
@@ -134,9 +137,16 @@ def extrapolated(model: AnyModel, start: FloatArray | None = None) -> FinerMeshe
     ModelError
         If there is no finer mesh of it.
     """
-    fine, beside = finer(model.spec), graded(model.spec)
+    spec = model.spec
+    fine, beside = finer(spec), graded(spec)
     coarse = None if beside is None else OtherMesh(model, beside)
-    return FinerMeshes(model, OtherMesh(model, fine), coarse, share(model.spec), start)
+    otherwise = None
+    if not isinstance(spec.body, MeshFile) and fine.body.grading != spec.body.grading:
+        equal, less = (_on(spec, times, thin=False) for times in (TIMES, 1.0))
+        times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
+        other = None if less.body == spec.body else OtherMesh(model, less)
+        otherwise = FinerMeshes(model, OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start)
+    return FinerMeshes(model, OtherMesh(model, fine), coarse, share(spec), start, otherwise)
 
 
 class FinerMeshes:
@@ -148,24 +158,34 @@ class FinerMeshes:
         On its own mesh.
     fine, coarse
         On the finest, and on the other one; None where that is its own.
-    share, start
+    share, start, otherwise
         As of `Extrapolated`.
     """
 
     def __init__(
-        self, own: AnyModel, fine: OtherMesh, coarse: OtherMesh | None, share: float, start: FloatArray | None
+        self,
+        own: AnyModel,
+        fine: OtherMesh,
+        coarse: OtherMesh | None,
+        share: float,
+        start: FloatArray | None,
+        otherwise: FinerMeshes | None = None,
     ) -> None:
         self.own, self.fine, self.coarse, self.share, self.start = own, fine, coarse, share, start
+        self.otherwise = otherwise
         self._begun: list[Begun | None] = []
 
     def observing(self, observed: SpecimenModel) -> Extrapolated:
         """Return the model of what is `observed` of a specimen; collective when it is first solved."""
         coarse = observed if self.coarse is None else self.coarse.observing(observed)
-        return Extrapolated(self.fine.observing(observed), coarse, self.share, self.start, self._begun)
+        otherwise = None if self.otherwise is None else self.otherwise.observing(observed)
+        return Extrapolated(self.fine.observing(observed), coarse, self.share, self.start, self._begun, otherwise)
 
     def restricted(self, to: Callable[[ForwardModel], ForwardModel] = lambda model: model) -> Extrapolated:
         """Return the model of its outputs, or of those that a function restricts it to; as `observing`."""
-        return Extrapolated(to(self.fine), to(self.coarse or self.own), self.share, self.start, self._begun)
+        otherwise = None if self.otherwise is None else self.otherwise.restricted(to)
+        coarse = to(self.coarse or self.own)
+        return Extrapolated(to(self.fine), coarse, self.share, self.start, self._begun, otherwise)
 
 
 class OtherMesh(OneByOne):

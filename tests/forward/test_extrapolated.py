@@ -38,6 +38,29 @@ def test_outputs_and_derivatives_are_those_of_the_limit():
     assert found.mesh_error() is None
 
 
+def test_other_meshes_take_the_place_of_those_without_an_answer():
+    """At some parameters; or at all, where there is none at the start: searches without an answer take minutes."""
+    tried = []
+
+    def fails(p):
+        tried.append(p[0])
+        if p[0] == 1.0:
+            message = "not there"
+            raise SolveError(message)
+        return on(0.2).function(p)
+
+    there, start = FunctionModel(fails, NAMES, ("y", "z")), np.array([1.0, 1.0])
+    other = Extrapolated(on(0.4), on(0.5), 0.7)
+    lost = Extrapolated(there, on(0.3), 0.8, start, otherwise=other)
+    np.testing.assert_array_equal(lost.solve(POINT).outputs, other.solve(POINT).outputs)
+    np.testing.assert_array_equal(lost.solve(start).outputs, other.solve(start).outputs)
+    assert tried == [1.0]
+    part = Extrapolated(there, on(0.3), 0.8, POINT, otherwise=other)
+    np.testing.assert_array_equal(part.solve(start).outputs, other.solve(start).outputs)
+    whole = Extrapolated(on(0.2), on(0.3), 0.8)
+    np.testing.assert_allclose(part.solve(POINT).outputs, whole.solve(POINT).outputs)
+
+
 def test_a_start_without_an_answer_is_none():
     tried = []
 
