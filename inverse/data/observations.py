@@ -194,8 +194,9 @@ class Observations:
         return np.argsort(np.concatenate([self.case[which], self.readings.case]), kind="stable")
 
     def by_datum(self, values: FloatArray) -> FloatArray:
-        """Return values (n,) of the points for each of the `components`."""
-        return np.asarray(values[self._order[0]])
+        """Return values (n,) of the points for each of the `components`; zeros of other outputs."""
+        which, _ = np.nonzero(self.measured)
+        return np.asarray(np.concatenate([values[which], np.zeros(len(self.readings))])[self._order])
 
     def components(self) -> Components:
         """Return what was measured, load case after load case: displacements by component, then other outputs."""

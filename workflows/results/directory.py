@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from forward.machine import write_whole
 from workflows.results.norms import squares
-from workflows.results.points import points_grid
+from workflows.results.points import has_points, points_grid
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -151,8 +151,8 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
         names = dataset.data_set.values
         grids = {str(name): partial(body_grid, dataset.sel(data_set=name)) for name in names}
         if "datum_axis" in dataset:
-            solved = [str(name) for name in names if bool(dataset["ok"].sel(data_set=name))]
-            grids |= {f"points-{name}": partial(points_grid, dataset.sel(data_set=name)) for name in solved}
+            seen = {str(name): dataset.sel(data_set=name) for name in names if bool(dataset["ok"].sel(data_set=name))}
+            grids |= {f"points-{name}": partial(points_grid, one) for name, one in seen.items() if has_points(one)}
     elif "cell_nodes" in dataset:
         grids = {"displacement": partial(body_grid, dataset)}
     path = None

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+N = 3  # axes of displacements
+
+
 @dataclass(frozen=True, eq=False)
 class MeasuredPoints:
     """The points of a load case.
@@ -46,7 +49,7 @@ class MeasuredPoints:
 
 def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
     """Return the points of each load case of one data set that was inverted, ``dataset.sel(data_set=name)``."""
-    seen = np.isfinite(one["measured"].to_numpy())
+    seen = np.isfinite(one["measured"].to_numpy()) & (one["datum_axis"].to_numpy() < N)  # no other outputs
     axes = one["datum_axis"].to_numpy()[seen].astype(int)
     along = one["datum_direction"].to_numpy()[seen] if "datum_direction" in one else np.eye(3)[axes]
     numbers = {name: one[name].to_numpy()[seen] for name in ("measured", "predicted", "residual", "datum_case")}
@@ -66,6 +69,11 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
         over = np.sqrt(squares / np.maximum(counts, 1))
         found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[rows][first]))
     return found
+
+
+def has_points(one: xr.Dataset) -> bool:
+    """Whether displacements were measured, rather than other outputs alone."""
+    return "datum_axis" in one and bool((one["datum_axis"] < N).any())
 
 
 def points_grid(one: xr.Dataset) -> Any:

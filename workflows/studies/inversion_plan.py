@@ -58,7 +58,7 @@ def plan(study: Inversion) -> list[str]:
 def _moved(count: int, usable: list[Measurement]) -> str:
     where = "" if all(m.on_surface for m in usable) else " outside the body"
     are = f"point{where} is" if count == 1 else f"points{where} are"
-    farthest = max(m.moved.max() for m in usable)
+    farthest = max(m.moved.max(initial=0.0) for m in usable)
     square = float(np.mean(np.concatenate([m.moved for m in usable]) ** 2))
     return f"{count} {are} moved to its surface, by up to {farthest:.2g} m (root mean square {np.sqrt(square):.2g} m)"
 

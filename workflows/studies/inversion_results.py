@@ -92,8 +92,8 @@ def _of_specimen(
     found = list(study.measurements)
     return {
         "points_moved": ("data_set", [0 if m is None else int((m.moved > 0).sum()) for m in found]),
-        "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max()) for m in found]),
-        "rms_move": ("data_set", [0.0 if m is None else float(np.sqrt((m.moved**2).mean())) for m in found]),
+        "largest_move": ("data_set", [0.0 if m is None else float(m.moved.max(initial=0.0)) for m in found]),
+        "rms_move": ("data_set", [0.0 if m is None else _rms(m.moved) for m in found]),
         "points_left_out": ("data_set", [0 if m is None else len(m.left_out) for m in found]),
         "datum_move": (("data_set", "datum"), _moves(found, record["place"].shape[1])),
         "stiffness_prior_std": ("node", _prior_stiffness_std(study, places, prior)),
@@ -102,6 +102,10 @@ def _of_specimen(
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
+
+
+def _rms(moved: FloatArray) -> float:
+    return float(np.linalg.norm(moved) / np.sqrt(max(len(moved), 1)))
 
 
 def _moves(found: Sequence[Measurement | None], count: int) -> FloatArray:

@@ -175,11 +175,16 @@ class Measurement:
         if not len(root) and not any(self.between):
             return None
         data = self.observations.components()
-        centre = registered.centre if registered is not None else data.places.mean(axis=0)
+        places = data.places
+        there = np.isfinite(places).all(axis=1)
+        if not there.any():  # other outputs alone, which do not move
+            return None
+        places = np.where(there[:, None], places, places[there][0])
+        centre = registered.centre if registered is not None else places[there].mean(axis=0)
         surface = Surface.of(body) if self.on_surface else None
         project = (lambda points: surface.nearest(points)[0]) if surface is not None else None
         between = np.repeat(self.between, 3)
-        return SharedMotion(data.places, data.along, data.cases, root, between, centre, project)
+        return SharedMotion(places, data.along, data.cases, root, between, centre, project)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -13,11 +13,17 @@ from pydantic import ValidationError
 
 from forward.bodies.geometry import Box
 from forward.bodies.surface import Surface
+from forward.specimen import Specimen
+from inverse.data.registration import turned
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from tests.fuzz import damaged_bytes
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load
 from workflows.studies.measured import digest_of, read_on, scan_of
+from workflows.studies.specimen_selection import DisplacementFile, MeasuredDisplacements
 
+CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 POINTS = 50 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1.0]])  # mm
 TRIANGLES = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2], [1, 5, 3]])
 MOTION = POINTS @ np.array([[0.02, 0.01, 0], [0, -0.03, 0.01], [0.01, 0, 0.04]]) + 1.0
@@ -302,3 +308,71 @@ def test_nearest_places_of_surfaces():
         places, normals = Surface.of(Box(size=(0.05, 0.05, 0.05), cells=cells)).nearest(points)
         np.testing.assert_allclose(places, expected, atol=1e-15)
         np.testing.assert_allclose(np.abs(normals).max(axis=1), 1)
+
+
+def test_what_the_plan_says_of_a_scan(tmp_path):
+    """The shipped one is found askew; points that do not belong to the body are named."""
+    study = load(CONFIGS / "scan.toml")
+    (found,) = study.measurements
+    assert found.registered is not None
+    np.testing.assert_allclose(found.registered.motion.angles, [0, 0, 5], atol=1e-4)
+    np.testing.assert_allclose(found.registered.motion.shift, [0.01, 0, 0], atol=1e-7)
+    lines = study.plan(1)
+    assert any(
+        line.startswith("registered  rotated by 0, 0, 5° about x, y and z, shifted by 0.01, 0, 0 m") for line in lines
+    )
+    text = (CONFIGS / "data" / "scan.csv").read_text(encoding="utf-8")
+    stray = "".join(f"{100 + k},100,100,1,1,1,0.1,shear\n" for k in range(7))
+    (tmp_path / "scan.csv").write_text(text + stray, encoding="utf-8")
+    changes = [f"data.files=['{tmp_path}/scan.csv']", "data.beyond='leave-out'"]
+    study = load(CONFIGS / "scan.toml", changes)
+    (found,) = study.measurements
+    np.testing.assert_allclose(found.registered.motion.angles, [0, 0, 5], atol=1e-2)
+    (line,) = found.warnings
+    assert line.startswith("7 points do not belong to the body and are left out: scan.csv: line 278 (")
+    assert line.endswith("and 2 others")
+    assert f"warning     {line}" in study.plan(1)
+
+
+@pytest.mark.fem
+def test_comparisons_take_scans_in_their_own_frame(tmp_path):
+    """The same predictions along the axes of the scanner; uncertain motions are refused."""
+    from mpi4py import MPI
+
+    specimen = Specimen.model_validate(
+        {
+            "body": {"size": [0.05] * 3, "cells": [1, 1, 1], "degree": 1},
+            "material": {"kind": "neo-hookean-coupled", "mu": 1e3, "lmbda": 4e3},
+            "cases": [
+                {
+                    "name": "press",
+                    "clamp": ["z-min"],
+                    "loads": [{"kind": "traction", "on": "z-max", "direction": [1, 0, 0], "size": 50.0}],
+                }
+            ],
+        }
+    )
+    write(tmp_path / "scan.csv")
+    R = turned((0.0, 0.0, 5.0))
+    whole = [[*row, 0.0] for row in R.tolist()]
+    inside = np.array([25.0, 20, 30])  # the corners would leave the body
+    text = (tmp_path / "scan.csv").read_text().splitlines()
+    rows = [line.split(", ") for line in text[1:]]
+    for row in rows:
+        row[:3] = map(repr, map(float, (inside + 0.1 * np.array(row[:3], dtype=float)) @ R))
+    (tmp_path / "scan.csv").write_text("\n".join([text[0], *(", ".join(row) for row in rows)]))
+    how = {"file": "scan.csv", "registration": {"kind": "given", "matrix": whole}}
+    data = MeasuredDisplacements.model_validate(DisplacementFile.model_validate(how).read(tmp_path, specimen))
+    np.testing.assert_allclose(data.axes, R.T, atol=1e-12)
+    places = np.array(data.places)
+    expected = {tuple(x) for x in ((inside + 0.1 * POINTS) / 1e3).round(9).tolist()}
+    assert {tuple(x) for x in places.round(9).tolist()} == expected
+    model = specimen.build(MPI.COMM_SELF, ())
+    axes, cases = ["xyz".index(axis) for axis in data.components], [0] * len(places)
+    seen = model.observing(places, axes, cases, np.array(data.axes)[axes]).solve(np.zeros(0)).outputs
+    plain = model.observing(np.repeat(places, 3, axis=0), [0, 1, 2] * len(places), [0] * 3 * len(places))
+    vectors = plain.solve(np.zeros(0)).outputs.reshape(-1, 3)
+    np.testing.assert_allclose(seen, [(u @ R)[axis] for u, axis in zip(vectors, axes, strict=True)], atol=1e-12)
+    how["registration"] = {"kind": "given", "rotation_std": 1.0}
+    with pytest.raises(StudyError, match="uncertain motions are for inversions"):
+        DisplacementFile.model_validate(how | {"tolerance": 1.0}).read(tmp_path, specimen)

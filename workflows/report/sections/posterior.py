@@ -13,6 +13,7 @@ from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
 from workflows.report.plots import residuals
 from workflows.report.section import Results, Section
+from workflows.results.points import has_points
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -267,6 +268,8 @@ def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
     words = (
         "Measured minus predicted displacements at the mode: as arrows, and over their errors, on the box of the body"
     )
+    if not has_points(one):
+        return
     yield residuals.residuals(one), f"{words}; fields/points-{one.data_set.item()}.vtu for ParaView."
     if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
         yield residuals.distances(one), "How far points were from the body before they were moved onto it."
