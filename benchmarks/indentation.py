@@ -1,6 +1,7 @@
 """Rigid tools: closed forms on a large block, large strains against another code, random indentations, and their cost.
 
-Options: ``--cells 6 8`` for the meshes of the closed forms, ``--random 1000`` for the number of random indentations.
+Options: ``--cells 6 8`` for the meshes of the closed forms (none leaves these tables out), ``--random 1000`` for the
+number of random indentations, ``--kept FILE`` for those that are finished: the same command goes on with them.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ import argparse
 import math
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from benchmarks.axisymmetric import indented
+from benchmarks.indentations import random
 from forward.hyperelastic import Hyperelastic
-from forward.model import Guess, ReferenceSolution, SolveError
+from forward.model import Guess, ReferenceSolution
 
 C1, D1 = 1e3, 2e3  # ν = 2/7
 CONTACT, DEPTH = 1e-3, 2e-5  # radius in contact and depth (m) of the closed forms
@@ -96,42 +99,6 @@ def large_strains() -> None:
         sys.stdout.flush()
 
 
-def random(count: int, seed: int = 1) -> None:
-    """Random indentations: what fails and why, and whether forces balance and tools keep out where nothing fails."""
-    sys.stdout.write(f"{count} random indentations (1,029 unknowns)\n")
-    rng = np.random.default_rng(seed)
-    tools: dict[str, dict[str, float]] = {"sphere": {"radius": 5e-3}, "flat": {"radius": 4e-3}, "cone": {"angle": 60.0}}
-    for shape, sizes in tools.items():
-        spec = quarter(SIDE, (3, 3, 3), 4.0, {"shape": shape, "depth": 2e-3, **sizes})
-        names = [f"loads.indenter.{name}" for name in ("x", "y", "depth", *sizes)] + ["material.C1", "material.D1"]
-        model = spec.build(MPI.COMM_SELF, tuple(names))
-        failures: dict[str, int] = {}
-        apart, into, seconds = [], [], time.process_time()
-        for _ in range(-(-count // len(tools))):
-            size = next(iter(sizes.values())) * rng.uniform(0.6, 1.4)
-            depth = rng.uniform(0.1e-3, 4e-3)
-            point = np.array(
-                [*rng.uniform(0, 12e-3, 2), depth, size, C1 * rng.uniform(0.5, 2), D1 * rng.uniform(0.5, 2)]
-            )
-            try:
-                found = model.solve(point)
-            except SolveError as error:
-                failures[error.reason] = failures.get(error.reason, 0) + 1
-                continue
-            apart.append(abs(found.outputs[0] / found.outputs[1] - 1))
-            model.visit(found)
-            into.append(model.equations.penetrations()["indenter"] / depth)
-        seconds = (time.process_time() - seconds) / (len(apart) + sum(failures.values()))
-        above = np.mean(np.array(into) > 1e-3)
-        sys.stdout.write(
-            f"{shape:6s} {len(apart)} answers, {seconds:.2f} s each; force and reaction apart by {max(apart):.1e},"
-            f" penetration over depth {np.median(into):.1e}, at most {max(into):.1e}, above 1e-3 in {above:.1%}\n"
-        )
-        for reason, times in failures.items():
-            sys.stdout.write(f"       {times} failed: {reason}\n")
-        sys.stdout.flush()
-
-
 def cost(draws: int = 8) -> None:
     """Predict and correct against Newton's method, from the same predictions and from zero."""
     sys.stdout.write(
@@ -169,10 +136,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks indentation")
     parser.add_argument("--cells", type=int, nargs="*", default=[6, 9, 12])
     parser.add_argument("--random", type=int, default=1000)
+    parser.add_argument("--kept", type=Path, default=Path("indentations.jsonl"))
     options = parser.parse_args(arguments or [])
     if options.cells:
         closed_forms(options.cells)
         large_strains()
     cost()
     if options.random:
-        random(options.random)
+        random(options.random, options.kept)

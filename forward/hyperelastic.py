@@ -23,7 +23,7 @@ from forward.bodies.inclusions import Inclusion
 from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
-from forward.fem.cost import Estimate, Times, times
+from forward.fem.cost import Estimate, Times, sum_of, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
@@ -40,6 +40,7 @@ from forward.terms.steps import Block, lists
 from forward.terms.term import Load
 
 CONTRAST = "contrast"
+INCREMENTS = 10  # of a load with friction
 
 
 class RegionNumbers(Settings):
@@ -216,8 +217,39 @@ class Hyperelastic(ModelSpec):
 
     @property
     def symmetric(self) -> bool:
-        """Whether the stiffness is symmetric: no load follows the body."""
+        """Whether the stiffness is symmetric: no load follows the body, and no tool rubs on it."""
         return all(load.symmetric for load in self.loads)
+
+    @property
+    def frictional(self) -> bool:
+        """Whether a tool rubs on it, so that its state depends on the states before."""
+        return any(load.contact and not load.symmetric for load in self.loads)
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths."""
+        smooth = [load.label for load in self.loads if load.contact and load.symmetric]
+        why = "a tool without friction has no such number, expected a friction above 0 in the load too"
+        return {f"loads.{label}.friction": why for label in smooth}
+
+    @property
+    def remembers(self) -> str:
+        """What makes its states depend on those before; empty if nothing does."""
+        return "friction" if self.frictional else ""
+
+    @property
+    def touched(self) -> bool:
+        """Whether tools touch it."""
+        return any(load.contact for load in self.loads)
+
+    @property
+    def increments(self) -> int:
+        """In how many increments the load grows where there is friction, in all; 1 without."""
+        return self._increments_in(1)
+
+    def _increments_in(self, steps: int) -> int:
+        stated = [getattr(load, "increments", None) or -(-INCREMENTS // steps) for load in self.loads if load.contact]
+        return steps * max(stated, default=1) if self.frictional else 1
 
     @property
     def contact_modulus(self) -> float:
@@ -283,7 +315,7 @@ class Hyperelastic(ModelSpec):
 
     def _of_followers(self) -> Iterator[Finding]:
         """What the stability test cannot see under loads that follow the body."""
-        followers = [load.label for load in self.loads if not load.symmetric]
+        followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
         if followers and not self.solver.accept_unstable:
             text = (
                 f"The load {', '.join(followers)} follows the body, so that its stiffness is not symmetric. "
@@ -380,9 +412,13 @@ class Hyperelastic(ModelSpec):
 
     def cost(self, factors: int = 2) -> Times:
         """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
-        predicted = self.solver.kind != "newton"
-        contact, mixed, symmetric = any(load.contact for load in self.loads), self.mixed, self.symmetric
-        return times(self.body, mixed=mixed, symmetric=symmetric, predicted=predicted, factors=factors, contact=contact)
+        predicted = self.solver.kind != "newton" and not self.frictional
+        contact, mixed, symmetric = self.touched, self.mixed, self.symmetric
+        one = times(self.body, mixed=mixed, symmetric=symmetric, predicted=predicted, factors=factors, contact=contact)
+        if self.increments == 1:
+            return one
+        whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
+        return replace(whole, setup=one.setup, bytes=one.bytes)
 
     def mesh_error_cost(self) -> Estimate:
         """Predict what an estimate of the error of the mesh takes, and what calibrates it."""
@@ -433,7 +469,8 @@ class Hyperelastic(ModelSpec):
         if self.unrefined:
             message = f"model.adapt: {UNREFINED}"
             raise ModelError(message)
-        return named("forward.fem.model:HyperelasticModel")(self, comm, parameters)
+        model = "history:HistoryModel" if self.frictional else "model:HyperelasticModel"
+        return named(f"forward.fem.{model}")(self, comm, parameters)
 
     @model_validator(mode="after")
     def _check(self) -> Hyperelastic:
@@ -485,6 +522,8 @@ class Hyperelastic(ModelSpec):
         yield from self._mistakes_of_formulation()
         yield from self._contradictions()
         yield from adaptive.mistakes(self)
+        if self.adapt is not None and self.frictional:
+            yield ("adapt",), "errors of the mesh are not estimated with friction, expected friction = 0", True
         yield from self._mistakes_of_support(any_unknown=bool(unknown))
 
     def _mistakes_of_support(self, *, any_unknown: bool) -> Iterator[Mistake]:

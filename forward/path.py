@@ -122,6 +122,12 @@ class Path(Hyperelastic):
         return {path: number for path, number in super().scalars.items() if path not in self.steps}
 
     @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths: they have steps."""
+        why = "has a value for each step, and what has steps cannot be random; expected one value, or another parameter"
+        return dict(super().unavailable) | dict.fromkeys(self.steps, why)
+
+    @property
     def returned(self) -> tuple[AtStep, ...]:
         """All outputs at the first step, then at the second, and so on."""
         return tuple(
@@ -148,9 +154,15 @@ class Path(Hyperelastic):
         ends = {path: (min(values), max(values)) for path, values in self.steps.items()}
         return tuple(dict.fromkeys((*super().findings, *too_far(self.body, ends))))
 
+    @property
+    def increments(self) -> int:
+        """In how many increments the load takes all steps where there is friction."""
+        return self._increments_in(self.count)
+
     def cost(self, factors: int = 1) -> Times:
         """Predict the cost of a solve of all steps, each from the one before and with a factor of its own."""
-        return sum_of([replace(super().cost(factors), contact=False)] * self.count)
+        found = super().cost(factors)
+        return found if self.frictional else sum_of([replace(found, contact=False)] * self.count)
 
     def mesh_error_cost(self) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all steps."""
@@ -178,7 +190,8 @@ class Path(Hyperelastic):
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms on a communicator; collective. As `Hyperelastic.build`."""
-        return named("forward.fem.path:PathModel")(self, comm, parameters)
+        model = "history:HistoryModel" if self.frictional else "path:PathModel"
+        return named(f"forward.fem.{model}")(self, comm, parameters)
 
     def _mistakes(self) -> Iterator[Mistake]:
         yield from super()._mistakes()

@@ -144,6 +144,21 @@ class ModelSpec(Settings):
         return ()
 
     @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Why some of its numbers cannot be parameters, by their paths."""
+        return {}
+
+    @property
+    def remembers(self) -> str:
+        """What makes its states depend on those before, so that errors of its mesh are not estimated; empty if none."""
+        return ""
+
+    @property
+    def touched(self) -> bool:
+        """Whether tools touch it: richer elements seldom follow the edge of the area in contact."""
+        return False
+
+    @property
     def adaptive(self) -> bool:
         """Whether it has a mesh that is refined before anything else is solved."""
         return False

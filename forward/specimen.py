@@ -94,6 +94,13 @@ class _Loaded(Hyperelastic):
 
     outputs: tuple[Output, ...] = ()
 
+    def _mistakes(self) -> Iterator[Mistake]:
+        yield from super()._mistakes()
+        for i, load in enumerate(self.loads):
+            if self.frictional and load.contact and not load.symmetric:
+                message = "a specimen has no friction yet, expected friction = 0 (or a model of kind 'path')"
+                yield ("loads", i, "friction"), message, getattr(load, "friction", None)
+
 
 class Specimen(ModelSpec):
     """A body that is tested in several load cases.

@@ -60,6 +60,10 @@ class Solved(Protocol):
         """This rank's part (U_local,) of the state."""
 
     @property
+    def stiffer(self) -> float:
+        """Factor on the stiffness of tools."""
+
+    @property
     def reference(self) -> ReferenceSolution | None:
         """The nearby solution whose factor was used to find it."""
 
@@ -83,6 +87,11 @@ class Moved:
     def state(self) -> FloatArray:
         """State (U_local,) of the solution itself."""
         return self.origin.state
+
+    @property
+    def stiffer(self) -> float:
+        """As of the solution."""
+        return self.origin.stiffer
 
     @property
     def reference(self) -> ReferenceSolution | None:
@@ -214,7 +223,7 @@ class Enriched:
         """Set parameters, loads and state to those of a solution of the body."""
         equations = self.equations
         if equations.latest.solution is not solution:
-            equations.set_parameters(solution.parameters)
+            equations.set_parameters(solution.parameters, solution.stiffer)
             equations.at_load(1.0)
             equations.set_state(self._state_of(solution))
             equations.latest.solution = solution

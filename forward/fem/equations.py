@@ -48,9 +48,12 @@ class Discretisation(Linearisation):
         self._stretch = self._small_stretch()
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
-    def set_parameters(self, parameters: FloatArray) -> None:
-        """Set the values (d,) of the parameters."""
+    def set_parameters(self, parameters: FloatArray, stiffer: float = 1.0) -> None:
+        """Set the values (d,) of the parameters, and a factor on the stiffness of tools."""
         self.latest.rounding = None
+        if float(self._stiffer.value) != stiffer:
+            self._stiffer.value = stiffer
+            self.latest.moved()
         if self.latest.parameters is not None and np.array_equal(parameters, self.latest.parameters):
             return
         self.latest.parameters = np.array(parameters, dtype=float)
@@ -93,6 +96,19 @@ class Discretisation(Linearisation):
         """How deep (m) the body enters each tool, by their labels, at the state that is set."""
         return {load.label: -ranks.smallest(self.comm, float(gaps().min(initial=0.0))) for load, gaps in self._gaps}
 
+    def touched(self) -> dict[str, FloatArray]:
+        """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices of the boundary of each tool; collective.
+
+        Those of all ranks, on every rank.
+        """
+        found = {}
+        places = spaces.node_coordinates(spaces.scalar_space(self.mesh, 1))
+        for load in (load for load in self.spec.loads if load.contact):
+            pressures = self.pressures_at_vertices(load.label)
+            rows = np.column_stack([places, pressures()])[pressures.areas > 0]
+            found[load.label] = np.concatenate(self.comm.allgather(rows))
+        return found
+
     @cached_property
     def _contact_forces(self) -> Callable[[], FloatArray] | None:
         """Forces (U_local,) of all tools, at the state that is set; None without tools."""
@@ -119,6 +135,12 @@ class Discretisation(Linearisation):
             self._constants[path].value = self._values[path]
         self.work = work
         return forces
+
+    def in_words(self, fraction: float) -> str:
+        """Say what a fraction of the load is in which tools move: how far they have; empty without them."""
+        tools = [(load.label, self.number(f"loads.{load.label}.depth")) for load in self.spec.loads if load.contact]
+        moved = [f"tool '{name}' at {1e3 * fraction * deep:.4g} of {1e3 * deep:.4g} mm" for name, deep in tools if deep]
+        return f" ({', '.join(moved)})" if moved else ""
 
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""

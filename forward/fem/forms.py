@@ -18,7 +18,9 @@ from forward.fem.layout import Layout
 from forward.fem.vertex_fields import VertexField
 from forward.hyperelastic import CONTRAST, Hyperelastic
 from forward.materials.material import energy_of, isochoric
-from forward.terms.term import Place, Term
+from forward.model import FloatArray
+from forward.terms import tools
+from forward.terms.term import Place, Since, Term
 
 
 class Forms:
@@ -78,11 +80,18 @@ class Forms:
         self.J = ufl.det(self.F)
         self._pressure = None if self.p is None else ufl.variable(self.p)
         self.stored_energy, self._potential, self.dilation = self._energies()
+        # Where there is friction: the state at the end of the increment before, and what has moved since.
+        self.increments = spec.increments
+        self._before = spaces.function(self.unknowns.whole) if spec.frictional else None
+        self._share = spaces.constant(self.mesh, 0.0)
+        self._shifts = {load.label: spaces.constant(self.mesh, np.zeros(3)) for load in spec.loads if load.contact}
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
         # Virtual works of those loads that act in contact, and what they are written with.
         self._tools: list[tuple[Any, Term, Place]] = []
         self._curved = spaces.constant(self.mesh, 1.0)  # 0 takes the curvature of tools out of the stiffness
         self._touched = spaces.constant(self.mesh, 1.0)  # 0 takes them away
+        self._stiffer = spaces.constant(self.mesh, 1.0)  # factor on their stiffness
+        self._rubbing: list[tuple[Any, Term, Place]] = []  # virtual works of friction
         self._loads = self._virtual_works()
         self.symmetric = spec.symmetric
 
@@ -212,8 +221,12 @@ class Forms:
             numbers = self._numbers(f"loads.{load.label}")
             if load.contact:
                 numbers |= {"depth": self._load * numbers["depth"]}
-                work = self._out_of_balance(load, numbers)
-                self._tools.append((work, load, self.place(numbers)))
+                work, at = self._out_of_balance(load, numbers), self.place(numbers, load.label)
+                rubbing = load.rubbing(at)
+                if rubbing is not None:
+                    self._rubbing.append((rubbing, load, at))
+                    work += rubbing
+                self._tools.append((work, load, at))
                 works.append(self._touched * work)
                 continue
             work = self._out_of_balance(load, {name: self._load * number for name, number in numbers.items()})
@@ -223,8 +236,12 @@ class Forms:
             works.append(work)
         return works
 
-    def place(self, numbers: dict[str, Any]) -> Place:
-        """Return what a load with these numbers is written with."""
+    def place(self, numbers: dict[str, Any], label: str = "") -> Place:
+        """Return what a load with these numbers, a tool of this name, is written with."""
+        since = None
+        if self._before is not None and label in self._shifts:
+            u, _ = self.unknowns.split(self._before)
+            since = Since(u, self._share, self._shifts[label], self.increments)
         return Place(
             u=self.u,
             v=self.test,
@@ -240,12 +257,14 @@ class Forms:
             ops=OPS,
             modulus=lambda: self.spec.contact_modulus,
             bounds=self.spec.body.bounds,
+            stiffer=self._stiffer,
+            since=since,
         )
 
     def tool(self, label: str) -> tuple[Any, Place]:
         """Return a tool among the loads by its label, and what it is written with."""
         (load,) = (load for load in self.spec.loads if load.label == label)
-        return load, self.place(self._numbers(f"loads.{label}"))
+        return load, self.place(self._numbers(f"loads.{label}"), label)
 
     @cached_property
     def _gaps(self) -> list[tuple[Term, assembly.FacetValues]]:
@@ -254,6 +273,22 @@ class Forms:
             (load, self.on_facets(load.touch(at, at.X + at.u).gap, load.on, load.degree))  # type: ignore[attr-defined]
             for _, load, at in self._tools
         ]
+
+    @cached_property
+    def contact_values(self) -> dict[str, assembly.FacetValues]:
+        """Pressures (Pa) and gaps (m), (n, 2), at the quadrature points under each tool."""
+        found = {}
+        for load in (load for load in self.spec.loads if load.contact):
+            _, at = self.tool(load.label)
+            touch = load.touch(at, at.X + at.u)  # type: ignore[attr-defined]
+            values = ufl.as_vector([tools.pressure(OPS, *touch), touch.gap])
+            found[load.label] = self.on_facets(values, load.on, load.degree)  # type: ignore[attr-defined]
+        return found
+
+    def pressures_at_vertices(self, label: str) -> PressuresAtVertices:
+        """Pressures under a tool, averaged by hat functions."""
+        load, at = self.tool(label)
+        return PressuresAtVertices(self, tools.pressure(OPS, *load.touch(at, at.X + at.u)), load.measure(at))
 
     def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
         at = self.place(numbers)
@@ -292,6 +327,26 @@ class Forms:
             left_out = load.straight_stiffness(at, along) - self.derivative(work, trial)
             exact += (1 - self._curved) * left_out
         return exact
+
+    def derivative_before(self, form: Any) -> assembly.VectorAssembler | None:
+        """Derivative of a functional by the state at the end of the increment before; None if it depends on none."""
+        if self._before is None or self._before not in form.coefficients():
+            return None
+        return self.vector(ufl.derivative(form, self._before, self._variation))
+
+    @cached_property
+    def _rubbing_action(self) -> assembly.VectorAssembler:
+        """Derivative of the imbalance by the state before, along `_along`."""
+        return self.vector(ufl.derivative(self._rubbing_work, self._before, self._along))
+
+    @cached_property
+    def _rubbing_transposed(self) -> assembly.VectorAssembler:
+        """Its transpose."""
+        return self.vector(ufl.derivative(ufl.action(self._rubbing_work, self._along), self._before, self._variation))
+
+    @property
+    def _rubbing_work(self) -> Any:
+        return sum((work for work, _, _ in self._rubbing[1:]), self._rubbing[0][0])
 
     @cached_property
     def _parameter_force(self) -> assembly.VectorAssembler | None:
@@ -340,6 +395,29 @@ class Forms:
     def gradients(self) -> assembly.NodalGradients:
         """Deformation gradients at the nodes, at the current state."""
         return assembly.NodalGradients(self.F, self.space, self.comm)
+
+
+class PressuresAtVertices:
+    """Contact pressures (n_vertices,) (Pa) at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
+
+    Attributes
+    ----------
+    density, measure
+        Pressure and its boundary, in UFL.
+    areas
+        ∫φ_i dS (n_vertices,) (m²); 0 away from the boundary.
+    """
+
+    def __init__(self, forms: Forms, density: Any, measure: Any) -> None:
+        self.density, self.measure = density, measure
+        hat = ufl.TestFunction(spaces.scalar_space(forms.mesh, 1))
+        self._forces = forms.by_vertices(density * hat * measure)
+        self.areas = forms.by_vertices(hat * measure)()
+
+    def __call__(self) -> FloatArray:
+        """Return them at the state that is set."""
+        on_it = self.areas > 0
+        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=on_it)
 
 
 def _linear(work: Any, numbers: Collection[Any]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -128,16 +128,25 @@ class Linearisation(Forms):
 
     @cached_property
     def _symmetric_stiffness(self) -> Any:
-        """The symmetric part of the stiffness, compiled; the stiffness itself if it is symmetric."""
+        """The symmetric part of the stiffness, compiled; the stiffness itself if it is symmetric.
+
+        That of friction is the stiffness at pressures that stay: what slides has no other resistance along the tool.
+        """
         if self.symmetric:
             return self._stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
         works = list(zip(self.spec.loads, self._loads, strict=True))
         rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
-        of_rest, of_followers = (
-            self.derivative(work, trial) for work in (rest, sum(work for load, work in works if not load.symmetric))
-        )
-        return self._bilinear(of_rest + 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers))
+        found = self.derivative(rest, trial)
+        for _, load, at in self._rubbing:
+            pressed = ufl.derivative(load.potential(at), self._state, self._variation)
+            found += self.derivative(ufl.algorithms.expand_derivatives(pressed), trial)
+            found += load.rubbing_stiffness(at, self.unknowns.split(trial)[0])
+        followers = [work for load, work in works if not load.symmetric and not load.contact]
+        if followers:
+            of_followers = self.derivative(sum(followers[1:], followers[0]), trial)
+            found += 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers)
+        return self._bilinear(found)
 
     def new_solver(self) -> LinearSolver:
         """Return a solver for the stiffness, with a matrix of its own."""
@@ -217,6 +226,32 @@ class Linearisation(Forms):
         y[:, self.fixed] = x[:, self.fixed]
         return y
 
+    def set_before(self, u: FloatArray, share: float, shifts: Mapping[str, FloatArray]) -> None:
+        """Set the state (U_local,) at the end of the increment before, and what tools have moved since.
+
+        Parameters
+        ----------
+        u
+            The state.
+        share
+            The part of the load by which it has grown.
+        shifts
+            What tools have moved besides (m), by their labels.
+        """
+        self.latest.moved()
+        self.unknowns.give(self._before, u)
+        self._share.value = share
+        for label, shift in shifts.items():
+            self._shifts[label].value = shift
+
+    def rubbed(self, w: FloatArray, *, transpose: bool = True) -> FloatArray:
+        """Product of the derivative of the imbalance by the state before (or its transpose) with w (U_local,)."""
+        if self._before is None:
+            return np.zeros(self.size)
+        self.unknowns.give(self._along, w)
+        self.work.residuals += 1
+        return (self._rubbing_transposed if transpose else self._rubbing_action)()
+
     def assembled_stiffness(self) -> Any:
         """A copy of the stiffness at the state that is set; the factor of `factorise` is lost."""
         self.latest.factorised = None
@@ -272,9 +307,9 @@ class Linearisation(Forms):
             right[i, self.fixed] = 0
             if path in self._movers:
                 w = np.zeros(right.shape[1])
-                w[self.fixed] = self._movers[path]
+                w[self.fixed] = float(self._load.value) * self._movers[path]
                 right[i] -= self.stiffness_times(w)
-                right[i, self.fixed] = self._movers[path]
+                right[i, self.fixed] = w[self.fixed]
         return right
 
     def right_sides_of_all(self) -> FloatArray:

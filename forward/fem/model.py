@@ -43,7 +43,7 @@ from forward.solvers.system import Found, Residual
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
 AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
 UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
-ENTERED = 5  # times the penetration that is aimed at
+STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
 ITERATIONS = 20  # for these derivatives, before the stiffness is factorised after all
 
 
@@ -81,8 +81,8 @@ class HyperelasticModel(OneByOne):
         self.equations = Discretisation(spec, comm, parameters)
         self.space = BodySpace(self.equations)
         self.differentiable = True
-        self._functionals = [output.functional(self.equations) for output in spec.outputs]
-        self._enrichments = _Enrichments(spec, self.equations, self._functionals)
+        self.functionals = [output.functional(self.equations) for output in spec.outputs]
+        self._enrichments = _Enrichments(spec, self.equations, self.functionals)
 
     @cached_property
     def reference(self) -> ReferenceFactor:
@@ -120,6 +120,30 @@ class HyperelasticModel(OneByOne):
         """
         equations = self.equations
         equations.latest.begin()
+        self.require_admissible(parameters)
+        guess = guess or Guess()
+        reference = guess.reference if self.spec.solver.kind != "newton" and guess.state is not None else None
+        screen = False
+        if reference is not None:
+            self.reference.prepare(reference)
+            screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
+        equations.work = Work()
+        equations.set_parameters(parameters)
+        way = None if reference is None else _Way(self, reference, parameters, screen=screen)
+        with equations.time_limit(self.spec.solver.solve_seconds):
+            found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
+            stiffer = 1.0
+            if found.converged and equations.contact:
+                found, stiffer = self._kept_out(found, parameters)
+        # If Newton's method had to take over, the reference is too far away for the derivatives too.
+        way = way if found.corrected else None
+        solution = FiniteElementSolution(self, parameters, found, equations.work, way, stiffer)
+        if found.stability >= Stability.COUNTED and equations.symmetric:
+            equations.latest.factorised = solution
+        return solution
+
+    def require_admissible(self, parameters: FloatArray) -> None:
+        """Refuse parameters (d,) for which there is no model."""
         for path, value in zip(self.parameters, parameters, strict=True):
             scalar = self._scalars.get(path)
             if scalar is not None:
@@ -132,46 +156,56 @@ class HyperelasticModel(OneByOne):
         objection = self._materials.objection(dict(zip(self.parameters, map(float, parameters), strict=True)))
         if objection is not None:
             raise InadmissibleError(objection)
-        guess = guess or Guess()
-        reference = guess.reference if self.spec.solver.kind != "newton" and guess.state is not None else None
-        screen = False
-        if reference is not None:
-            self.reference.prepare(reference)
-            screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
-        equations.work = Work()
-        equations.set_parameters(parameters)
-        way = None if reference is None else _Way(self, reference, parameters, screen=screen)
-        with equations.time_limit(self.spec.solver.solve_seconds):
-            found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
-        if found.converged and equations.contact:
-            self._check_contact(found)
-        # If Newton's method had to take over, the reference is too far away for the derivatives too.
-        solution = FiniteElementSolution(self, parameters, found, equations.work, way if found.corrected else None)
-        if found.stability >= Stability.COUNTED and equations.symmetric:
-            equations.latest.factorised = solution
-        return solution
 
-    def _check_contact(self, found: Found) -> None:
-        """Refuse an equilibrium in which the body enters a tool by far more than is aimed at."""
+    def _kept_out(self, found: Found, parameters: FloatArray) -> tuple[Found, float]:
+        """Raise the stiffness of the tools until the body enters none too far; return its factor too.
+
+        Steps of a factor, so that most samples of a study have the same stiffness and all their derivatives are exact.
+        """
+        equations, stiffer = self.equations, 1.0
+        self.refuse_sharp(found)
+        while said := self.entered(found):
+            if stiffer >= STIFFER**RAISES:
+                raise SolveError(self.too_far(said, stiffer), work=equations.work)
+            stiffer *= STIFFER
+            equations.set_parameters(parameters, stiffer)
+            found = solve(equations, self.spec.solver, np.zeros(equations.size), found.state)
+        return found, stiffer
+
+    def too_far(self, said: str, stiffer: float) -> str:
+        """Say why there is no answer where even stiffer tools are entered too far."""
+        return (
+            f"{said}, even with tools {stiffer:g} times as stiff as the depth and the constants as stated ask for: "
+            "pressures are far above these; state constants, or a depth, near those of the samples"
+        )
+
+    def entered(self, found: Found) -> str:
+        """Say how far the body enters a tool where that is more than is aimed at; empty where it is not."""
         equations = self.equations
         equations.set_state(found.state)
-        at_rest = equations.norm(found.state) <= AT_REST * self._extent
+        for label, penetration in equations.penetrations().items():
+            depth, aim = equations.number(f"loads.{label}.depth"), self._aims[label]
+            if depth > 0 and penetration > aim * depth:
+                share = penetration / depth
+                return f"the body enters the tool '{label}' by {share:.2g} of its depth, where {aim:g} is aimed at"
+        return ""
+
+    @cached_property
+    def _aims(self) -> dict[str, float]:
+        """Penetrations that are aimed at, relative to the depth, by the labels of the tools."""
+        return {load.label: load.penetration for load in self.spec.loads if load.contact}  # type: ignore[attr-defined]
+
+    def refuse_sharp(self, found: Found) -> None:
+        """Refuse a body that nothing has moved though a tool is inside it, between the points that are looked at."""
+        equations = self.equations
+        if equations.norm(found.state) > AT_REST * self._extent:
+            return
         for load in (load for load in self.spec.loads if load.contact):
-            label, penetration = load.label, equations.penetrations()[load.label]
-            numbers = {name: equations.number(f"loads.{label}.{name}") for name in load.scalars}
-            depth = numbers["depth"]
-            if depth > 0 and penetration > ENTERED * load.penetration * depth:  # type: ignore[attr-defined]
+            numbers = {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars}
+            if load.entered(self.spec.body, numbers) > UNSEEN * numbers["depth"]:  # type: ignore[attr-defined]
                 message = (
-                    f"the body enters the tool '{label}' by {penetration / depth:.2g} of its depth, where "
-                    f"{load.penetration:g} is aimed at: "  # type: ignore[attr-defined]
-                    "pressures are far above those of the depth and the constants as stated (large strains, a stiffer "
-                    f"body, a coarse mesh); lower loads.{label}.penetration"
-                )
-                raise SolveError(message, work=equations.work)
-            if at_rest and load.entered(self.spec.body, numbers) > UNSEEN * depth:  # type: ignore[attr-defined]
-                message = (
-                    f"the tool '{label}' enters the body between the points at which contact is looked for: it is too "
-                    "sharp, or its depth too small, for the mesh; refine the mesh there"
+                    f"the tool '{load.label}' enters the body between the points at which contact is looked for: it is "
+                    "too sharp, or its depth too small, for the mesh; refine the mesh there"
                 )
                 raise SolveError(message, work=equations.work)
 
@@ -179,7 +213,7 @@ class HyperelasticModel(OneByOne):
         """Set parameters and state to those of a solution, unless they are already."""
         equations = self.equations
         if equations.latest.solution is not solution:
-            equations.set_parameters(solution.parameters)
+            equations.set_parameters(solution.parameters, solution.stiffer)
             equations.at_load(1.0)
             equations.set_state(solution.state)
             equations.latest.solution = solution
@@ -284,8 +318,9 @@ class FiniteElementSolution:
         found: Found,
         work: Work,
         way: _Way | None,
+        stiffer: float = 1.0,
     ) -> None:
-        self._model = model
+        self._model, self.stiffer = model, stiffer
         self.parameters = np.array(parameters, dtype=float)
         self.state = np.array(found.state)
         self.residual, self.converged = found.residual, found.converged
@@ -296,8 +331,12 @@ class FiniteElementSolution:
         self.reference = None if way is None else way.reference
         self._rotation = None if way is None else way.rotation
         model.visit(self)
-        self.outputs = np.array([f.value() for f in model._functionals])
+        self.outputs = np.array([f.value() for f in model.functionals])
         self.outputs.flags.writeable = False
+
+    def touched(self) -> dict[str, FloatArray]:
+        """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices under each tool; collective."""
+        return self._model.visit(self).touched()
 
     @cached_property
     def _right_sides(self) -> FloatArray:
@@ -307,13 +346,13 @@ class FiniteElementSolution:
     def _gradients(self) -> FloatArray:
         """∂ψ/∂u (m, U_local)."""
         self._model.visit(self)
-        return np.array([f.gradient() for f in self._model._functionals])
+        return np.array([f.gradient() for f in self._model.functionals])
 
     @cached_property
     def _partials(self) -> FloatArray:
         """∂ψ/∂ω (m, d)."""
         self._model.visit(self)
-        return np.array([f.partial() for f in self._model._functionals])
+        return np.array([f.partial() for f in self._model.functionals])
 
     def solve(
         self,

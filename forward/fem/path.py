@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from forward.fem.calibration import FinerMesh
 from forward.fem.model import FiniteElementSolution, HyperelasticModel
-from forward.fem.space import gather_each, scatter_each
+from forward.fem.space import BodySpace, gather_each, scatter_each
 from forward.model import (
     FloatArray,
     Guess,
@@ -44,7 +44,7 @@ class PathModel(OneByOne):
         self.steps = tuple(whole.with_own_reference() for _ in range(spec.count))
         self.values = np.array(list(spec.steps.values())).T  # (steps, numbers that have steps)
         self.equations = whole.equations
-        self.space = PathSpace(self)
+        self.space = PathSpace(whole.space, spec.count, self.along)
         self.differentiable = True
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> PathSolution:
@@ -101,38 +101,46 @@ class PathModel(OneByOne):
         last, *others = np.split(rows, len(self.steps), axis=-1)
         return [*others, last]
 
-    def joined(self, parts: Sequence[FloatArray]) -> FloatArray:
-        """Join the states of the steps (…, U), the last first."""
-        *others, last = parts
-        return np.concatenate([last, *others], axis=-1)
-
     def along(self, direction: FloatArray) -> FloatArray:
         """Return a direction (…, d) of the parameters as one of the parameters of each step."""
         return np.concatenate([direction, np.zeros((*direction.shape[:-1], self.values.shape[1]))], axis=-1)
 
 
-class PathSpace:
-    """The `NodalSpace` of a path: a state begins with the displacements of the last step."""
+def joined(parts: Sequence[FloatArray]) -> FloatArray:
+    """Join the states of the steps (…, U), the last first."""
+    *others, last = parts
+    return np.concatenate([last, *others], axis=-1)
 
-    def __init__(self, model: PathModel) -> None:
-        self._model = model
-        one = model.steps[0].space
+
+class PathSpace:
+    """The `NodalSpace` of a path: a state begins with the displacements of the last step.
+
+    Parameters
+    ----------
+    one
+        That of the body.
+    count
+        Number of steps.
+    along
+        Extends parameters (…, d) of the path to those of the body.
+    """
+
+    def __init__(self, one: BodySpace, count: int, along: Callable[[FloatArray], FloatArray]) -> None:
         self.coordinates, self.displacements = one.coordinates, one.displacements
         self.cells, self.regions, self.variance_kept = one.cells, one.regions, one.variance_kept
-        self._one = one
+        self._one, self._all, self._along = one, [one] * count, along
 
     def gather(self, rows: FloatArray) -> FloatArray | None:
         """Collect (k, U_local) as (k, U) on the first rank."""
-        spaces = [step.space for step in self._model.steps]
-        return gather_each(spaces, np.split(rows, len(spaces), axis=1))
+        return gather_each(self._all, np.split(rows, len(self._all), axis=1))
 
     def scatter(self, rows: FloatArray) -> FloatArray:
         """Take this rank's part (k, U_local) of (k, U)."""
-        return scatter_each([step.space for step in self._model.steps], rows)
+        return scatter_each(self._all, rows)
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d); collective."""
-        return self._one.factors(self._model.along(points), degree)
+        return self._one.factors(self._along(points), degree)
 
 
 class PathSolution:
@@ -141,7 +149,7 @@ class PathSolution:
     def __init__(self, model: PathModel, parameters: FloatArray, steps: tuple[FiniteElementSolution, ...]) -> None:
         self._model, self.steps = model, steps
         self.parameters = np.array(parameters, dtype=float)
-        self.state = model.joined([step.state for step in steps])
+        self.state = joined([step.state for step in steps])
         self.outputs = np.concatenate([step.outputs for step in steps])
         for array in (self.parameters, self.state, self.outputs):
             array.flags.writeable = False
@@ -153,6 +161,10 @@ class PathSolution:
         """That of the step of which least is known; an instability that was missed counts more."""
         return Stability.of_all([step.stability for step in self.steps])
 
+    def touched(self) -> dict[str, FloatArray]:
+        """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
+        return self.steps[-1].touched()
+
     @property
     def work(self) -> Work:
         """Cost of all steps so far."""
@@ -161,7 +173,7 @@ class PathSolution:
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
         along = self._model.along(direction)
-        return self._model.joined([step.state_tangent(along) for step in self.steps])
+        return joined([step.state_tangent(along) for step in self.steps])
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
@@ -194,7 +206,7 @@ class PathSolution:
         far = max((one.nonlinearity for one in found), key=lambda far: (not np.isfinite(far), far))
         return MeshError(
             np.concatenate([one.outputs for one in found]),
-            self._model.joined([one.state for one in found]),
+            joined([one.state for one in found]),
             sum(one.energy for one in found),
             max(one.relative for one in found),
             Work.sum_of(one.work for one in found),

@@ -15,7 +15,8 @@ from forward.terms import tools
 class Force(Observable):
     """Force (N) with which a tool presses on the body: along its direction, or one component.
 
-    It is the derivative of the potential by the place of the tool, so that it balances the reactions exactly.
+    It is the derivative of the potential by the place of the tool, with the tractions of friction, so that it balances
+    the reactions exactly.
 
     Parameters
     ----------
@@ -44,4 +45,6 @@ class Force(Observable):
         x = ufl.variable(at.X + at.u)
         touch = tool.touch(at, x)
         density = tools.pressure(at.ops, *touch) * ufl.dot(ufl.diff(touch.gap, x), at.constant(along))
+        if tool.friction:
+            density -= ufl.dot(tool.rub(at).traction, at.constant(along))
         return Integral(equations, density, 1 / self.times, tool.measure(at))

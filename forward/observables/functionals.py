@@ -72,6 +72,15 @@ class Integral:
         """Return ∂ψ/∂u (U_local,)."""
         return np.asarray(self._gradient()) / self.size
 
+    @cached_property
+    def _gradient_before(self) -> Any:
+        return self._equations.derivative_before(self._density * self._measure)
+
+    def gradient_before(self) -> FloatArray:
+        """Return ∂ψ/∂u (U_local,) by the state at the end of the increment before."""
+        found = self._gradient_before
+        return np.zeros(self._equations.size) if found is None else np.asarray(found()) / self.size
+
     def partial(self) -> FloatArray:
         """Return ∂ψ/∂ω (d,)."""
         equations = self._equations

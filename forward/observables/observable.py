@@ -34,7 +34,8 @@ from forward.settings import Settings
 class Functional(Protocol):
     """An output ψ(u, ω) of a discretised body, at the state and the parameters that its equations are set to.
 
-    All methods are collective over the ranks of the equations.
+    All methods are collective over the ranks of the equations. Forces, which friction is part of, have a
+    `gradient_before` too: ∂ψ/∂u by the state at the end of the increment before.
     """
 
     def value(self) -> float:
@@ -107,6 +108,9 @@ class Equations(Protocol):
     def tool(self, label: str) -> tuple[Any, Any]:
         """Return a tool among the loads by its label, and the expressions with which it is written."""
 
+    def pressures_at_vertices(self, label: str) -> Any:
+        """Pressures under a tool, averaged by hat functions."""
+
     def stress_of(self, density: Any) -> Any:
         """P = ∂W/∂F (Pa) of an energy density."""
 
@@ -118,6 +122,12 @@ class Equations(Protocol):
 
     def unit_directions(self) -> Iterator[str]:
         """Set the direction to each unit vector of the numbers of the model in turn."""
+
+    def derivative_before(self, form: Any) -> Any | None:
+        """Compiled derivative of a functional by the state at the increment before; None if it depends on none."""
+
+    def rubbed(self, w: FloatArray) -> FloatArray:
+        """Derivative (U_local,) of wᵀF by the state at the increment before."""
 
     def scalar(self, form: Any) -> Any:
         """Compile a functional."""

@@ -50,6 +50,10 @@ class _Reaction:
     def gradient(self) -> FloatArray:
         return self._equations.stiffness_times(self.w, transpose=True)
 
+    def gradient_before(self) -> FloatArray:
+        """By the state at the end of the increment before, where friction depends on it."""
+        return self._equations.rubbed(self.w)
+
     def partial(self) -> FloatArray:
         equations = self._equations
         slopes = equations.field_products(self.w)

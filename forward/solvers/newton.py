@@ -51,7 +51,7 @@ def load_steps(
             if unstable:
                 smallest = max(smallest, LOCATED)
             if step < smallest or refusals > REFUSALS:
-                message = f"stopped at {100 * reached:.4g} % of the load: {stop}"
+                message = f"stopped at {100 * reached:.4g} % of the load{system.in_words(reached)}: {stop}"
                 jacobian = system.smallest_jacobian(found.state)
                 if jacobian < SQUEEZED:
                     message += f"; before, cells are already squeezed to J = {jacobian:.2g}"

@@ -55,6 +55,9 @@ class System(Protocol):
     def contact(self) -> bool:
         """Whether forces set in suddenly somewhere, so that whole Newton steps may go to and fro."""
 
+    def in_words(self, fraction: float) -> str:
+        """Say in parentheses what a fraction of the load is; empty if that says no more than the number."""
+
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
 

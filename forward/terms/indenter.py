@@ -4,7 +4,8 @@ The pressure is proportional to the penetration, p = ε s, by a stiffness ε tha
 stated, so that it is the same in all solutions of a study and on all meshes. With the contact modulus E* = E/(1 − ν²)
 the largest pressures over the depth δ are those of Hertz, (2/π) E*/√(R δ), for a sphere of radius R (and a cylinder);
 PEAK times the mean ones of a punch of radius a, (2/π) E*/a, and of Sneddon's cone, E*/(2 tan α δ); and E* over the
-extent of the body under a plane. ε is MARGIN times that over the penetration that is aimed at, relative to the depth.
+extent of the body under a plane. ε is MARGIN times that over the penetration that is aimed at, relative to the depth;
+where the body enters a tool further all the same, it is raised by steps of a factor (`forward.fem.model`).
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ SHARP = 1 / 20  # radius of an edge relative to that of the tool, and of a tip r
 SMOOTH = 0.1  # width over which contact sets in, relative to the penetration that is aimed at
 PEAK = 3.0  # largest pressure over the mean one under flat tools and cones
 MARGIN = 6.0  # stiffness beyond that for the aim: single points are pressed more, most of all on coarse meshes
+ROUND = 3.0  # times that for balls and cylinders, whose edges of the area in contact move from point to point
 AT_REST = 1e-3  # depth relative to the size that stands for a depth of zero
 BORNE = 1e-6  # width over which contact sets in on a plane that does not move, relative to the extent of the body
+STARTED = 1e-3  # part of the width that keeps the share of an increment in contact defined where nothing touches
 SLACK = 0.01  # of the depth, and of the inaccuracy of positions, that a tool may be inside the body at the start
 Shape = Literal["sphere", "flat", "cylinder", "cone", "plane"]
 NEEDED: dict[str, tuple[str, ...]] = {
@@ -81,12 +84,51 @@ class Touch(NamedTuple):
     width: Any
 
 
-class Indenter(Term):
-    """A rigid tool that touches a boundary and is moved by `depth` against it, without friction.
+class Rub(NamedTuple):
+    """How a tool rubs, in UFL.
 
-    The body may slide along it and leave it; points of the boundary resist penetration by a pressure that is
-    proportional to it, so stiff that they enter the tool by no more than a thousandth of the depth
-    (docs/theory/contact.md).
+    Attributes
+    ----------
+    limit
+        Largest traction μp (Pa).
+    slip
+        What the body has slid along the tool in the increment (m): a vector.
+    width
+        Slip (m) over which the traction grows.
+    normal
+        Unit normal of the tool.
+    """
+
+    limit: Any
+    slip: Any
+    width: Any
+    normal: Any
+
+    @property
+    def length(self) -> Any:
+        """√(|slip|² + width²) (m)."""
+        import ufl
+
+        return ufl.sqrt(ufl.dot(self.slip, self.slip) + self.width**2)
+
+    @property
+    def traction(self) -> Any:
+        """Traction (Pa) on the tool: μp along the slip, less where this is not large against its width."""
+        return self.limit * self.slip / self.length
+
+    def along(self, v: Any) -> Any:
+        """Return the part of a vector along the surface of the tool."""
+        import ufl
+
+        return v - ufl.dot(v, self.normal) * self.normal
+
+
+class Indenter(Term):
+    """A rigid tool that touches a boundary and is moved by `depth` against it.
+
+    The body may slide along it, with Coulomb's friction or without, and leave it; points of the boundary resist
+    penetration by a pressure that is proportional to it, so stiff that they enter the tool by no more than a thousandth
+    of the depth (docs/theory/contact.md).
 
     Parameters
     ----------
@@ -112,7 +154,9 @@ class Indenter(Term):
     tip
         Radius of curvature (m) of the tip of a cone; a twentieth of the depth by default.
     friction
-        Coefficient of friction; only 0 is possible so far.
+        Coefficient of friction. Where it is not 0, the load grows in increments, and can be random then.
+    increments
+        In how many increments it grows, or goes from one step of a path to the next; by default ten in all.
     penetration
         Largest penetration that is aimed at, relative to the depth.
     """
@@ -130,13 +174,16 @@ class Indenter(Term):
     axis: Direction | None = None
     angle: Annotated[float | None, Gt(0), Lt(90), Unit("°")] = None
     tip: Annotated[float | None, Gt(0), Unit("m")] = None
-    friction: Annotated[float, Ge(0)] = 0.0
+    friction: Annotated[float, Ge(0), Unit("1")] = 0.0
+    increments: Annotated[int | None, Ge(1)] = None
     penetration: Annotated[float, Gt(0), Le(0.1)] = 1e-3
 
     @property
     def scalars(self) -> dict[str, Scalar]:
         """Its numbers that can be parameters, the place among them."""
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
+        if not self.friction:  # then it is not in the forms
+            found.pop("friction")
         return found | {axis: Scalar(value, Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
 
     @property
@@ -152,6 +199,11 @@ class Indenter(Term):
                 return 2 / math.pi * depth * math.tan(math.radians(self.angle or 0))
             case _:
                 return math.sqrt((self.radius or 0) * depth)
+
+    @property
+    def along(self) -> Vector:
+        """Unit vector of its direction."""
+        return unit_vector(self.direction)
 
     def resistance(self, modulus: float, extent: float) -> Stiffness:
         """Return the stiffness that keeps the penetration small.
@@ -173,7 +225,7 @@ class Indenter(Term):
             case "cone":
                 slope = PEAK * modulus / (math.pi * self._moved.size)
             case _:
-                slope = 2 / math.pi * modulus / self._moved.size
+                slope = ROUND * 2 / math.pi * modulus / self._moved.size
         width = BORNE * extent if self.shape == "plane" and self.depth == 0 else SMOOTH * self.penetration * self._depth
         return Stiffness(MARGIN * slope / self.penetration, width)
 
@@ -238,19 +290,73 @@ class Indenter(Term):
         return tools.energy(at.ops, touch.gap, touch.stiffness, touch.width) * self.measure(at)
 
     def straight_stiffness(self, at: Place, direction: Any) -> Any:
-        """Stiffness ∫ φ''(g) (∇g·v)(∇g·w) dS, without that of ∇∇g."""
+        """Stiffness ∫ φ''(g) (∇g·v)(∇g·w) dS, without that of ∇∇g, and that of friction."""
         import ufl
 
         x = ufl.variable(at.X + at.u)
         touch = self.touch(at, x)
         normal = ufl.diff(touch.gap, x)
         product = ufl.dot(normal, at.v) * ufl.dot(normal, direction)
-        return touch.stiffness * tools.contact(at.ops, touch.gap, touch.width) * product * self.measure(at)
+        pressed = touch.stiffness * tools.contact(at.ops, touch.gap, touch.width) * product * self.measure(at)
+        return pressed + self.rubbing_stiffness(at, direction, secant=True) if self.friction else pressed
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether it has no friction, which has no potential."""
+        return not self.friction
+
+    def rubbing(self, at: Place) -> Any | None:
+        """Virtual work ∫ t·v dS of the tractions t of friction; None without friction."""
+        if not self.friction:
+            return None
+        import ufl
+
+        return ufl.dot(self.rub(at).traction, at.v) * self.measure(at)
+
+    def rubbing_stiffness(self, at: Place, direction: Any, *, secant: bool = False) -> Any:
+        """Stiffness of friction, at pressures and normals that stay.
+
+        Tangent, or the secant t/slip, which is the larger one: far from equilibrium slip is far from what it will be.
+        """
+        import ufl
+
+        rub = self.rub(at)
+        v, w = rub.along(at.v), rub.along(direction)
+        straight = ufl.dot(v, w) / rub.length
+        if not secant:
+            straight -= ufl.dot(rub.slip, v) * ufl.dot(rub.slip, w) / rub.length**3
+        return rub.limit * straight * self.measure(at)
+
+    def rub(self, at: Place) -> Rub:
+        """Return how the tool rubs on the body in this increment, in UFL.
+
+        Pressures are those of its end, and slip is what the body has moved along the tool since the increment before,
+        or since it touched the tool: an implicit Euler step. The width of the slip over which tractions grow is the
+        penetration that is aimed at over the number of increments, so that all that sticks creeps by no more than such
+        a penetration.
+        """
+        import ufl
+
+        assert at.since is not None
+        since, x = at.since, ufl.variable(at.X + at.u)
+        touch = self.touch(at, x)
+        slope = ufl.diff(touch.gap, x)
+        size = ufl.sqrt(ufl.dot(slope, slope) + tools.TINY**2)
+        normal = slope / size
+        moved = at.constant(unit_vector(self.direction)) * since.share * at.numbers["depth"] + since.shift
+        # What was not in contact before has slid since it touched only, by linear interpolation of the gap.
+        before = self.gap(at.ops, at.X + since.u + moved, at.numbers, at.constant)
+        entered, left = (tools.pressure(at.ops, gap, 1.0, touch.width) for gap in (touch.gap, before))
+        since_touched = entered / (entered + before + left + STARTED * touch.width)
+        apart = since_touched * (at.u - since.u - moved)
+        width = touch.width / (SMOOTH * since.count)
+        limit = at.numbers["friction"] * tools.pressure(at.ops, *touch) * size
+        return Rub(limit, apart - ufl.dot(apart, normal) * normal, width, normal)
 
     def touch(self, at: Place, x: Any) -> Touch:
         """Return how a place `x` of the deformed body is touched, in UFL."""
-        stiffness = self.resistance(at.modulus(), self.extent(at.bounds))
-        return Touch(self.gap(at.ops, x, at.numbers, at.constant), *map(at.constant, stiffness))
+        stiffness, width = map(at.constant, self.resistance(at.modulus(), self.extent(at.bounds)))
+        return Touch(self.gap(at.ops, x, at.numbers, at.constant), at.stiffer * stiffness, width)
 
     def measure(self, at: Place) -> Any:
         """Measure of its boundary, fine enough for the pressure under it."""
@@ -309,7 +415,8 @@ class Indenter(Term):
         sizes = ", ".join(f"{name} {numbers[name]}" for name in ("radius", "edge", "angle", "tip") if name in numbers)
         place = ", ".join(numbers[axis] for axis in "xyz")
         moved = f"moved by {numbers['depth']} along {listed(self.direction)} from ({place})"
-        return f"{self.label} on {self.on}: rigid {shape}{', ' + sizes if sizes else ''}; {moved}, without friction"
+        rubs = f"friction {numbers['friction']}" if self.friction else "without friction"
+        return f"{self.label} on {self.on}: rigid {shape}{', ' + sizes if sizes else ''}; {moved}, {rubs}"
 
     @model_validator(mode="after")
     def _check(self) -> Indenter:
@@ -326,8 +433,8 @@ class Indenter(Term):
                 yield f"a tool with shape = '{self.shape}' needs {name}"
             if given and name not in (*needed, *allowed):
                 yield f"a tool with shape = '{self.shape}' has no {name}"
-        if self.friction:
-            yield f"contact with friction ({self.friction:g}) is not there yet, expected friction = 0"
+        if self.increments is not None and not self.friction:
+            yield "increments are there for friction, expected friction > 0 (or none of them)"
         if self.edge is not None and self.radius is not None and self.edge > self.radius:
             yield f"its edge is rounder ({self.edge:g} m) than the tool (radius {self.radius:g} m)"
         if self.axis is not None and np.linalg.norm(np.cross(self.axis, self.direction)) < 1e-9 * np.linalg.norm(

@@ -34,6 +34,28 @@ from forward.words import settings
 
 
 @dataclass(frozen=True)
+class Since:
+    """The increment of a load in which a body is, where friction depends on what it did: UFL expressions.
+
+    Attributes
+    ----------
+    u
+        Displacement (m) at the end of the increment before.
+    share
+        The part of the load by which it has grown since.
+    shift
+        What a tool has moved since (m) besides: where its place or depth is a number with steps.
+    count
+        How many increments there are.
+    """
+
+    u: Any
+    share: Any
+    shift: Any
+    count: int
+
+
+@dataclass(frozen=True)
 class Place:
     """Where a load acts: the UFL expressions with which its potential or virtual work is written.
 
@@ -65,6 +87,10 @@ class Place:
         Returns E/(1 − ν²) (Pa) of the stiffest material of the body, with the constants as they are stated.
     bounds
         Smallest and largest coordinates (m) of the undeformed body along each axis.
+    stiffer
+        Factor on the stiffness of tools, which is raised where the body enters them too far.
+    since
+        The increment of the load; None where nothing depends on it.
     """
 
     u: Any
@@ -81,6 +107,8 @@ class Place:
     ops: Any
     modulus: Callable[[], float]
     bounds: tuple[tuple[float, float], ...]
+    stiffer: Any
+    since: Since | None = None
 
 
 class Term(Named):
@@ -101,6 +129,17 @@ class Term(Named):
 
         Only of loads that act in contact: far from equilibrium, pressures are so large that this curvature makes the
         stiffness indefinite.
+        """
+        raise NotImplementedError
+
+    def rubbing(self, at: Place) -> Any | None:
+        """Return the virtual work of friction besides its potential, as a form of UFL; None without friction."""
+        return None
+
+    def rubbing_stiffness(self, at: Place, direction: Any) -> Any:
+        """Return the symmetric stiffness of friction along a direction, at pressures and normals that stay.
+
+        Only of loads with friction; by it stability is judged.
         """
         raise NotImplementedError
 

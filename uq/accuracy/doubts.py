@@ -37,11 +37,14 @@ class Told(NamedTuple):
         Outputs whose error of the mesh is not estimated at all.
     tolerance
         Of its solver, relative.
+    contact
+        Whether tools touch the body.
     """
 
     units: Mapping[str, str]
     never: frozenset[str] = frozenset()
     tolerance: float = 0.0
+    contact: bool = False
 
 
 def doubts(dataset: xr.Dataset, estimates: Evaluations, told: Told) -> Iterator[Finding]:
@@ -127,7 +130,15 @@ def _of_estimates(names: Names, estimates: Evaluations, told: Told, counts: NDAr
     if ok < n:
         reason = estimates.failures[0].reason
         rest = "the others are used" if ok > 1 else "so that nothing is known of the error of the mesh"
-        yield Finding("warning", f"{n - ok} of {n} estimates of the error of the mesh failed ({reason}); {rest}.")
+        if told.contact:
+            said = (
+                f"{n - ok} of {n} estimates of the error of the mesh failed, as they mostly do in contact, where the "
+                f"edge of the area that is touched moves; {rest}. Compare with a finer mesh, and set "
+                "accuracy.mesh_error = false to save their time."
+            )
+        else:
+            said = f"{n - ok} of {n} estimates of the error of the mesh failed ({reason}); {rest}."
+        yield Finding("warning", said)
     if ok < 2:
         return
     assert estimates.mesh_errors is not None

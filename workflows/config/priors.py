@@ -71,15 +71,20 @@ def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mist
 
 
 def mistakes_of_parameters(
-    scalars: Mapping[str, Scalar], parameters: Mapping[str, Distribution], constants: Collection[str] = ()
+    scalars: Mapping[str, Scalar],
+    parameters: Mapping[str, Distribution],
+    constants: Collection[str] = (),
+    unavailable: Mapping[str, str] | None = None,
 ) -> Iterator[Mistake]:
     """Find parameters that are not numbers of a model, or that allow values for which it is impossible.
 
-    Constants of materials are left out: they are judged together, by `workflows.config.priors`.
+    Constants of materials are left out: they are judged together, by `workflows.config.priors`. Numbers that are
+    `unavailable` come with the reason.
     """
     for path, distribution in parameters.items():
         if path not in scalars:
-            yield ("parameters",), f"not a number of the model; {nearest(path, tuple(scalars))}", path
+            why = (unavailable or {}).get(path) or f"not a number of the model; {nearest(path, tuple(scalars))}"
+            yield ("parameters",), why, path
             continue
         if path in constants:
             continue
@@ -113,7 +118,8 @@ def mistakes_of_priors(
 ) -> Iterator[Mistake]:
     """Find priors, by paths, that do not fit a model or each other; `inputs` makes the random parameters of them."""
     materials = spec.materials(parameters)
-    yield from mistakes_of_parameters(spec.scalars, parameters, () if materials is None else materials.names)
+    constants = () if materials is None else materials.names
+    yield from mistakes_of_parameters(spec.scalars, parameters, constants, spec.unavailable)
     try:
         found = inputs()
     except ValueError as error:

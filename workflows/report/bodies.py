@@ -15,6 +15,8 @@ import numpy as np
 
 from forward.model import FloatArray
 from workflows.results.directory import body_grid, mesh_grid
+from workflows.results.tools import surface as tool_surface
+from workflows.results.tools import tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,6 +25,7 @@ SUBDIVISION = 3  # number of times that a face of high order is halved
 DRAWING_SECONDS = 600  # time limit for drawing all bodies
 FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
 COLUMNS, ROWS = 3, 3  # of names of colours
+TOOL = "#6b7480"
 STILL = "#c9ced4"  # of nodes that do not move
 BY_NUMBER = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
 
@@ -96,6 +99,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         nan_color=STILL,
     )
     plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
+    for tool in () if undeformed else tools_of(dataset):
+        plotter.add_mesh(tool_surface(tool, grid.points), color=TOOL, opacity=0.45, smooth_shading=True)
     _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]), _up(dataset))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)

@@ -150,6 +150,7 @@ SECTIONS = Kinds(
         "distribution": f"{_HERE}.distribution:Distribution",
         "density": f"{_HERE}.density:Density",
         "body": f"{_HERE}.body:Body",
+        "contact": f"{_HERE}.contact:Contact",
         "local-sensitivities": f"{_HERE}.local_sensitivities:LocalSensitivities",
         "local-field": f"{_HERE}.local_field:LocalField",
         "evidences": f"{_HERE}.evidences:Evidences",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from forward.machine import write_whole
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
+from workflows.results.tools import surface, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -144,7 +145,7 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
 
     Displacements are in one file; what each data set says about the interior is in one file each, its
     points with what was measured and predicted there in another; a mesh that was
-    refined is in one with what its cells add to errors.
+    refined is in one with what its cells add to errors; every tool is in one, at its depth.
     """
     grids: dict[str, Callable[[], Any]] = {}
     if "cell_nodes" in dataset and "data_set" in dataset.dims:
@@ -158,11 +159,18 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     path = None
     if "mesh_indicator" in dataset:
         grids = {"mesh": partial(mesh_grid, dataset)} | grids
+    if "cell_nodes" in dataset:
+        points = dataset["node_position"].to_numpy()
+        grids = {f"tool-{tool.label}": partial(_tool_grid, tool, points) for tool in tools_of(dataset)} | grids
     for name, grid in grids.items():
         directory.mkdir(exist_ok=True)
         path = directory / f"{name}.vtu"
         write_whole(path, _vtu(grid()))
     return path
+
+
+def _tool_grid(tool: Any, points: NDArray[np.float64]) -> Any:
+    return surface(tool, points).cast_to_unstructured_grid()
 
 
 def _vtu(grid: Any) -> bytes:

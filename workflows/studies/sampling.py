@@ -151,7 +151,7 @@ class Study(StudyKind):
     @property
     def _estimating(self) -> bool:
         theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
-        return self.accuracy.mesh_error and self.spec.meshed and not theirs
+        return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.remembers
 
     @cached_property
     def _too_large(self) -> float | None:
@@ -194,6 +194,11 @@ class Study(StudyKind):
                 "warning",
                 f"The error of the mesh is not estimated: that would take about {self._too_large:,.0f} MiB for each "
                 f"group of ranks, more than accuracy.memory = {self.accuracy.memory:,.0f} MiB.",
+            )
+        if self.accuracy.mesh_error and self.spec.meshed and self.spec.remembers:
+            yield Finding(
+                "note",
+                f"The error of the mesh is not estimated with {self.spec.remembers}: compare with a finer mesh.",
             )
 
     @property
@@ -362,6 +367,6 @@ class Study(StudyKind):
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
         materials = spec.materials(self.parameters)
         constants = () if materials is None else materials.names
-        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants)
+        yield from mistakes_of_parameters(spec.scalars, self.parameters, constants, spec.unavailable)
         if self.draws is not None:
             yield from mistakes_of_draws(spec.scalars, self.draws, constants)

@@ -21,6 +21,7 @@ from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
+from workflows.studies.contact import touched, with_contact
 from workflows.studies.findings_solves import measured
 from workflows.studies.job import Job, MethodJob
 
@@ -74,12 +75,13 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     regions = model.space.regions()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
     locking = measured(study, model) if ensemble.index == 0 else []
+    pressed = touched(study, model) if ensemble.index == 0 else {}
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         settled(found, units)
         add(found, *locking)
-        found = with_regions(found, model.spec.body.regions, regions)
+        found = with_contact(with_regions(found, model.spec.body.regions, regions), pressed)
         return with_random_fields(found, factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
@@ -139,7 +141,8 @@ def told_of(study: Study) -> Told:
 
     outputs = study.spec.returned
     never = frozenset(one.name for one in outputs if not getattr(one, "estimable", True))
-    return Told({one.name: one.unit for one in outputs}, never, study.spec.solver_tolerance or 0.0)
+    units = {one.name: one.unit for one in outputs}
+    return Told(units, never, study.spec.solver_tolerance or 0.0, contact=study.spec.touched)
 
 
 def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:

@@ -59,7 +59,7 @@ def test_an_inclusion_that_covers_the_body_multiplies_its_energy(model, homogene
     model.equations.set_state(plain.state)
     names = model.outputs
     for name in ("energy", "stress"):
-        found = model._functionals[names.index(name)].value()
+        found = model.functionals[names.index(name)].value()
         assert found == pytest.approx(contrast * plain.outputs[names.index(name)], rel=1e-12)
 
 

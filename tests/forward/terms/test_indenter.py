@@ -183,14 +183,36 @@ def test_derivatives(shape):
 
 
 @pytest.mark.fem
-def test_what_enters_the_tool_too_far_is_refused():
-    """The tool is made for the constants as stated; a body that is much stiffer enters it."""
+def test_tools_are_made_stiffer_until_the_body_stays_out():
+    """A tool is made for the constants as stated; a body that is much stiffer would enter it."""
     spec = body(tool())
     model = spec.build(MPI.COMM_SELF, ("material.C1", "material.D1"))
-    model.solve(np.array([C1, D1]))
+    assert model.solve(np.array([C1, D1])).stiffer == 1
     assert model.equations.penetrations()["indenter"] < 1e-3 * 1e-3
+    stiff = model.solve(50 * np.array([C1, D1]))
+    assert (
+        stiff.stiffer > 1
+    )  # the tool was made stiffer for this sample, and its derivatives are those of what it gives
+    model.visit(stiff)
+    assert model.equations.penetrations()["indenter"] < 1e-3 * 1e-3
+    step = 50 * np.array([1e-3 * C1, 0])
+    ends = [model.solve(50 * np.array([C1, D1]) + sign * step).outputs[0] for sign in (1, -1)]
+    assert stiff.tangent(step)[0] == pytest.approx((ends[0] - ends[1]) / 2, rel=1e-4)
     with pytest.raises(SolveError, match=r"the body enters the tool 'indenter' by 0\.\d+ of its depth, where 0.001"):
-        model.solve(50 * np.array([C1, D1]))
+        model.solve(1e4 * np.array([C1, D1]))
+
+
+@pytest.mark.fem
+def test_contact_is_complementary():
+    """At quadrature points: p ≥ 0, no gap below the aim, and p g = 0 up to it."""
+    model = body(tool(at=(4e-3, 3e-3, SIDE), depth=2e-3)).build(MPI.COMM_SELF, ())
+    model.visit(model.solve(np.zeros(0)))
+    pressure, gap = model.equations.contact_values["indenter"]().T
+    assert (pressure >= 0).all()
+    assert pressure.max() > 100
+    assert gap.min() > -1e-3 * 2e-3
+    assert np.abs(pressure * gap).max() < 1e-3 * 2e-3 * pressure.max()
+    assert (pressure[gap > 1e-4 * 2e-3] == 0).all()
 
 
 @pytest.mark.fem
@@ -233,7 +255,7 @@ def test_two_tools_squeeze_a_body_between_them():
         ({"depth": 0.03}, r"as deep as the body is thick there \(0.02 m\)"),
         ({"depth": -1e-3}, "greater than or equal to 0"),
         ({"friction": -0.1}, "greater than or equal to 0"),
-        ({"friction": 0.2}, "friction .0.2. is not there yet, expected friction = 0"),
+        ({"increments": 4}, "increments are there for friction"),
         ({"radius": None}, "a tool with shape = 'sphere' needs radius"),
         ({"edge": 1e-3}, "a tool with shape = 'sphere' has no edge"),
         ({"shape": "cylinder", "axis": (0.0, 0.0, 2.0)}, "lies along its direction"),

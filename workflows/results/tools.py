@@ -1,0 +1,70 @@
+"""Rigid tools as surfaces, from the study that results carry: at their depth, with the mean of what is random."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from forward.model import FloatArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.terms.indenter import Indenter
+
+POINTS = 96  # of the lattice on which distances are computed, along each axis
+SHOWN = 0.35  # part of the body's extent that a tool without end is drawn over, to each side
+
+
+def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
+    """Return the tools of a study, along a path at the last step."""
+    model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
+    loads = [load for load in model.get("loads", ()) if isinstance(load, Mapping) and load.get("kind") == "indenter"]
+    if not loads:
+        return
+    from forward.terms.indenter import Indenter
+
+    means: dict[str, float] = {}
+    if "parameter_mean" in dataset:
+        names = [str(name) for name in dataset["parameter"].values]
+        means = dict(zip(names, map(float, dataset["parameter_mean"].values), strict=True))
+    means |= {path: values[-1] for path, values in model.get("steps", {}).items()}
+    for load in loads:
+        block = {key: value[-1] if key == "depth" and isinstance(value, list) else value for key, value in load.items()}
+        label = Indenter.model_construct(**block).label
+        own = {path.rpartition(".")[2]: v for path, v in means.items() if path.rpartition(".")[0] == f"loads.{label}"}
+        block["at"] = [own.pop(axis, value) for axis, value in zip("xyz", block["at"], strict=True)]
+        yield Indenter.model_validate(block | own)
+
+
+def surface(tool: Indenter, points: FloatArray) -> Any:
+    """Return the surface of a tool at its depth, as a pyvista mesh: where the distance from it is zero.
+
+    Parameters
+    ----------
+    points
+        Points (n, 3) of the body (m); tools without end are drawn as far as it reaches.
+    """
+    import pyvista
+
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent, d = float((high - low).max()), np.array(tool.along)
+    tip = np.array(tool.at) + tool.depth * d
+    if tool.shape == "plane":
+        middle = tip + (np.eye(3) - np.outer(d, d)) @ ((low + high) / 2 - tip)
+        return pyvista.Plane(center=middle, direction=d, i_size=1.1 * extent, j_size=1.1 * extent)
+    half = min(1.2 * (tool.radius or np.inf), SHOWN * extent)
+    ahead = 0.05 * half
+    lengths = np.full(3, half)
+    if tool.axis is not None:  # it is longer than the body
+        along = np.abs(tool.axis) / np.linalg.norm(tool.axis)
+        lengths = np.maximum(lengths, along * (extent / 2 + 0.2 * half))
+        tip = tip + np.outer(tool.axis, tool.axis) @ ((low + high) / 2 - tip) / np.dot(tool.axis, tool.axis)
+    centre = tip - (half - ahead) * d
+    spacing = 2 * lengths / (POINTS - 1)
+    lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(centre - lengths))
+    lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
+    return lattice.contour([0.0], scalars="gap")
