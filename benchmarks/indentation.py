@@ -1,6 +1,7 @@
 """Rigid tools: closed forms on a large block, large strains against another code, random indentations, and their cost.
 
-Options: ``--cells 6 8`` for the meshes of the closed forms (none leaves these tables out), ``--random 1000`` for the
+Options: ``--meshes 40,0.6,6 …`` for the closed forms, side and first edge over the radius in contact and cells along an
+edge (none leaves these tables out), ``--random 1000`` for the
 number of random indentations, ``--kept FILE`` for those that are finished: the same command goes on with them.
 """
 
@@ -15,14 +16,18 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from scipy.integrate import trapezoid
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
 
 from benchmarks.axisymmetric import indented
 from benchmarks.indentations import random
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, ReferenceSolution
+from forward.terms.indenter import Indenter
 
 C1, D1 = 1e3, 2e3  # ν = 2/7
-CONTACT, DEPTH = 1e-3, 2e-5  # radius in contact and depth (m) of the closed forms
+CONTACT, DEPTH = 1e-3, 2e-6  # radius in contact and depth (m) of the closed forms
 SIDE = 20e-3
 PATHS = {
     "material": ("material.C1",),
@@ -60,30 +65,98 @@ def quarter(
     return Hyperelastic.model_validate(blocks | more)
 
 
-def closed_forms(cells: list[int]) -> None:
-    """Forces over those of Hertz, Boussinesq's punch and Sneddon's cone on a half-space."""
+def half_space(tool: Indenter, modulus: float) -> float:
+    """Force (N) on a half-space by a tool with its own profile f(r): L. A. Galin; I. N. Sneddon, 1965.
+
+    δ = ∫ f'(r) a/√(a² − r²) dr and F = 2E* ∫ f'(r) r²/√(a² − r²) dr over the radius a of the area in contact, so what
+    differs from Hertz's sphere, a punch and a cone (rounded edges and tips) is no error here.
+    """
+    end = min(0.999999 * (tool.radius or 1.0), 20 * CONTACT)
+    r = end * np.sin(np.linspace(0, np.pi / 2, 4001))
+    heights = np.array([_height(tool, one) for one in r])
+    slope = PchipInterpolator(r, heights).derivative()
+    angles = np.linspace(0, np.pi / 2, 20001)
+
+    def of(a: float) -> tuple[float, float]:
+        slopes = slope(a * np.sin(angles))
+        return a * trapezoid(slopes, angles), 2 * modulus * a**2 * trapezoid(slopes * np.sin(angles) ** 2, angles)
+
+    radius = brentq(lambda a: of(a)[0] - tool.depth, 1e-3 * CONTACT, end)
+    return float(of(radius)[1])
+
+
+def _height(tool: Indenter, r: float) -> float:
+    """How far (m) the surface of a tool lies behind its tip, at a distance r (m) from its axis."""
+    d = np.array(tool.along)
+    beside = np.array(tool.at) + tool.depth * d + np.array([r, 0.0, 0.0])
+    return float(brentq(lambda t: float(tool.gaps((beside - t * d)[None])[0]), -1e-6, 1e-1, xtol=1e-15))
+
+
+def closed_forms(meshes: list[str]) -> None:
+    """Forces over those on a half-space, on blocks of several sizes and meshes, and what they tend to."""
     angle = math.atan(math.pi / 2 * CONTACT / DEPTH)
-    tools: dict[str, tuple[dict[str, Any], float]] = {
-        "sphere": ({"radius": CONTACT**2 / DEPTH}, 4 / 3 * CONTACT * DEPTH),
-        "flat": ({"radius": CONTACT, "edge": CONTACT / 20}, 2 * CONTACT * DEPTH),
-        "cone": ({"angle": math.degrees(angle), "tip": CONTACT / 20}, 2 / math.pi * math.tan(angle) * DEPTH**2),
+    tools: dict[str, dict[str, Any]] = {
+        "sphere": {"radius": CONTACT**2 / DEPTH},
+        "flat": {"radius": CONTACT, "edge": CONTACT / 20},
+        "cone": {"angle": math.degrees(angle), "tip": CONTACT / 20},
     }
-    sys.stdout.write("Force over the closed form (quarter of a block of 80 contact radii), penetration over depth\n")
-    for shape, (numbers, over_modulus) in tools.items():
-        for n in cells:
-            lattice = (n, n, max(3 * n // 4, 1))
-            spec = quarter(80 * CONTACT, lattice, 160.0, {"shape": shape, "depth": DEPTH, **numbers})
+    sys.stdout.write(
+        "Force over that on a half-space; quarter of a block: side and first edge over the radius in contact, cells\n"
+    )
+    for shape, numbers in tools.items():
+        ratios = {}
+        for mesh in meshes:
+            side, first, n = (float(part) for part in mesh.split(","))
+            growth = brentq(lambda g: (g**n - 1) / (g - 1) - side / first, 1.01, 10.0)  # noqa: B023 - used at once
+            grading = growth ** (n - 1)
+            spec = quarter(side * CONTACT, (int(n),) * 3, grading, {"shape": shape, "depth": DEPTH, **numbers})
+            tool: Any = spec.loads[0]
             model = spec.build(MPI.COMM_SELF, ())
             start = time.process_time()
             found = model.solve(np.zeros(0))
             seconds = time.process_time() - start
-            ratio = 4 * found.outputs[0] / (over_modulus * spec.contact_modulus)
+            ratios[side, first] = ratio = 4 * found.outputs[0] / half_space(tool, spec.contact_modulus)
             into = model.equations.penetrations()["indenter"] / DEPTH
-            line = (
-                f"{shape:6s} {spec.unknowns:7,d} unknowns  {ratio:.4f}  {into:.1e}  {found.work.factorisations} factors"
+            sys.stdout.write(
+                f"{shape:6s} side {side:3g}, first edge {first:4g}, {spec.unknowns:7,d} unknowns: {ratio:.4f}; "
+                f"penetration {into:.1e} of the depth; {found.work.factorisations} factors, {seconds:.1f} s\n"
             )
-            sys.stdout.write(f"{line}  {seconds:.1f} s\n")
             sys.stdout.flush()
+        _tend_to(shape, ratios)
+
+
+def _tend_to(shape: str, ratios: dict[tuple[float, float], float]) -> None:
+    """Print what blocks and cells do: errors of blocks fall with 1/side, those of meshes with the first edge."""
+    pairs = [(p, q) for p in ratios for q in ratios if p[1] == q[1] and p[0] < q[0]]
+    smallest = min(side for side, _ in ratios)
+    meshes = sorted((edge, ratio) for (side, edge), ratio in ratios.items() if side == smallest)
+    if not pairs or len(meshes) < 2:
+        return
+    p, q = pairs[-1]
+    of_block = (ratios[p] - ratios[q]) / (1 / p[0] - 1 / q[0]) / smallest
+    (fine, there), (coarse, here) = meshes[:2]
+    limits = [there - (here - there) / ((coarse / fine) ** order - 1) - of_block for order in (2, 1)]
+    of_mesh = there - of_block - limits[0]
+    sys.stdout.write(
+        f"{shape:6s} the block of {smallest:g} adds {of_block:+.4f}, the finest mesh on it {of_mesh:+.4f}; "
+        f"without both {limits[0]:.4f} (errors of the mesh of order 2) or {limits[1]:.4f} (of order 1)\n"
+    )
+
+
+def rough(cells: int = 5) -> None:
+    """A punch that does not slip, over one without friction: (1 − ν) ln(3 − 4ν)/(1 − 2ν) on a half-space."""
+    sys.stdout.write("Rough over smooth flat punch: Poisson's ratio, computed, V. I. Mossakovski 1954, CPU time (s)\n")
+    for nu in (0.0, 0.2, 2 / 7):
+        material = {"kind": "neo-hookean", "C1": C1, "D1": 2 * C1 * (1 + nu) / (3 * (1 - 2 * nu))}
+        tool = {"shape": "flat", "radius": CONTACT, "edge": CONTACT / 20, "depth": 5 * DEPTH}
+        start, forces = time.process_time(), []
+        for friction in ({"friction": 10.0, "increments": 2}, {}):
+            spec = quarter(40 * CONTACT, (cells,) * 3, 80.0, tool | friction, material=material)
+            forces.append(spec.build(MPI.COMM_SELF, ()).solve(np.zeros(0)).outputs[0])
+        known = (1 - nu) * math.log(3 - 4 * nu) / (1 - 2 * nu)
+        seconds = time.process_time() - start
+        sys.stdout.write(f"{nu:.3f}  {forces[0] / forces[1]:.4f}  {known:.4f}  {seconds:.1f} s\n")
+        sys.stdout.flush()
 
 
 def large_strains() -> None:
@@ -134,12 +207,13 @@ def cost(draws: int = 8) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks indentation")
-    parser.add_argument("--cells", type=int, nargs="*", default=[6, 9, 12])
+    parser.add_argument("--meshes", nargs="*", default=["40,0.6,6", "40,0.4,8", "40,0.27,10", "80,0.4,9"])
     parser.add_argument("--random", type=int, default=1000)
     parser.add_argument("--kept", type=Path, default=Path("indentations.jsonl"))
     options = parser.parse_args(arguments or [])
-    if options.cells:
-        closed_forms(options.cells)
+    if options.meshes:
+        closed_forms(options.meshes)
+        rough()
         large_strains()
     cost()
     if options.random:

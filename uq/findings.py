@@ -30,6 +30,28 @@ def withdraw(dataset: xr.Dataset, names: Collection[str]) -> None:
     )
 
 
+def once_for_steps(dataset: xr.Dataset) -> None:
+    """Say once what findings say of one output at several steps of a path, in the words of the first of them."""
+    places = {
+        str(name): (str(of), int(step))
+        for name, of, step in zip(*(dataset[key].values for key in ("output", "output_of", "step")), strict=True)
+    }
+    known = re.compile(rf"(?<![\w.])({'|'.join(map(re.escape, places))})(?!\d|\.\d)")
+    groups: dict[tuple[str, ...], list[tuple[Finding, int]]] = {}
+    for i, one in enumerate(_kept(dataset)):
+        named = set(known.findall(one.text))
+        of, step = places[named.pop()] if len(named) == 1 else ("", 0)
+        said = re.sub(r"\d[\d.,e+-]*", "#", known.sub(of, one.text)) if of else str(i)
+        groups.setdefault((one.severity, of, said), []).append((one, step))
+    kept = []
+    for (first, _), *others in groups.values():
+        also = ", ".join(str(step) for _, step in others)
+        text = f"{first.text} The same, with other numbers, at step{'s' * (len(others) > 1)} {also}."
+        kept.append(first._replace(text=text) if others else first)
+    if kept:
+        dataset.attrs["findings"] = json.dumps([one._asdict() for one in kept], ensure_ascii=False)
+
+
 def findings(dataset: xr.Dataset) -> list[Finding]:
     """Return the findings that a dataset keeps, the most severe first."""
     return sorted(_kept(dataset), key=lambda one: SEVERITIES.index(one.severity))

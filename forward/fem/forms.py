@@ -84,7 +84,7 @@ class Forms:
         self.increments = spec.increments
         self._before = spaces.function(self.unknowns.whole) if spec.frictional else None
         self._share = spaces.constant(self.mesh, 0.0)
-        self._shifts = {load.label: spaces.constant(self.mesh, np.zeros(3)) for load in spec.loads if load.contact}
+        self._shifts = {load.label: spaces.constant(self.mesh, np.zeros(4)) for load in spec.loads if load.contact}
         self._proportional = True  # whether forces at rest are proportional to the numbers of the loads
         # Virtual works of those loads that act in contact, and what they are written with.
         self._tools: list[tuple[Any, Term, Place]] = []

@@ -112,8 +112,8 @@ class HistoryModel(OneByOne):
         """What each tool moves (m) where its place or its depth is a number with steps."""
         moved = dict(zip(self._paths, changes, strict=True))
         for load in (load for load in self.equations.spec.loads if load.contact):
-            x, y, z, depth = (moved.get(f"loads.{load.label}.{name}", 0.0) for name in ("x", "y", "z", "depth"))
-            yield load.label, np.array([x, y, z]) + depth * np.array(load.along)  # type: ignore[attr-defined]
+            names = ("x", "y", "z", "depth")
+            yield load.label, np.array([moved.get(f"loads.{load.label}.{name}", 0.0) for name in names])
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> HistorySolution:
         """Find the equilibria of all increments at `parameters` (d,), each from the one before; collective.

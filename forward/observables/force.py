@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from annotated_types import Gt
 
-from forward.bodies.geometry import AXES, unit_vector
+from forward.bodies.geometry import AXES
 from forward.observables.observable import Equations, Functional, Observable
 from forward.terms import tools
 
@@ -41,10 +41,13 @@ class Force(Observable):
         from forward.observables.functionals import Integral
 
         tool, at = equations.tool(self.tool)
-        along = unit_vector(tool.direction) if self.component == "along" else np.eye(3)[AXES.index(self.component)]
+        if self.component == "along":
+            along = ufl.as_vector(tool.pointing(at.ops, at.numbers))
+        else:
+            along = at.constant(np.eye(3)[AXES.index(self.component)])
         x = ufl.variable(at.X + at.u)
         touch = tool.touch(at, x)
-        density = tools.pressure(at.ops, *touch) * ufl.dot(ufl.diff(touch.gap, x), at.constant(along))
+        density = tools.pressure(at.ops, *touch) * ufl.dot(ufl.diff(touch.gap, x), along)
         if tool.friction:
-            density -= ufl.dot(tool.rub(at).traction, at.constant(along))
+            density -= ufl.dot(tool.rub(at).traction, along)
         return Integral(equations, density, 1 / self.times, tool.measure(at))

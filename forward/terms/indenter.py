@@ -36,6 +36,7 @@ AT_REST = 1e-3  # depth relative to the size that stands for a depth of zero
 BORNE = 1e-6  # width over which contact sets in on a plane that does not move, relative to the extent of the body
 STARTED = 1e-3  # part of the width that keeps the share of an increment in contact defined where nothing touches
 SLACK = 0.01  # of the depth, and of the inaccuracy of positions, that a tool may be inside the body at the start
+POINTING = ("direction_x", "direction_y", "direction_z")
 Shape = Literal["sphere", "flat", "cylinder", "cone", "plane"]
 NEEDED: dict[str, tuple[str, ...]] = {
     "sphere": ("radius",),
@@ -59,6 +60,20 @@ class Position(Settings):
     x: Annotated[float, Unit("m")]
     y: Annotated[float, Unit("m")]
     z: Annotated[float, Unit("m")]
+
+
+class Pointing(Settings):
+    """How a tool points.
+
+    Parameters
+    ----------
+    direction_x, direction_y, direction_z
+        Components of its direction; their length does not matter.
+    """
+
+    direction_x: Annotated[float, Unit("1")]
+    direction_y: Annotated[float, Unit("1")]
+    direction_z: Annotated[float, Unit("1")]
 
 
 class Stiffness(NamedTuple):
@@ -140,7 +155,7 @@ class Indenter(Term):
     at
         Its foremost point (m) before it is moved; x, y and z can be random.
     direction
-        The way it points and moves.
+        The way it points and moves; its components direction_x, … can be random.
     depth
         How far (m) it is moved.
     radius
@@ -184,7 +199,9 @@ class Indenter(Term):
         found = {name: scalar for name, scalar in super().scalars.items() if scalar.value is not None}
         if not self.friction:  # then it is not in the forms
             found.pop("friction")
-        return found | {axis: Scalar(value, Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
+        found |= {axis: Scalar(value, Position, axis) for axis, value in zip("xyz", self.at, strict=True)}
+        pointing = zip(POINTING, self.along, strict=True)
+        return found | {name: Scalar(component, Pointing, name) for name, component in pointing}
 
     @property
     def size(self) -> float:
@@ -252,15 +269,21 @@ class Indenter(Term):
         constant
             Makes a constant of forms.
         """
-        d = constant(unit_vector(self.direction))
+        d = self.pointing(ops, numbers)
         apart = [x[i] - numbers[axis] for i, axis in enumerate("xyz")]
         t = _dot(apart, d) - numbers["depth"]
         if self.axis is not None:
-            side = np.cross(unit_vector(self.direction), unit_vector(self.axis))
-            across = _dot(apart, constant(side / np.linalg.norm(side))) ** 2
+            side = _cross(d, unit_vector(self.axis))
+            across = _dot(apart, side) ** 2 / _dot(side, side)
         else:  # |a − (a·d) d|² as |a × d|², which loses no digits
             across = sum(part**2 for part in _cross(apart, d))
         return tools.distance(ops, self.shape, t, across, self._sized(numbers, constant))
+
+    def pointing(self, ops: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+        """Unit vector of its direction, of numbers or forms."""
+        x, y, z = (numbers[name] for name in POINTING)
+        length = ops.sqrt(x**2 + y**2 + z**2)
+        return x / length, y / length, z / length
 
     def _sized(self, numbers: Mapping[str, Any], constant: Callable[[Any], Any]) -> dict[str, Any]:
         """Its size in all numbers that its shape needs."""
@@ -280,7 +303,7 @@ class Indenter(Term):
 
     def entered(self, body: Body, numbers: Mapping[str, float]) -> float:
         """How deep (m) the boundary of the body at rest is inside it, with these numbers."""
-        d = np.array(unit_vector(self.direction))
+        d = np.array(self.pointing(tools.NUMPY, numbers))
         tip = np.array([numbers[axis] for axis in "xyz"])
         return -float(self.gaps(points(facets(body, self.on), tip, d), **numbers).min())
 
@@ -343,7 +366,9 @@ class Indenter(Term):
         slope = ufl.diff(touch.gap, x)
         size = ufl.sqrt(ufl.dot(slope, slope) + tools.TINY**2)
         normal = slope / size
-        moved = at.constant(unit_vector(self.direction)) * since.share * at.numbers["depth"] + since.shift
+        d = ufl.as_vector(self.pointing(at.ops, at.numbers))
+        aside = ufl.as_vector([since.shift[i] for i in range(3)])
+        moved = d * (since.share * at.numbers["depth"] + since.shift[3]) + aside
         # What was not in contact before has slid since it touched only, by linear interpolation of the gap.
         before = self.gap(at.ops, at.X + since.u + moved, at.numbers, at.constant)
         entered, left = (tools.pressure(at.ops, gap, 1.0, touch.width) for gap in (touch.gap, before))

@@ -44,7 +44,7 @@ class Since:
     share
         The part of the load by which it has grown since.
     shift
-        What a tool has moved since (m) besides: where its place or depth is a number with steps.
+        What a tool has moved since (m) besides: along x, y, z and in depth, where these are numbers with steps.
     count
         How many increments there are.
     """

@@ -16,7 +16,7 @@ from uq.accuracy.budget import estimates_for
 from uq.estimators import branch
 from uq.estimators.rounding import settled
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
-from uq.findings import add
+from uq.findings import add, once_for_steps
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
@@ -81,6 +81,8 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
         settled(found, units)
         add(found, *locking)
+        if "step" in found.coords:
+            once_for_steps(found)
         found = with_contact(with_regions(found, model.spec.body.regions, regions), pressed)
         return with_random_fields(found, factors, model.space.variance_kept)
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.model import FloatArray
 from uq.estimators.moments import half_width
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, text_of
 
@@ -52,13 +53,7 @@ def shares(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | N
     x = there[along].to_numpy()
     values = there["sobol_total"].transpose("parameter", "output").to_numpy()
     errors = half_width(dataset) * there["sobol_total_error"].transpose("parameter", "output").to_numpy()
-    order = np.argsort(-values.max(axis=1))
-    for rank, i in enumerate(order[:NAMED]):
-        name = text_of(str(dataset["parameter"].to_numpy()[i]))
-        ax.errorbar(x, values[i], errors[i], color=f"C{rank}", marker="o", ms=4, capsize=3, label=name)
-    for i in order[NAMED:]:
-        ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
-    ax.axhline(0, color=DARK, linewidth=0.8)
+    _by_parameter(ax, dataset, x, values, errors)
     _along(ax, along, unit)
     ax.set_ylabel(f"total Sobol' index of {text_of(output)}")
     ax.legend(frameon=False, fontsize="small")
@@ -71,11 +66,7 @@ def slopes(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes | N
     there = _steps(dataset, output)
     x = there[along].to_numpy()
     values = there["derivative_per_std"].transpose("parameter", "output").to_numpy()
-    order = np.argsort(-np.abs(values).max(axis=1))
-    for rank, i in enumerate(order[:NAMED]):
-        name = text_of(str(dataset["parameter"].to_numpy()[i]))
-        ax.plot(x, values[i], color=f"C{rank}", marker="o", ms=4, label=name)
-    ax.axhline(0, color=DARK, linewidth=0.8)
+    _by_parameter(ax, dataset, x, values, np.zeros_like(values))
     _along(ax, along, unit)
     ax.set_ylabel(f"change of {_labelled(output, str(there['unit'].to_numpy()[0]))}")
     ax.legend(title="by one standard deviation of", frameon=False, fontsize="small")
@@ -104,6 +95,19 @@ def measured(one: xr.Dataset, output: str, steps: Steps, ax: Axes | None = None)
     ax.set_ylabel(_labelled(output, steps.units[output]))
     ax.legend(frameon=False, fontsize="small")
     return ax
+
+
+def _by_parameter(ax: Axes, dataset: xr.Dataset, x: FloatArray, values: FloatArray, errors: FloatArray) -> None:
+    """Draw values (d, steps) of each parameter with their errors: the largest in colours, with names."""
+    order = np.argsort(-np.abs(values).max(axis=1))
+    for rank, i in enumerate(order):
+        if rank < NAMED:
+            name = text_of(str(dataset["parameter"].to_numpy()[i]))
+            error = errors[i] if errors[i].any() else None
+            ax.errorbar(x, values[i], error, color=f"C{rank}", marker="o", ms=4, capsize=3, label=name)
+        else:
+            ax.plot(x, values[i], color=PLAIN, linewidth=0.8)
+    ax.axhline(0, color=DARK, linewidth=0.8)
 
 
 def _steps(dataset: xr.Dataset, output: str) -> xr.Dataset:
