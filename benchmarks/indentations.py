@@ -183,7 +183,8 @@ def _print(records: list[dict[str, Any]]) -> None:
             f"{', '.join(kind):48s} {len(mine)}: {len(answers)}, {sum(one['verdict'] == VERIFIED for one in answers)}; "
             f"{np.median([one['seconds'] for one in mine]):.2f}; {np.median([one['factors'] for one in answers]):.0f}; "
             f"{largest['apart']:.0e}, {largest['entered']:.1e}, {largest['product']:.1e}, {largest['between']:.1e}; "
-            f"{sum(one['stiffer'] > 1 for one in answers)}; {sum(w < ALIKE for w in ways)} of {len(ways)}\n"
+            f"{sum(one['stiffer'] > 1 for one in answers)}; {sum(w < ALIKE for w in ways)} of {len(ways)}"
+            f"{' (check warns of its edge)' if specification(*kind).findings else ''}\n"
         )
     for said, times in Counter(_short(one) for one in records if one["verdict"] != VERIFIED).most_common():
         sys.stdout.write(f"{times:5d} {said}\n")

@@ -34,6 +34,7 @@ MARGIN = 6.0  # stiffness beyond that for the aim: single points are pressed mor
 ROUND = 3.0  # times that for balls and cylinders, whose edges of the area in contact move from point to point
 AT_REST = 1e-3  # depth relative to the size that stands for a depth of zero
 BORNE = 1e-6  # width over which contact sets in on a plane that does not move, relative to the extent of the body
+ALONG = 5  # points along the edge of a facet at which contact is looked for
 STARTED = 1e-3  # part of the width that keeps the share of an increment in contact defined where nothing touches
 SLACK = 0.01  # of the depth, and of the inaccuracy of positions, that a tool may be inside the body at the start
 POINTING = ("direction_x", "direction_y", "direction_z")
@@ -426,6 +427,15 @@ class Indenter(Term):
             text = (
                 f"loads.{self.label} touches '{self.on}' over a radius of about {self.size:.2g} m, which is below the "
                 f"edges of the cells there ({edge:.2g} m): its force and pressure are rough. Refine the mesh there."
+            )
+            yield Finding("warning", text)
+        rim = self.edge or SHARP * (self.radius or 0)
+        if self.shape == "flat" and rim < edge / ALONG:
+            text = (
+                f"The edge of loads.{self.label} is rounded over {rim:.2g} m, less than the distance of the points at "
+                f"which contact is looked for on '{self.on}' ({edge / ALONG:.2g} m): where these pass it there are "
+                "several equilibria, whose forces differ by up to 15 % on coarse meshes, and one of them is found. "
+                "Refine the mesh there, or give it a rounder edge."
             )
             yield Finding("warning", text)
 
