@@ -232,6 +232,24 @@ def test_displacements_alone_tell_ratios_and_a_force_the_absolute_stiffness(fold
     assert page.count("residual over its error") == 1
 
 
+def test_forces_alone_are_data_enough(folder):
+    study = load(folder / "few.toml")
+    data, forces = study.measured(0), study.measurements[0].observations.readings
+    rows = [
+        f"{study.parts[c]},{n},{v},{s}"
+        for c, n, v, s in zip(forces.case, forces.names, forces.values, forces.sigma, strict=True)
+    ]
+    (folder / "alone").mkdir()
+    (folder / "alone" / "made.csv").write_text("\n".join(["case,output,value,sigma", *rows]))
+    (folder / "alone.toml").write_text(FEW.replace('["data"]', '["alone"]'))
+    here(folder / "alone.toml", folder / "out-alone")
+    found = results(folder / "out-alone")
+    assert int(np.isfinite(found["measured"]).sum()) == len(forces) < len(data.values)
+    assert int(found["points_moved"]) == 0
+    assert "force by load case" in (folder / "out-alone" / "report.html").read_text()
+    assert not list((folder / "out-alone" / "fields").glob("points-*"))
+
+
 def test_fields_of_stiffness_get_their_mean_from_forces(folder):
     assert any(RATIOS in finding.text for finding in load(folder / "blind-field.toml").findings)
     here(folder / "blind-field.toml", folder / "out-blind-field")
