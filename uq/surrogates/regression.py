@@ -29,9 +29,10 @@ from uq.estimators.indices import Analysis, coefficient_moments, moments, shares
 from uq.estimators.moments import Z, error_of_root, student
 from uq.estimators.tails import influences
 from uq.evaluation.evaluate import Evaluations
+from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.basis import Basis, IntArray, by_degree, hyperbolic, hyperbolic_count, orthonormal
+from uq.surrogates.basis import Basis, IntArray, by_degree, hyperbolic, hyperbolic_count, orthonormal, recurrence
 
 BoolArray = NDArray[np.bool_]
 TRUNCATIONS = (0.5, 0.75, 1.0)
@@ -537,7 +538,7 @@ def beyond(
 ) -> Beyond:
     """Return what an expansion (P, m) has in tails beyond all points (n, d)."""
     m = coefficients.shape[1]
-    tails = np.array([marginal.support is None for marginal in inputs.marginals.values()])
+    tails = _tails(inputs)
     if not tails.any():
         return Beyond(np.zeros(m), np.zeros(m))
     drawn = inputs.points(sobol_points(0, 0, 0, POINTS, len(tails)))
@@ -636,25 +637,35 @@ class Regression:
         samples. If the residuals of such a function ψ of norm 1, fitted at these samples, have the sum of squares r²,
         then outputs whose residuals have the sum of squares s² miss a function of norm s/r.
         """
-        tails = np.flatnonzero([marginal.support is None for marginal in self.inputs.marginals.values()])
-        if not tails.size:
+        tails = _tails(self.inputs)
+        if not tails.any():
             return None
         basis, data = self.basis, self.data
-        degrees = basis.indices[:, tails]
-        powers = np.zeros((2, tails.size, basis.indices.shape[1]), dtype=np.int64)
+        q, _ = np.linalg.qr(data.left(basis).reshape(data.right.shape[0] * data.right.shape[1], -1))
+        joint = np.isin(np.arange(tails.size), self.inputs.joint)
+        least = np.full(self.fit.loo.size, np.inf)
+        for places in map(np.flatnonzero, (tails & ~joint, tails & joint)):
+            if places.size:
+                least = np.minimum(least, self._left_of_following(places, q))
+        return np.sqrt(shares(self.fit.squares, least))
+
+    def _left_of_following(self, places: IntArray, q: FloatArray) -> FloatArray:
+        """Least square r² (m,) of a function of the next powers of parameters at these places, see `rest`."""
+        basis, data = self.basis, self.data
+        degrees = basis.indices[:, places]
+        powers = np.zeros((2, places.size, basis.indices.shape[1]), dtype=np.int64)
         following = degrees.max(axis=0) + 1
-        powers[:, np.arange(tails.size), tails] = following, following + 1
-        functions, left = data.left(orthonormal(self.inputs, powers.reshape(-1, powers.shape[2]))), data.left(basis)
-        rows = left.shape[0] * left.shape[1]
-        q, _ = np.linalg.qr(left.reshape(rows, -1))
-        columns = functions.reshape(rows, -1)
-        next_one, after = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0).reshape(2, tails.size, 1)
+        powers[:, np.arange(places.size), places] = following, following + 1
+        functions, norms = _following(self.inputs, basis, powers.reshape(-1, powers.shape[2]))
+        columns = data.left(functions).reshape(len(q), -1)
+        found = ((columns - q @ (q.T @ columns)) ** 2).sum(axis=0)
+        found = np.where(norms > 0, found / np.where(norms > 0, norms, 1.0) ** 2, np.inf)
+        next_one, after = found.reshape(2, places.size, 1)
         # An odd function, or one beside a slope, has no even powers, and lacks the one after the next.
         squares = self.fit.coefficients**2
         alike = ((degrees > 1) & (degrees % 2 == following % 2)).T @ squares
         lacks = alike <= SYMMETRIC * ((degrees > 1).T @ squares)
-        least = np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0)
-        return np.sqrt(shares(self.fit.squares, least))
+        return np.asarray(np.minimum(next_one, np.where(lacks, after, np.inf)).min(axis=0))
 
     @property
     def beyond(self) -> FloatArray:
@@ -688,6 +699,28 @@ class Regression:
                 influences(first, second)[:, which],
                 expanded=True,
             )
+
+
+def _tails(inputs: Inputs) -> BoolArray:
+    """Which parameters (d,) have values beyond those of samples: without bounds, or given by draws, which are many."""
+    bounded = [marginal.support is not None for marginal in inputs.marginals.values()]
+    return ~np.array(bounded, dtype=bool) | np.isin(np.arange(len(bounded)), inputs.joint)
+
+
+def _following(inputs: Inputs, basis: Basis, powers: IntArray) -> tuple[Basis, FloatArray]:
+    """Return the powers (K, d) of single coordinates that a basis lacks, and the norms (K,) of what is new in them."""
+    if basis.joint is None or not powers[:, basis.joint.members].any():
+        return orthonormal(inputs, powers), np.ones(len(powers))
+    draws, start = inputs.draws, inputs.joint.start
+    assert draws is not None
+    alpha, beta = recurrence(Normal(mean=0.0, std=1.0), int(powers.max()))
+    d = powers.shape[1]
+    plain = Basis(basis.coordinates, np.tile(alpha, (d, 1)), np.tile(beta, (d, 1)), powers)
+    points = np.hstack([np.tile(inputs.mean[:start], (len(draws.values), 1)), draws.values])
+    alone = basis.subset(np.flatnonzero((basis.indices[:, :start] == 0).all(axis=1)))
+    known, new = alone.values(points), plain.values(points)
+    left = new - known @ (known.T @ (draws.weights[:, None] * new))
+    return plain, np.sqrt(draws.weights @ left**2)
 
 
 def _estimates(fit: Fit, largest: IntArray, data: Data, rest: FloatArray | None, of: Analysis) -> dict[str, FloatArray]:
