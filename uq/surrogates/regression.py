@@ -641,7 +641,8 @@ class Regression:
         if not tails.any():
             return None
         basis, data = self.basis, self.data
-        q, _ = np.linalg.qr(data.left(basis).reshape(data.right.shape[0] * data.right.shape[1], -1))
+        left = data.left(basis)
+        q, _ = np.linalg.qr(left.reshape(left.shape[0] * left.shape[1], -1))
         joint = np.isin(np.arange(tails.size), self.inputs.joint)
         least = np.full(self.fit.loo.size, np.inf)
         for places in map(np.flatnonzero, (tails & ~joint, tails & joint)):

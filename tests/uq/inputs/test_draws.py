@@ -238,3 +238,25 @@ def test_errors_count_that_draws_are_few(method):
             covered.append(off < 1.96 * float(found[f"{name}_error"][0]))
     for name, covered in inside.items():
         assert np.mean(covered) >= 0.86, name
+
+
+def test_few_samples_of_many_draws_do_not_claim_the_draws_beyond_them():
+    """Rational and exponential functions of three dependent numbers: eight samples reach no end of 600 draws."""
+    held = []
+    for seed in range(6):
+        values = np.random.default_rng(seed).standard_normal((600, 3)) @ np.linalg.cholesky(COVARIANCE).T
+        draws = Draws(NAMES, values, np.full(600, 1 / 600), 600.0)
+        e, r = np.exp(0.5 * values[:, :2].sum(axis=1)), 1 / (1 + 0.3 * (values[:, 0] - values[:, 2]) ** 2)
+
+        def both(p):
+            return [np.exp(0.5 * (p[0] + p[1])), 1 / (1 + 0.3 * (p[0] - p[2]) ** 2)]
+
+        def slopes(p):
+            x, inverse = p[0] - p[2], 1 / (1 + 0.3 * (p[0] - p[2]) ** 2)
+            up, down = 0.5 * np.exp(0.5 * (p[0] + p[1])), -0.6 * x * inverse**2
+            return [[up, up, 0], [down, 0, -down]]
+
+        evaluate = SerialEvaluate(FunctionModel(both, NAMES, ("e", "r"), slopes))
+        found = Chaos(samples=8, seed=seed, quantiles=()).run(Inputs({}, draws=draws), evaluate)
+        held.append(np.abs(found["std"].to_numpy() - [e.std(), r.std()]) < 1.96 * found["std_error"].to_numpy())
+    assert np.mean(held) >= 0.8
