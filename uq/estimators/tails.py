@@ -56,6 +56,7 @@ def skewed(samples: FloatArray) -> FloatArray:
     γ²/(9n) (P. Hall, The Bootstrap and Edgeworth Expansion (1992), section 2.5), which lengthens them by 1.08 γ²/n.
     """
     deviations = samples - samples.mean(axis=0)
+    deviations = ratio(deviations, np.abs(deviations).max(axis=0))  # sixth powers of small and large numbers are none
     squares = (deviations**2).sum(axis=0)
     return np.asarray(np.sqrt(1 + 2.16 * ratio((deviations**3).sum(axis=0) ** 2, squares**3)))
 
