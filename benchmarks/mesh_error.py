@@ -20,6 +20,7 @@ from mpi4py import MPI
 from benchmarks.beams import beam
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray
+from uq.accuracy.budget import spare_for
 from uq.accuracy.effects import UNCALIBRATED
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
@@ -30,6 +31,7 @@ from workflows.config.study import load
 CONFIGS = Path(__file__).parent.parent / "configs"
 SOLVER = {"tolerance": 1e-10}
 SAMPLES = 8
+AFFORDED = spare_for(50)  # a calibration as in a study of 50 solves
 SIDES = ("x-min", "x-max", "y-min", "y-max", "z-min", "z-max")
 GRADING = 8.0
 ORDERS = np.geomspace(0.8, 8.0, 400)  # below, of point values at the edges of these polyhedra, there is none
@@ -307,7 +309,7 @@ def exact(case: Case) -> Exact:
 def effectivities(case: Case) -> list[tuple[float, bool]]:
     """Print a row for each output of a problem; return what is claimed, calibrated, over what is true."""
     solution = case.coarse.build(MPI.COMM_SELF, ()).solve(np.zeros(0))
-    error, saturation = solution.mesh_error(), solution.saturation()
+    error, saturation = solution.mesh_error(), solution.saturation(AFFORDED)
     calibrated = error.calibrated(saturation).outputs
     values, doubts = exact(case)
     true = values - solution.outputs
@@ -342,13 +344,13 @@ def elsewhere() -> None:
         ):
             model, names = case.coarse.build(MPI.COMM_SELF, inputs.names), ", ".join(inputs.names)
             centre = model.solve(inputs.mean)
-            once = centre.saturation()
+            once = centre.saturation(AFFORDED)
             for quantiles in ((0.05, 0.05), (0.05, 0.95), (0.95, 0.05), (0.95, 0.95)):
                 (point,) = inputs.points(np.array([quantiles]))
                 solution = model.solve(point)
                 error = solution.mesh_error()
                 here = error.calibrated(once, solution.outputs / centre.outputs).outputs
-                ratios = here / error.calibrated(solution.saturation()).outputs
+                ratios = here / error.calibrated(solution.saturation(AFFORDED)).outputs
                 found += ratios.tolist()
                 told = ", ".join(
                     f"{output.name} {r:.2f}" for output, r in zip(case.coarse.outputs, ratios, strict=True)

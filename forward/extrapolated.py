@@ -7,6 +7,7 @@ Trans. R. Soc. A 226 (1927) 299–361). The difference itself is an output too: 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -178,6 +179,6 @@ class ExtrapolatedSolution:
         """None: what is estimated here are outputs without one."""
         return
 
-    def saturation(self) -> None:
+    def saturation(self, spare: float = math.inf) -> None:
         """None: there are no estimates."""
         return

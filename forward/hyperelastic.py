@@ -328,8 +328,24 @@ class Hyperelastic(ModelSpec):
         """Return the same problem on a finer mesh, see the body's `refined`; `formulation` does not change."""
         return self.model_copy(update={"body": self.body.refined(level)})
 
+    @property
+    def plane(self) -> tuple[Axis, ...]:
+        """Axes along which a box or block is one cell thick between faces that slide: nothing varies along them.
+
+        Not of bodies with inclusions or random fields, which vary everywhere.
+        """
+        if isinstance(self.body, MeshFile) or self.inclusions or self.fields:
+            return ()
+        held = {on: set(AXES) for on in self.clamp}
+        for item in self.displacements:
+            held.setdefault(item.on, set()).update(item.components)
+        thick = zip(AXES, self.body.cells, strict=True)
+        return tuple(
+            axis for axis, n in thick if n == 1 and all(held.get(f"{axis}-{end}") == {axis} for end in ("min", "max"))
+        )
+
     def finer(self, times: float) -> Self:
-        """Return the same problem with so many times the cells along each edge, or a few more.
+        """Return the same problem with so many times the cells along each edge but those of a plane, or a few more.
 
         Raises
         ------
@@ -341,7 +357,7 @@ class Hyperelastic(ModelSpec):
             raise ModelError(objection)
         if isinstance(self.body, MeshFile):
             return self.refined(math.ceil(math.log2(times) - 1e-9))
-        return self.model_copy(update={"body": self.body.with_cells(times)})
+        return self.model_copy(update={"body": self.body.with_cells(times, self.plane)})
 
     @property
     def solver_tolerance(self) -> float:
@@ -420,9 +436,9 @@ class Hyperelastic(ModelSpec):
         whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
         return replace(whole, setup=one.setup, bytes=one.bytes)
 
-    def mesh_error_cost(self) -> Estimate:
+    def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
         """Predict what an estimate of the error of the mesh takes, and what calibrates it."""
-        own, calibrating = own_estimate(self), finer(self)
+        own, calibrating = own_estimate(self), finer(self, spare)
         if calibrating is None:
             return own
         return replace(own, calibration=calibrating.seconds, calibration_bytes=calibrating.bytes)

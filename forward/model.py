@@ -8,6 +8,7 @@ The module is longer than others because the whole contract, most of it document
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
@@ -313,10 +314,15 @@ class Solution(Protocol):
             If there is no estimate at this solution.
         """
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh, once for all solutions near this one; collective.
 
         None for a model without a mesh; typical values where this would take too much memory.
+
+        Parameters
+        ----------
+        spare
+            How many solves it may cost, by prediction, beside a fifth of what a study takes without its solves.
 
         Raises
         ------
@@ -558,7 +564,7 @@ class FunctionSolution:
         """No mesh."""
         return
 
-    def saturation(self) -> None:
+    def saturation(self, spare: float = math.inf) -> None:
         """No mesh."""
         return
 

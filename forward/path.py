@@ -164,9 +164,9 @@ class Path(Hyperelastic):
         found = super().cost(factors)
         return found if self.frictional else sum_of([replace(found, contact=False)] * self.count)
 
-    def mesh_error_cost(self) -> Estimate:
+    def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all steps."""
-        return sum_of([super().mesh_error_cost()] * self.count)
+        return sum_of([super().mesh_error_cost(spare)] * self.count)
 
     def described(self, ranges: Any) -> Iterator[tuple[str, str]]:
         """Say what the body is, and which steps there are."""

@@ -6,6 +6,7 @@ A specification needs no FEniCSx. Your own kind is a subclass in a module beside
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -209,8 +210,11 @@ class ModelSpec(Settings):
         """What its solver leaves of the equations, relative to their terms; None where there is no such number."""
         return None
 
-    def mesh_error_cost(self) -> Estimate | None:
-        """Predict what an estimate of the error of its mesh takes (`Solution.mesh_error`); None without a mesh."""
+    def mesh_error_cost(self, spare: float = math.inf) -> Estimate | None:
+        """Predict what an estimate of the error of its mesh takes (`Solution.mesh_error`); None without a mesh.
+
+        With what calibrates it if that may cost so many solves.
+        """
         return None
 
     def textbook(self) -> Self:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterator
 from typing import Any, ClassVar, Literal, Self
@@ -239,7 +240,7 @@ class Specimen(ModelSpec):
         """Predict the cost of a solve of all load cases, each with its own factor."""
         return sum_of([self.loaded(case).cost(factors=1) for case in self.cases])
 
-    def mesh_error_cost(self) -> Estimate:
+    def mesh_error_cost(self, spare: float = math.inf) -> Estimate:
         """Predict what an estimate of the error of the mesh takes in all load cases."""
         return sum_of([own_estimate(self.loaded(case)) for case in self.cases])
 

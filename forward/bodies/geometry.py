@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -123,15 +123,17 @@ class _SixSided(Settings):
             graded[face] = max(least, self.grading.get(face, 1.0))  # type: ignore[call-overload]
         return self.model_validate(self.model_dump() | {"cells": cells, "grading": graded})
 
-    def with_cells(self, times: float) -> Self:
-        """Return the same body with so many times the cells along each edge, rounded up.
+    def with_cells(self, times: float, kept: Collection[Axis] = ()) -> Self:
+        """Return the same body with so many times the cells along each edge, rounded up, but for some axes.
 
         Raises
         ------
         ValidationError
             If the mesh is too large.
         """
-        cells = tuple(math.ceil(times * n * (1 - 1e-9)) for n in self.cells)
+        cells = tuple(
+            n if axis in kept else math.ceil(times * n * (1 - 1e-9)) for axis, n in zip(AXES, self.cells, strict=True)
+        )
         return self.model_validate(self.model_dump() | {"cells": cells})
 
     @abstractmethod

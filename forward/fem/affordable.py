@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from typing import Any, NamedTuple
 
-from forward.fem.cost import MOST_BYTES, Estimate, estimate
+from forward.fem.cost import MOST_BYTES, REPORT, START, Estimate, estimate
 
 MOST_UNKNOWNS = 40_000
-TIMES = (2.0, 1.5)  # cells along each edge, over those of the body: the first that is small enough
-STEPS = 3  # of Newton's method from the solution on the mesh of the body
+TIMES = (2.0, 1.5, 1.25)  # cells along each edge, over those of the body: the first that is cheap and small enough
+SHARE = 0.2  # of what a study takes without its solves
+AROUND = 0.15  # processor time (s) of what estimates need besides: forms to be loaded, a longer report
 
 
 class Finer(NamedTuple):
@@ -34,20 +37,48 @@ def own_estimate(spec: Any) -> Estimate:
     return found
 
 
-def finer(spec: Any) -> Finer | None:
-    """Return a body on a finer mesh; None where that takes too much."""
+def allowance(spec: Any, spare: float) -> float:
+    """Predict the processor time (s) that a calibration may take: so many solves, and a part of what comes once.
+
+    By counts only, and so the same on every machine.
+    """
+    if math.isinf(spare):
+        return math.inf
+    cost = spec.cost()
+    once = START + REPORT + cost.first + cost.reference_factor(2)
+    return float(SHARE * once + spare * cost.sample - AROUND - own_estimate(spec).once)
+
+
+def richer(spec: Any) -> float:
+    """Predict the processor time (s) of an estimate in elements of two degrees more."""
+    twice = spec.enriched().enriched()
+    cost = estimate(spec.body, twice.body, mixed=spec.mixed, symmetric=spec.symmetric)
+    return cost.once + cost.seconds
+
+
+def finer(spec: Any, spare: float = math.inf) -> Finer | None:
+    """Return a body on the finest mesh that is affordable; None where any takes too much."""
     formulation, left = "mixed" if spec.mixed else "displacement", MOST_BYTES - own_estimate(spec).bytes
+    allowed = allowance(spec, spare)
     for times in TIMES:
-        try:
-            body = spec.body.refined(1) if times == 2.0 else spec.body.finer(times, (), 1.0, 1.0)
-        except ValueError:  # it is divided already, or too large
+        body = _with_cells(spec, times)
+        if body is None:
             continue
-        if times != 2.0 and body.cell_count >= 8 * spec.body.cell_count:
-            continue  # cells of a file are divided into eight
         there = spec.model_copy(update={"body": body, "formulation": formulation, "adapt": None})
         cost, estimating = there.cost(factors=1), own_estimate(there)
-        if there.unknowns <= MOST_UNKNOWNS and cost.bytes + estimating.bytes <= left:
-            newton = STEPS * (cost.assembly + cost.factorisation + cost.substitution + 2 * cost.residual)
-            seconds = cost.setup + newton + estimating.once + estimating.seconds
+        if there.unknowns > MOST_UNKNOWNS or cost.bytes + estimating.bytes > left:
+            continue
+        solving = cost.setup + cost.assembly + cost.factorisation + cost.corrected
+        seconds = solving + estimating.once + estimating.seconds
+        if seconds <= allowed:
             return Finer(there, times, seconds, cost.bytes + estimating.bytes)
+    return None
+
+
+def _with_cells(spec: Any, times: float) -> Any | None:
+    """Return the body with so many times the cells along each edge; None where it cannot be."""
+    with suppress(ValueError):  # it is divided already, or too large
+        if hasattr(spec.body, "with_cells"):
+            return spec.body.with_cells(times, spec.plane)
+        return spec.body.refined(1) if times == TIMES[0] else None  # cells of a file are divided into eight
     return None

@@ -11,22 +11,26 @@ believed: then it is 1, and the doubt is larger.
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from forward.fem.affordable import finer
+from forward.fem.affordable import Finer, finer
 from forward.fem.dolfinx import spaces
 from forward.fem.layout import sorted_by_place
-from forward.model import FloatArray, Guess, Saturation
+from forward.fem.model import HyperelasticModel
+from forward.model import FloatArray, Guess, ReferenceSolution, Saturation
 
 if TYPE_CHECKING:
-    from forward.fem.model import FiniteElementSolution, HyperelasticModel
+    from forward.fem.equations import Discretisation
+    from forward.fem.model import FiniteElementSolution
+    from forward.hyperelastic import Hyperelastic
 
 LOWEST, HIGHEST = 1.0, 4.0  # orders
-OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated, and of the whole error
+OF_REST, OF_ALL = 0.75, 0.1  # doubt of what is extrapolated from half the cells, and of the whole error
 LEAST, MOST = 0.5, 3.0  # ratios of errors to what is seen of them that hold at other parameters too
 THOROUGH = {False: 1e-3, True: 1e-4}  # nonlinearity that is left, without pressures and with them
 
@@ -63,7 +67,9 @@ def limit(
         share = share**2 * times
     rest = share / (1 - share) * (there + e_there - values - e)
     errors = there + e_there - values + rest
-    doubts = OF_REST * np.abs(rest) + OF_ALL * np.abs(errors) + np.where(regular, 0.0, np.abs(e_there))
+    doubts = (
+        OF_REST * (2 / times) ** 0.5 * np.abs(rest) + OF_ALL * np.abs(errors) + np.where(regular, 0.0, np.abs(e_there))
+    )
     return Limit(errors, doubts)
 
 
@@ -83,18 +89,35 @@ class FinerMesh:
     ----------
     model
         The body.
+    spare
+        How many solves it may cost (`forward.fem.affordable.allowance`).
     """
 
-    def __init__(self, model: HyperelasticModel) -> None:
-        self._model = model
+    def __init__(self, model: HyperelasticModel, spare: float = math.inf) -> None:
+        self._model, self._spare = model, spare
         self._scalars = [i for i, path in enumerate(model.parameters) if path in model.spec.scalars]
 
     @cached_property
-    def _made(self) -> tuple[HyperelasticModel, float] | None:
-        model, found = self._model, finer(self._model.spec)
-        if found is None:
-            return None
-        return found.spec.build(model.equations.comm, tuple(model.parameters[i] for i in self._scalars)), found.times
+    def _finer(self) -> Finer | None:
+        return finer(self._model.spec, self._spare)
+
+    @cached_property
+    def _tested(self) -> HyperelasticModel:
+        """The body there."""
+        assert self._finer is not None
+        return self._built(self._finer.spec)
+
+    @cached_property
+    def _untested(self) -> HyperelasticModel:
+        """The same, whose solutions are not tested for stability: one factorisation less."""
+        assert self._finer is not None
+        spec = self._finer.spec
+        solver = spec.solver.model_copy(update={"kind": "predict-correct", "accept_unstable": True})
+        return self._built(spec.model_copy(update={"solver": solver}))
+
+    def _built(self, spec: Hyperelastic) -> HyperelasticModel:
+        names = tuple(self._model.parameters[i] for i in self._scalars)
+        return HyperelasticModel(spec, self._model.equations.comm, names)
 
     def calibrated(self, solution: FiniteElementSolution) -> Saturation | None:
         """Calibrate estimates by the finer mesh at the parameters of a solution; collective.
@@ -107,21 +130,34 @@ class FinerMesh:
             If there is no such solution on the finer mesh.
         """
         model, point = self._model, solution.parameters
-        if np.delete(point, self._scalars).any() or self._made is None:
+        if np.delete(point, self._scalars).any() or self._finer is None:
             return None
-        (other, times), degree = self._made, model.spec.body.degree
         usual, bent = solution.mesh_error().outputs, THOROUGH[model.spec.mixed]
         own = solution.estimated(model.enriched, bent)
         seen = model.enriched.values(solution, own) - solution.outputs
-        guess = other.space.scatter(_moved(model, other, solution.state[None]))[0]
-        there = other.solve(point[self._scalars], Guess(guess))
+        other, there = self._solved(point[self._scalars], own.state)
         richer = there.estimated(other.enriched, bent)
         seen_there = other.enriched.values(there, richer) - there.outputs
+        times, degree = self._finer.times, model.spec.body.degree
         found = limit(solution.outputs, seen, there.outputs, seen_there, times, degree)
-        before = _everywhere(model, np.array([solution.state, model.enriched.down(own.change)]))
-        after = _moved(other, model, np.array([there.state, other.enriched.down(richer.change)]))
+        before = _everywhere(model.equations, np.array([solution.state, model.enriched.down(own.change)]))
+        moved = np.array([there.state, other.enriched.down(richer.change)])
+        after = _moved(other.equations, model.equations, moved)
         n = model.space.displacements
         return saturation(usual, found, of_states(before[:, :n], after[:, :n], times, degree))
+
+    def _solved(self, parameters: FloatArray, richer: FloatArray) -> tuple[HyperelasticModel, FiniteElementSolution]:
+        """Solve from what richer elements say of the state, (U⁺_local,), with the one factor of the stiffness there.
+
+        Where that has negative eigenvalues, only the equilibrium can tell whether it is stable.
+        """
+        other = self._untested
+        there = _moved(self._model.enriched.equations, other.equations, richer[None])
+        start = other.equations.layout.scatter(there)[0]
+        near = ReferenceSolution(parameters, start)
+        if other.take_reference(near).indefinite():
+            return self._tested, self._tested.solve(parameters, Guess(start))
+        return other, other.solve(parameters, Guess(start, near))
 
 
 def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) -> float:
@@ -142,21 +178,23 @@ def of_states(before: FloatArray, after: FloatArray, times: float, degree: int) 
     return float(np.clip(limit(0.0, 1.0, along[0], along[1], times, degree).errors, LEAST, MOST))
 
 
-def _everywhere(model: HyperelasticModel, rows: FloatArray) -> FloatArray:
+def _everywhere(equations: Discretisation, rows: FloatArray) -> FloatArray:
     """Return rows (k, U_local) as (k, U) on every rank."""
-    whole = model.space.gather(rows)
-    return np.asarray(model.equations.comm.bcast(whole))
+    return np.asarray(equations.comm.bcast(equations.layout.gather(rows)))
 
 
-def _moved(model: HyperelasticModel, other: HyperelasticModel, rows: FloatArray) -> FloatArray:
+def _moved(here: Discretisation, there: Discretisation, rows: FloatArray) -> FloatArray:
     """Return rows (k, U_local), interpolated at the nodes of another mesh, as (k, U') on every rank; collective."""
-    whole, start, parts = _everywhere(model, rows), 0, []
-    here, there = model.equations.unknowns, other.equations.unknowns
-    for source, target, components in ((here.displacement, there.displacement, 3), (here.pressure, there.pressure, 1)):
+    whole, start, parts = _everywhere(here, rows), 0, []
+    pairs = (
+        (here.unknowns.displacement, there.unknowns.displacement, 3),
+        (here.unknowns.pressure, there.unknowns.pressure, 1),
+    )
+    for source, target, components in pairs:
         if source is None:
             continue
-        points, *_ = sorted_by_place(target, other.equations.comm)
-        nodes, canonical, _ = sorted_by_place(source, model.equations.comm)
+        points, *_ = sorted_by_place(target, there.comm)
+        nodes, canonical, _ = sorted_by_place(source, here.comm)
         values = whole[:, start : start + components * len(nodes)].reshape(len(rows), -1, components)
         start += components * len(nodes)
         numbers = canonical[spaces.global_node_numbers(source)]
@@ -166,4 +204,4 @@ def _moved(model: HyperelasticModel, other: HyperelasticModel, rows: FloatArray)
             if one is not None:
                 moved[:, i] = one[1] @ values[:, numbers[one[0]]]
         parts.append(moved.reshape(len(rows), -1))
-    return np.asarray(model.equations.comm.allreduce(np.concatenate(parts, axis=1)))
+    return np.asarray(here.comm.allreduce(np.concatenate(parts, axis=1)))

@@ -80,6 +80,7 @@ DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
 SUBSTITUTIONS = 12  # for the natural modes, and as many for each direction
 MOST_BYTES = 4e9  # of factors for estimates, where there is another way
+BLOCKS = {"hexahedron": 0.4, "tetrahedron": 1.0}  # of an assembly, for the blocks of the nodes
 ACTION = 2  # a product with the stiffness, over a residual
 SMOOTHING, ROUGHLY = 12, 5  # steps in the enriched space, and solves with a factor of the body, of an estimate
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
@@ -285,7 +286,9 @@ def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) ->
     if mixed or (body.degree == 1 and held <= MOST_BYTES):
         alone = held > MOST_BYTES
         return Estimate(Way.REFERENCE, near, fine.setup + factored, fine.bytes if alone else held, alone=alone)
-    return Estimate(Way.SMOOTHING, smoothed, fine.assembly, BYTES_PER_UNKNOWN * 3 * enriched.nodes)
+    return Estimate(
+        Way.SMOOTHING, smoothed, BLOCKS[enriched.cell] * fine.assembly, BYTES_PER_UNKNOWN * 3 * enriched.nodes
+    )
 
 
 Summed = TypeVar("Summed", Times, Estimate)

@@ -16,6 +16,7 @@ body: a mesh that does not contain its vertices has another field.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
@@ -317,6 +318,6 @@ class OtherSolution:
         """Estimate the error of the other mesh; collective."""
         return self._solution.mesh_error()
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates on the other mesh; collective."""
-        return self._solution.saturation()
+        return self._solution.saturation(spare)

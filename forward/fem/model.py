@@ -7,12 +7,14 @@ dψ/dω = −λᵀ∂F/∂ω + ∂ψ/∂ω.
 from __future__ import annotations
 
 import copy
+import math
 from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from forward.fem.affordable import allowance, richer
 from forward.fem.cost import MOST_BYTES, estimate
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
@@ -513,14 +515,17 @@ class FiniteElementSolution:
         (of_energy,) = factors(once.energy, found.energy, degree)
         return twice, found, float(of_state), float(of_energy)
 
-    def saturation(self, finer: Any | None = None) -> Saturation:
+    def saturation(self, spare: float = math.inf, finer: Any | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
         Where that is too large, by elements of two degrees more (`forward.fem.saturation`); typical values where this
-        takes too much memory too.
+        takes too much memory too. In a short study, either is too large also where it would take too long
+        (`forward.fem.affordable.allowance`).
 
         Parameters
         ----------
+        spare
+            How many solves it may cost (`forward.fem.affordable.allowance`).
         finer
             The body on a finer mesh (`forward.fem.calibration.FinerMesh`), where there is one already.
 
@@ -530,13 +535,15 @@ class FiniteElementSolution:
             If a stiffness in an enriched space is singular.
         """
         if finer is None:
-            finer = named("forward.fem.calibration:FinerMesh")(self._model)
+            finer = named("forward.fem.calibration:FinerMesh")(self._model, spare)
         with suppress(SolveError):
             found: Saturation | None = finer.calibrated(self)
             if found is not None:
                 return found
         seen = self.mesh_error().outputs
-        saturated = self.saturated()
+        spec = self._model.spec
+        cheap = richer(spec) <= allowance(spec, spare)
+        saturated = self.saturated() if cheap else None
         if saturated is None:
             return typical(seen, self._model.spec.body.degree)
         twice, state, of_state, of_energy = saturated

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -213,10 +214,10 @@ class PathSolution:
             nonlinearity=far,
         )
 
-    def saturation(self) -> Saturation:
+    def saturation(self, spare: float = math.inf) -> Saturation:
         """Calibrate estimates of the error of the mesh, step by step; collective."""
-        finer = FinerMesh(self.steps[0]._model)
-        found = [step.saturation(finer) for step in self.steps]
+        finer = FinerMesh(self.steps[0]._model, spare)
+        found = [step.saturation(spare, finer) for step in self.steps]
         return Saturation(
             np.concatenate([one.outputs for one in found]),
             float(np.mean([one.state for one in found])),

@@ -94,6 +94,11 @@ class ReferenceFactor:
             equations.work = kept
         return True
 
+    def indefinite(self) -> bool:
+        """Whether the factor has negative eigenvalues beyond one for each pressure; False where it does not tell."""
+        negative = self._solver.negative_eigenvalues()
+        return negative is not None and negative > self._equations.unknowns.pressures
+
     def _definite(self) -> LinearSolver:
         """Solver for the symmetric part of the stiffness, factorised at the reference."""
         if self._equations.symmetric:

@@ -7,6 +7,7 @@ are Bu with a sparse B; other outputs of a case, such as the force of a tool, fo
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -330,7 +331,7 @@ class SpecimenSolution:
             outputs, state, energy, relative(energy, stored), Work.sum_of(one.work for one in found), nonlinearity=far
         )
 
-    def saturation(self) -> Saturation:
+    def saturation(self, spare: float = math.inf) -> Saturation:
         """Calibrate estimates of the error of the mesh by elements of two degrees more; collective.
 
         Data that the mesh hardly changes have the factor of the states. Typical values where it takes too much memory.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,7 +124,7 @@ class MeasuredSolution:
             return None
         return replace(found, outputs=found.outputs[self.which])
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh; None without a mesh."""
-        found = self.solution.saturation()
+        found = self.solution.saturation(spare)
         return None if found is None else found.of(self.which)

@@ -13,3 +13,8 @@ LEAST = 1e-9  # such tolerance: below, rounding decides
 def estimates_for(solves: int) -> int:
     """Number of estimates that a study of so many solves affords, `FEWEST` in any case."""
     return int(min(max(SHARE * solves / COST, FEWEST), MOST))
+
+
+def spare_for(solves: int) -> float:
+    """Return how many solves are left of that share beside the estimates; negative where they take more."""
+    return SHARE * solves - COST * estimates_for(solves)

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from forward.model import FloatArray
+from forward.model import Finding, FloatArray
 from uq.accuracy.consequences import ENOUGH, Consequence, consequences, has
 from uq.accuracy.doubts import Told, doubts
 from uq.accuracy.mesh_errors import Between, MeshErrors, best, between, covariances
 from uq.estimators.moments import ESTIMATES
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import sobol_points
+from uq.inputs.sampling import even_points
 from uq.surrogates.expansion import Expansion
 from uq.surrogates.linearisation import Linearisation
 from uq.surrogates.regression import NOTHING
@@ -37,7 +37,7 @@ POINTS = 4096  # at which surrogates are drawn
 FURTHEST = 10.0  # standard deviation over that of what is drawn, at most, for their ratio to be that of their errors
 FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from others
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
-ELSEWHERE = 0.15  # the same of what was found at the mean, at other parameters
+ELSEWHERE, CHANGED = 0.15, 0.5  # the same of what was found at the mean, at other parameters, and where errors vary
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
 DIRECTIONS = 12  # of what the estimates leave open, at most, along which its consequences are looked at
 
@@ -59,7 +59,7 @@ def sketch(dataset: xr.Dataset, inputs: Inputs, centre: Linearisation) -> Sketch
         ok = dataset["ok"].to_numpy()
         if ok.sum() >= ENOUGH:
             return Sketch(dataset["points"].to_numpy()[ok], dataset["values"].to_numpy()[ok])
-    points = inputs.points(sobol_points(0, 0, 0, POINTS, len(inputs.names)))
+    points = inputs.points(even_points(POINTS, len(inputs.names)))
     tangents = centre.middle + inputs.coordinates.of(points) @ centre.output_slopes.T
     if not expanded:
         return Sketch(points, tangents)
@@ -99,6 +99,13 @@ def with_mesh_errors(
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
     dataset = dataset.assign(variables)
     add(dataset, *doubts(dataset, found.evaluations, told))
+    if len(found.points) and not found.measured and np.isfinite(found.saturation).any():
+        text = (
+            "What part of the error of the mesh estimates see is not measured on a finer mesh, which would take too "
+            "long for so few solves or too much memory, but typical: they are multiplied by "
+            f"{np.nanmax(found.saturation):.2g}, and half of them is doubted (mesh_error_doubt)."
+        )
+        add(dataset, Finding("note", text))
     return dataset
 
 
@@ -110,7 +117,19 @@ def _unknown(found: MeshErrors) -> FloatArray:
     at_mean = np.abs(found.errors[0])
     known = np.isfinite(found.doubts) & (at_mean > 0)
     share = np.divide(found.doubts, at_mean, out=usual, where=known)
-    return np.where(known, np.hypot(share, ELSEWHERE), usual)
+    return np.where(known, np.hypot(share, np.hypot(ELSEWHERE, CHANGED * _spread(found))), usual)
+
+
+def _spread(found: MeshErrors) -> FloatArray:
+    """How far errors (m,) as they are seen, or their ratios to the outputs, vary: logarithms, 1 at most.
+
+    Where they vary much, so may what part of the errors is seen.
+    """
+    seen = found.seen
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = [np.abs(np.log(of / of[0])) for of in (seen, seen / found.outputs)]  # not a number for other signs
+    least = np.minimum(*(np.minimum(np.nan_to_num(size, nan=1.0, posinf=1.0), 1.0) for size in both))
+    return np.asarray(np.sqrt((least[1:] ** 2).mean(axis=0))) if len(least) > 1 else np.zeros(seen.shape[1])
 
 
 # --- outputs ---------------------------------------------------------------------------------------------------------

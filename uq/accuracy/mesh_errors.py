@@ -11,6 +11,7 @@ estimates best that it has not seen.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,12 +21,13 @@ from forward.model import FloatArray, ForwardModel, Solution
 from uq.estimators.indices import shares
 from uq.evaluation.evaluate import Evaluate, Evaluations, Request, merge
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import sobol_points
+from uq.inputs.sampling import latin_points, sobol_points
 from uq.surrogates.basis import Basis, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation
 
-DESIGNS, FAR = 64, 1.8  # of which the best is taken, with points so far (standard deviations) from the mean
-STREAM = 1 << 20  # of scrambles of the designs, beyond those of the methods
+DESIGNS, FAR = 256, 1.8  # of which the best is taken, with points so far (standard deviations) from the mean
+FEW = 4  # points, the mean among them
+STREAM = 1 << 20  # of the designs, beyond those of the methods
 PRODUCTS, LINES = 8, 100  # parameters up to which errors may have terms of second order, and of first
 FALL = 0.05  # variance of coefficients of one order more, over those before
 CONSTANT = 1e6  # variance of the constant, over those of first order: any
@@ -38,11 +40,12 @@ SMALL = 0.05  # of the largest output at the points: where it is smaller somewhe
 
 
 def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatArray:
-    """Return points (count, d): the mean, and scrambled Sobol' points that are spread well.
+    """Return points (count, d): the mean, and points that are spread well.
 
-    Of some scrambles that one is taken from which lines are known best, over the distribution: lines along all
-    coordinates where points are more than these, or else along the directions in which the outputs vary most. Points
-    farther out than `FAR` count against it: there terms that are left out are largest.
+    Of some Latin hypercubes, or scrambles of Sobol' points where there are more, that one is taken from which lines are
+    known best, over the distribution: lines along all coordinates where points are more than these, or else along the
+    directions in which the outputs vary most. Points farther out than `FAR` count against it: there terms that are
+    left out are largest.
 
     Parameters
     ----------
@@ -58,8 +61,13 @@ def design(inputs: Inputs, slopes: FloatArray, count: int, seed: int) -> FloatAr
         scaled = slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
         ways = np.linalg.svd(np.nan_to_num(scaled), full_matrices=False)[2][: count - 1]
     best, least = np.empty((0, d)), np.inf
-    for scramble in range(DESIGNS):
-        points = np.vstack([inputs.mean, inputs.points(sobol_points(seed, STREAM + scramble, 0, count - 1, d))])
+    for number in range(DESIGNS if count <= FEW else DESIGNS // 4):
+        drawn = (
+            latin_points((seed, STREAM + number), count - 1, d)
+            if count <= FEW
+            else sobol_points(seed, STREAM + number, 0, count - 1, d)
+        )
+        points = np.vstack([inputs.mean, inputs.points(drawn)])
         along = np.column_stack([np.ones(count), inputs.coordinates.of(points) @ ways.T])
         known = np.linalg.inv(along.T @ along + FALL * np.eye(along.shape[1]))
         score = float(np.trace(known)) + count * float(np.maximum(np.abs(along) - FAR, 0.0).max())
@@ -129,11 +137,15 @@ class MeshErrors:
         return self.evaluations.outputs[self.evaluations.ok]
 
     @property
+    def seen(self) -> FloatArray:
+        """Errors (n, m) of the outputs there as elements of one degree more see them."""
+        assert self.evaluations.mesh_errors is not None
+        return self.evaluations.mesh_errors[self.evaluations.ok]
+
+    @property
     def errors(self) -> FloatArray:
         """Errors (n, m) of the outputs there; NaN in columns of what is not estimated."""
-        assert self.evaluations.mesh_errors is not None
-        seen = self.evaluations.mesh_errors[self.evaluations.ok]
-        outputs = self.outputs
+        seen, outputs = self.seen, self.outputs
         first = outputs[:1] if len(outputs) and self.evaluations.ok[0] else np.ones((1, outputs.shape[1]))
         ratios = np.divide(outputs, first, out=np.ones(outputs.shape), where=first != 0)
         near = (ratios > 1 / FAR_OFF) & (ratios < FAR_OFF)
@@ -141,19 +153,26 @@ class MeshErrors:
 
 
 def estimate(
-    inputs: Inputs, evaluate: Evaluate, centre: Linearisation, count: int, seed: int, *, fields: bool
+    inputs: Inputs,
+    evaluate: Evaluate,
+    centre: Linearisation,
+    count: int,
+    seed: int,
+    *,
+    fields: bool,
+    spare: float = math.inf,
 ) -> MeshErrors:
-    """Estimate the error of the mesh at so many points, and calibrate it at the mean."""
+    """Estimate the error of the mesh at so many points, and calibrate it at the mean, which may cost so many solves."""
     points = design(inputs, centre.output_slopes, count, seed)
     parts, states, some = [], [], fields and centre.state.size > 0
-    for these, calibrated in ((points[:1], True), (points[1:], False)):
+    for these, calibrated in ((points[:1], spare), (points[1:], None)):
         wanted = _StateErrors(these) if some else None
         request = Request(these, fields=wanted, start=centre.prediction, mesh_errors=True, saturations=calibrated)
         found = evaluate(request)
         if found.fields.size:
             states.append(found.fields[found.ok][:, : evaluate.displacements])
         parts.append(replace(found, fields=found.fields[:0], saturations=None))
-        if calibrated:
+        if calibrated is not None:
             assert found.saturations is not None
             *of_outputs, of_state, measured = found.saturations[0]
             factors, shifts, doubts = np.reshape(of_outputs, (3, -1))

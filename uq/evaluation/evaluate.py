@@ -213,7 +213,7 @@ class Request:
     mesh_errors
         Whether the errors of the mesh in the outputs are estimated (`Solution.mesh_error`).
     saturations
-        Whether what calibrates these is found too (`Solution.saturation`).
+        How many solves it may cost to find what calibrates these too (`Solution.saturation`); None if it is not wanted.
     """
 
     points: FloatArray
@@ -224,7 +224,7 @@ class Request:
     model: str = OWN
     joint: JointSum | None = None
     mesh_errors: bool = False
-    saturations: bool = False
+    saturations: float | None = None
 
     def blocks(self, most: int | None = None) -> list[Request]:
         """Cut into blocks that depend only on the number of points, the size of rows, and `most`."""
@@ -516,9 +516,10 @@ class BlockSolver:
 class _MeshErrors:
     """Errors of the mesh (n, m) of solutions, and what calibrates them (n, 3m + 2) where it is asked for."""
 
-    def __init__(self, n: int, m: int, *, saturations: bool) -> None:
+    def __init__(self, n: int, m: int, *, saturations: float | None) -> None:
         self.errors = np.full((n, m), np.nan)
-        self.saturations = np.full((n, 3 * m + 2), np.nan) if saturations else None
+        self.saturations = np.full((n, 3 * m + 2), np.nan) if saturations is not None else None
+        self._spare = saturations
 
     def take(self, i: int, solution: Solution) -> None:
         """Take those of one; collective. Errors that cannot be calibrated remain estimates.
@@ -531,10 +532,10 @@ class _MeshErrors:
         found = solution.mesh_error()
         if found is not None:
             self.errors[i] = _worth(found).outputs
-        if self.saturations is None:
+        if self.saturations is None or self._spare is None:
             return
         try:
-            factors = solution.saturation()
+            factors = solution.saturation(self._spare)
         except SolveError:
             return
         if factors is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -320,9 +321,9 @@ class KeptSolution:
         """Estimate the error of the mesh."""
         return self._solution.mesh_error()
 
-    def saturation(self) -> Saturation | None:
+    def saturation(self, spare: float = math.inf) -> Saturation | None:
         """Calibrate estimates of the error of the mesh."""
-        return self._solution.saturation()
+        return self._solution.saturation(spare)
 
 
 def _failed(outputs: Sequence[str], error: SolveError, seconds: float) -> Evaluations:

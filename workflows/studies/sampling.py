@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from forward.model import Finding, ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from uq.accuracy.budget import OF_SOLVER, estimates_for
+from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
@@ -149,21 +150,26 @@ class Study(StudyKind):
         return 0 if not self._estimating or self._too_large is not None else estimates_for(self.planned)
 
     @property
+    def spare(self) -> float:
+        """How many solves the calibration of these estimates may cost with the planned solves."""
+        return math.inf if self.accuracy.tolerance is not None else spare_for(self.planned)
+
+    @property
     def _estimating(self) -> bool:
         theirs = len(self.meshes) > 1 or getattr(self.method, "mesh_error", False)
         return self.accuracy.mesh_error and self.spec.meshed and not theirs and not self.spec.remembers
 
     @cached_property
     def _too_large(self) -> float | None:
-        """Memory (MiB) that an estimate of the error of the mesh would take, if that is too much."""
-        cost = self.spec.mesh_error_cost()
-        needed = 0.0 if cost is None else cost.bytes / MIB
+        """Memory (MiB) that an estimate of the error of the mesh and its calibration take, if that is too much."""
+        cost = self.spec.mesh_error_cost(self.spare)
+        needed = 0.0 if cost is None else (cost.bytes + cost.calibration_bytes) / MIB
         return needed if needed > self.accuracy.memory else None
 
     @property
     def memory(self) -> float:
         """Memory (bytes) of a group of ranks beside that of the program; 0 where there are no finite elements."""
-        estimating = self.spec.mesh_error_cost() if self.estimates else None
+        estimating = self.spec.mesh_error_cost(self.spare) if self.estimates else None
         return super().memory + (0.0 if estimating is None else estimating.bytes + estimating.calibration_bytes)
 
     @property

@@ -91,7 +91,7 @@ def parts(study: Study) -> list[Part]:
 
 def _estimates(study: Study) -> Iterator[Part]:
     """Estimates of the error of the mesh, each with its solution."""
-    estimating = study.spec.mesh_error_cost() if study.estimates else None
+    estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
     if estimating is None:
         return
     each = times_of(study.spec).sample + estimating.seconds
@@ -104,7 +104,7 @@ def _estimates(study: Study) -> Iterator[Part]:
 
 def _compilation(study: Study) -> float:
     """Seconds of the forms of a body, and of those for the error of its mesh."""
-    estimating = study.spec.mesh_error_cost() if study.estimates else None
+    estimating = study.spec.mesh_error_cost(study.spare) if study.estimates else None
     if estimating is None:
         return COMPILATION
     return COMPILATION * (2 if estimating.calibration else 3)  # in elements of one degree more, and perhaps of two

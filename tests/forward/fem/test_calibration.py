@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from forward.bodies.hexahedra import FACES
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.affordable import MOST_UNKNOWNS, finer
+from forward.fem.affordable import MOST_UNKNOWNS, allowance, finer
 from forward.fem.calibration import LEAST, MOST, FinerMesh, limit, saturation
 from forward.hyperelastic import Hyperelastic
 from tests.bodies import OUTPUTS, loaded_body
@@ -229,3 +229,52 @@ def test_ranks_agree(tmp_path):
     for form in ("displacement", "mixed"):
         one, other = (np.load(tmp_path / f"{form} {ranks}.npy") for ranks in (1, 2))
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.unit
+def test_layers_of_plane_strain_are_not_cut():
+    plane = {"displacements": ({"on": "z-min", "z": 0.0}, {"on": "z-max", "z": 0.0}), "clamp": ("x-min",)}
+    assert block((4, 4, 1), **plane).plane == ("z",)
+    assert block((4, 4, 1), **plane).finer(2.0).body.cells == (8, 8, 1)
+    assert finer(block((4, 4, 1), **plane)).spec.body.cells == (8, 8, 1)
+    assert block((4, 4, 2), **plane).plane == ()  # someone wants to see what happens there
+    assert block((4, 4, 1)).plane == ()  # between plates that hold it, it bulges
+    ball = {"kind": "sphere", "x": 0.5, "y": 0.5, "z": 0.3, "radius": 0.2, "width": 0.1, "contrast": 3.0}
+    assert block((4, 4, 1), **plane, inclusions=(ball,)).plane == ()
+
+
+@pytest.mark.unit
+def test_short_studies_have_coarser_finer_meshes_or_none():
+    spec = block((5, 5, 5), degree=2)
+    found = [finer(spec, spare) for spare in (math.inf, 1000.0, 20.0, -2.0)]
+    times = [0.0 if one is None else one.times for one in found]
+    assert times == sorted(times, reverse=True)
+    assert times[0] == 2.0 > times[-1]
+    for one, spare in zip(found, (math.inf, 1000.0, 20.0, -2.0), strict=True):
+        assert one is None or one.seconds <= allowance(spec, spare)
+    assert spec.mesh_error_cost(-2.0).calibration < spec.mesh_error_cost().calibration
+    assert allowance(spec, 100.0) - allowance(spec, 0.0) == pytest.approx(100 * spec.cost().sample)
+
+
+def test_a_finer_mesh_is_solved_on_with_one_factor():
+    """The same as with Newton's method and a test of stability."""
+    solution = block((3, 3, 2), degree=2).build(MPI.COMM_SELF, ()).solve(np.zeros(0))
+    mesh = FinerMesh(solution._model)
+    quick = mesh.calibrated(solution)
+    assert mesh._untested.equations.work.factorisations == 0  # but that of the reference
+    careful = FinerMesh(solution._model)
+    careful.__dict__["_untested"] = mesh._tested
+    slow = careful.calibrated(solution)
+    np.testing.assert_allclose(quick.outputs[:2], slow.outputs[:2], rtol=2e-3)
+    np.testing.assert_allclose(quick.doubts[:2], slow.doubts[:2], rtol=2e-2)
+
+
+@pytest.mark.unit
+def test_smaller_steps_are_doubted_more():
+    order, poor, rich = 1.4, np.array([1.0]), np.array([0.4])
+    left = [
+        limit(2 + poor, rich - poor, 2 + poor * t**-order, (rich - poor) * t**-order, t).doubts[0]
+        for t in (2.0, 1.5, 1.25)
+    ]
+    assert left == sorted(left)
+    assert left[2] > 1.2 * left[0] - 0.1 * 0.2

@@ -14,7 +14,7 @@ class Estimated:
     def mesh_error(self):
         return MeshError(np.array([0.5, 0.6, 0.7]), np.zeros(2), 0.0, 0.0, Work())
 
-    def saturation(self):
+    def saturation(self, spare):
         return FACTORS
 
 

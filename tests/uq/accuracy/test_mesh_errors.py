@@ -9,7 +9,7 @@ import xarray as xr
 from forward.model import FunctionModel, FunctionSolution, MeshError, Saturation, SolveError, Work
 from uq.accuracy.budget import FEWEST, MOST, estimates_for
 from uq.accuracy.doubts import Told
-from uq.accuracy.effects import DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors
+from uq.accuracy.effects import CHANGED, DOUBT, ELSEWHERE, UNCALIBRATED, with_mesh_errors
 from uq.accuracy.mesh_errors import design, estimate
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
@@ -38,6 +38,7 @@ class OnMesh(FunctionModel):
     seen: float = 1.0  # share of the error that an estimate sees
     missed: float = 0.0  # part of the output that estimates of its error do not see
     doubt: float | None = None  # of calibrated errors
+    measured: bool = True
 
     def solve(self, parameters, guess=None):
         found = super().solve(parameters, guess)
@@ -53,14 +54,14 @@ class SolvedOnMesh(FunctionSolution):
         seen = self.model.seen * errors - self.model.missed * self.outputs
         return MeshError(seen, np.empty(0), 0.0, np.nan, Work())
 
-    def saturation(self):
+    def saturation(self, spare):
         m = len(self.outputs)
         if self.model.doubt is not None:
             shifts, doubts = self.model.missed * self.outputs, np.full(m, self.model.doubt)
             return Saturation(np.ones(m), 1.0, 1.0, shifts=shifts, doubts=doubts)
         if self.model.seen == 1.0:
             return None
-        return Saturation(np.full(m, 1 / self.model.seen), 1.0, 1.0)
+        return Saturation(np.full(m, 1 / self.model.seen), 1.0, 1.0, self.model.measured)
 
 
 def on_mesh(error, names=("a", "b")):
@@ -289,6 +290,25 @@ def test_what_an_expansion_leaves_is_claimed():
     assert any("does not follow" in one.text and "u" in one.text for one in findings(found))
 
 
+def test_what_is_seen_is_doubted_more_where_it_varies():
+    """A ratio to the output that stays says that one calibration holds; one that does not says that it may not."""
+    follows = lambda p: [0.05 * p[0] / p[1], 0.02 * p[0] ** 2 / p[1]]  # noqa: E731
+    varies = lambda p: [0.05 * p[0] / p[1], 0.02 * (p[0] / p[1]) ** 6]  # noqa: E731
+    steady, moving = (
+        studied(Chaos(samples=24), replace(on_mesh(error), doubt=1e-4))[1]["mesh_error_unknown"].to_numpy()
+        for error in (follows, varies)
+    )
+    assert steady[0] == pytest.approx(moving[0], rel=1e-6) == pytest.approx(ELSEWHERE, rel=0.05)
+    assert moving[1] > steady[1] + 0.1
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_estimates_with_a_typical_calibration_say_so(measured):
+    model = replace(on_mesh(affine), seen=0.8, measured=measured)
+    _, found = studied(Chaos(samples=24), model)
+    assert any("not measured on a finer mesh" in one.text for one in findings(found)) is not measured
+
+
 def test_failed_estimates_are_said_and_left_out():
     def error(p):
         if p[1] > limit:
@@ -424,8 +444,9 @@ def test_what_estimates_miss_is_added_and_its_doubt_is_told():
     np.testing.assert_allclose(sure["mesh_error_shift"], 0.2 * on_mesh(affine).function(INPUTS.mean))
     at_mean = abs(np.array(affine(INPUTS.mean)))
     for found, doubt in ((sure, 0.01), (unsure, 0.2)):
-        relative = np.hypot(doubt / at_mean, ELSEWHERE)
-        np.testing.assert_allclose(found["mesh_error_unknown"], relative)
+        relative = found["mesh_error_unknown"].to_numpy()
+        assert (relative >= np.hypot(doubt / at_mean, ELSEWHERE)).all()
+        assert (relative <= np.hypot(doubt / at_mean, np.hypot(ELSEWHERE, CHANGED))).all()
         np.testing.assert_allclose(found["mesh_error_doubt"], relative * abs(found["mesh_error"]), rtol=0.05)
     told = "do not agree on the error of the mesh for u, v"
     assert any(told in one.text for one in findings(unsure))

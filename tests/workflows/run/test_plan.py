@@ -43,6 +43,18 @@ def test_estimates_that_take_too_much_memory_are_left_out_and_it_is_said():
     assert not any("accuracy.memory" in one.text for one in off.findings)
 
 
+def test_the_finer_mesh_that_calibrates_estimates_counts():
+    study = load(CONFIGS / "beam.toml")
+    cost = study.spec.mesh_error_cost(study.spare)
+    assert cost.calibration_bytes > cost.bytes
+    between = (cost.bytes + cost.calibration_bytes / 2) / 2**20
+    short = load(CONFIGS / "beam.toml", [f"accuracy.memory={between:.0f}"])
+    assert short.estimates == 0
+    assert study.estimates > 0
+    (found,) = (one for one in short.findings if "accuracy.memory" in one.text)
+    assert f"{(cost.bytes + cost.calibration_bytes) / 2**20:,.0f} MiB" in found.text
+
+
 def test_the_plan_is_the_sum_of_its_parts(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     study = load(CONFIGS / "beam.toml")
