@@ -37,7 +37,7 @@ from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
 from uq.estimators.moments import ESTIMATES, Estimates, estimate_from_replicates, quantiles_from_replicates
-from uq.estimators.tails import counted, influences
+from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
 from uq.findings import add
 from uq.inputs.distributions import (
@@ -401,8 +401,7 @@ class _Samples:
                         dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
                 dataset["loo_error"] = (("output",), regression.fit.relative)
                 add(dataset, *of_indices(dataset))
-        moved = influences(*(self._in_order(one)[ok] for one in self._controlled(self.each)))
-        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error, moved))
+        add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))
         if not ok.all():
             dataset.attrs["note"] = failure_note(ok, "all estimates", None)
         return dataset
