@@ -28,12 +28,10 @@ def pressure_map(dataset: xr.Dataset, tool: str, direction: Vector, ax: Axes | N
     seen = Triangulation(x, y)
     drawn = ax.tripcolor(seen, pressure, shading="gouraud", cmap="viridis", vmin=0)
     ax.plot(x, y, ".", color="white", ms=2, alpha=0.6)
-    touching = pressure > 0
-    if touching.any():  # a margin of a quarter around the area in contact
-        for whole, limit in ((x, ax.set_xlim), (y, ax.set_ylim)):
-            there = whole[touching]
-            margin = 0.25 * float(np.ptp(there)) + 0.02 * float(np.ptp(whole))
-            limit(max(there.min() - margin, whole.min()), min(there.max() + margin, whole.max()))
+    corners = seen.triangles[(pressure[seen.triangles] > 0).any(axis=1)].ravel()
+    if len(corners):  # the area in contact and the cells around it
+        for values, limit in ((x[corners], ax.set_xlim), (y[corners], ax.set_ylim)):
+            limit(float(values.min()), float(values.max()))
     figure = ax.get_figure(root=True)
     assert figure is not None
     figure.colorbar(drawn, ax=ax, label=f"pressure of {text_of(tool)} (Pa)")
