@@ -11,6 +11,7 @@ from forward.conformance import check_derivatives
 from forward.specimen import Specimen
 from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
+from tests.launch import run_script
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.run.run import run as run_study
@@ -195,6 +196,31 @@ def test_what_is_observed_may_be_any_of_them_in_any_number():
     np.add.at(spread, (slice(None), which), weights)
     np.testing.assert_allclose(other.adjoint(weights), everything.adjoint(spread), rtol=1e-9)
     np.testing.assert_allclose(other.mesh_error().outputs, everything.mesh_error().outputs[which])
+
+
+RANKS = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from tests.inverse.methods.test_forces import NUMBERS, specimen
+
+model = specimen().build(MPI.COMM_WORLD, NUMBERS)
+solution = model.solve(np.array([1e4, 0.1, 0.1]))
+found = solution.outputs, solution.tangent(np.eye(3)), solution.adjoint(np.eye(len(model.outputs)))
+if MPI.COMM_WORLD.rank == 0:
+    np.savez(sys.argv[1], *found)
+"""
+
+
+@pytest.mark.mpi
+def test_ranks_that_share_a_specimen_find_the_same_forces(tmp_path):
+    run = run_script(2, RANKS, tmp_path / "found.npz")
+    assert run.returncode == 0, run.stderr
+    solution = specimen().build(MPI.COMM_SELF, NUMBERS).solve(np.array([1e4, 0.1, 0.1]))
+    expected = solution.outputs, solution.tangent(np.eye(3)), solution.adjoint(np.eye(len(solution.outputs)))
+    with np.load(tmp_path / "found.npz") as found:
+        for name, values in zip(found.files, expected, strict=True):
+            np.testing.assert_allclose(found[name], values, atol=1e-9 * np.abs(values).max())
 
 
 # --- what forces tell ------------------------------------------------------------------------------------------------
