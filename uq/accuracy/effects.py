@@ -39,6 +39,10 @@ FEWEST_ANSWERS = 2  # of estimates: one alone does not say how far it is from ot
 DOUBT = 0.25  # of an estimate that is calibrated, relative to it, where what calibrates it does not say
 ELSEWHERE, CHANGED = 0.15, 0.5  # the same of what was found at the mean, at other parameters, and where errors vary
 UNCALIBRATED = 0.5  # of one that is not, or by a typical factor: elements of one degree more err too
+WITHOUT = {  # variables whose error of the mesh is not estimated
+    "active_direction": "the active subspace",
+    "field_sobol_first": "the Sobol' indices of the displacement field",
+}
 DIRECTIONS = 12  # of what the estimates leave open, at most, along which its consequences are looked at
 
 
@@ -99,6 +103,13 @@ def with_mesh_errors(
         variables |= _of_fields(dataset, inputs, centre, drawn, found)
     dataset = dataset.assign(variables)
     add(dataset, *doubts(dataset, found.evaluations, told))
+    left_out = [words for name, words in WITHOUT.items() if name in dataset]
+    if "mesh_error" in dataset and left_out:
+        text = (
+            f"The error of the mesh is not estimated of {' and of '.join(left_out)}, which follow from more than "
+            "outputs; that of the outputs says how large it may be."
+        )
+        add(dataset, Finding("note", text))
     if len(found.points) and not found.measured and np.isfinite(found.saturation).any():
         text = (
             "What part of the error of the mesh estimates see is not measured on a finer mesh, which would take too "

@@ -302,6 +302,13 @@ def test_what_is_seen_is_doubted_more_where_it_varies():
     assert moving[1] > steady[1] + 0.1
 
 
+def test_what_has_no_estimate_is_named():
+    _, found = studied(DerivativeBased(samples=64), on_mesh(affine))
+    assert sum("not estimated of the active subspace" in one.text for one in findings(found)) == 1
+    _, found = studied(Chaos(samples=24), on_mesh(affine))
+    assert not any("not estimated of" in one.text for one in findings(found))
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_estimates_with_a_typical_calibration_say_so(measured):
     model = replace(on_mesh(affine), seen=0.8, measured=measured)
