@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import locale
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -120,6 +121,7 @@ def _polydata(path: Path) -> Points:
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkPolyDataReader()
     shown = vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    words = locale.setlocale(locale.LC_ALL)  # the legacy reader leaves "C", in which no later text could hold "±"
     try:
         if path.suffix != ".vtp":
             reader.ReadAllScalarsOn()
@@ -128,6 +130,7 @@ def _polydata(path: Path) -> Points:
         reader.SetFileName(str(path))
         reader.Update()
     finally:
+        locale.setlocale(locale.LC_ALL, words)
         vtkLogger.SetStderrVerbosity(shown)
     mesh, as_numbers = reader.GetOutput(), cast("Any", numpy_support).vtk_to_numpy
     if reader.GetErrorCode() or not mesh.GetNumberOfPoints():

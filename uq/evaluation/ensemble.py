@@ -8,6 +8,7 @@ in order.
 from __future__ import annotations
 
 import gc
+import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -145,23 +146,43 @@ class Ensemble:
         -------
         object
             What the task returned, on rank 0; None on the other ranks.
+
+        Raises
+        ------
+        Exception
+            What the task raises, on all ranks: the others would wait for rank 0 to write results.
         """
         with self.turns(progress) as turns:
             worker = _Worker(self, _Models(model, others or {}, passing), checkpoint, turns)
             if self.world.rank > 0:
                 with abort_all(self.world):
-                    while (order := self.told(None)) is not None:
+                    while isinstance(order := self.told(None), str | _Order):
                         worker.work(order)
+                if order is not None:
+                    raise order
                 return None
+            ended = None
             try:
                 return task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes))
+            except Exception as error:
+                ended = _told_to_others(error)
+                raise
             finally:
-                self.told(None)
+                self.told(ended)
 
     def told(self, order: O) -> O:
         """Return what rank 0 says, for which the others may wait long; collective."""
         gather_here(self.world)
         return cast("O", self.world.bcast(order))
+
+
+def _told_to_others(error: Exception) -> Exception:
+    """Return an exception as it can be sent to other ranks."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return StopError(str(error))
+    return error
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -94,7 +95,7 @@ def _place(steps: Sequence[str | int], place: str) -> str:
     for step in steps:
         if isinstance(step, int):
             place += f"[{step}]"
-        elif (step not in _TAGS or place == "candidates") and not _INNER.match(step) and not _MEMBER.match(step):
+        elif (step not in _kinds() or place == "candidates") and not _INNER.match(step) and not _MEMBER.match(step):
             place += f".{cut(step, _WORD)}" if place else cut(step, _WORD)
     return place
 
@@ -121,15 +122,16 @@ _WORD = 60  # letters of a key in a message
 
 
 def _kinds() -> set[str]:
-    """Return the kinds of blocks, which pydantic includes in the locations of errors."""
+    """Return what pydantic includes in the locations of errors: kinds, and a field whose keys are in its own block."""
     from typing import get_args
 
     from forward.bodies import geometry, inclusions
-    from inverse.data.registration import Registration
 
-    unions = (geometry.Body, inclusions.Inclusion, Distribution, Registration)
-    members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return {member.model_fields["kind"].default for member in members}
-
-
-_TAGS = _kinds() | {"sampling"}  # and the field of `Entry` whose keys are in its own block
+    unions = [geometry.Body, inclusions.Inclusion, Distribution]
+    scans = sys.modules.get("inverse.data.registration")  # others do not import inversion
+    members = [
+        member
+        for union in [*unions, *([scans.Registration] if scans else [])]
+        for member in get_args(get_args(union)[0])
+    ]
+    return {member.model_fields["kind"].default for member in members} | {"sampling"}

@@ -70,8 +70,11 @@ def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> I
                 total, corrected = (values[key] for key in (f"{first}total_error", f"{name}_corrected"))
                 doubt, its = (values[key] for key in (f"{first}mesh_error_doubt", f"{name}_corrected_error"))
                 of_mesh = [_signed(error, doubt), _error(total), f"{_value(corrected, its)} ± {_error(its)}"]
-            elif error is not None:  # of the finest of several meshes
-                of_mesh = [f"{error:+.2g}", _error(values[f"{first}total_error"]), NONE]
+            elif (
+                error is not None
+            ):  # of the finest of several meshes; comparisons look at one finer mesh, and add nothing
+                total = values.get(f"{first}total_error")
+                of_mesh = [f"{error:+.2g}", NONE if total is None else _error(total), NONE]
             sampling = values[f"{name}_error"]
             rows.append((f"  {name}", _value(values[name], sampling), _error(sampling), *of_mesh))
     yield from _table(rows)

@@ -1,5 +1,6 @@
 """Scans: every format gives the same data, pairs of surfaces their difference, and one line for what is wrong."""
 
+import locale
 import random
 import struct
 from pathlib import Path
@@ -71,7 +72,9 @@ def write(path):
         found = pyvista.PolyData(POINTS, np.column_stack([np.full(4, 3), TRIANGLES]).ravel())
         for name, values in arrays.items():
             found.point_data[name] = values
+        words = locale.setlocale(locale.LC_ALL)
         found.save(path)
+        locale.setlocale(locale.LC_ALL, words)  # VTK leaves "C"
     elif path.suffix == ".ply":
         columns = dict(zip(("ux", "uy", "uz"), HOLES.T, strict=True))
         triangles = TRIANGLES.astype(np.int32)
@@ -87,7 +90,9 @@ FORMATS = ("scan.csv", "scan.vtu", "scan.vtk", "scan.xdmf", "dolfinx.xdmf", "sca
 def test_every_format_says_the_same(tmp_path, name):
     write(tmp_path / name)
     scan = Scan(file=name, units=None if name.endswith("csv") else "mm", sigma=1e-4)
+    before = locale.setlocale(locale.LC_ALL)
     found = read(tmp_path, scan, ("press",)).with_sigma(scan.sigma)
+    assert locale.setlocale(locale.LC_ALL) == before
     np.testing.assert_allclose(found.places, POINTS / 1e3, rtol=1e-6)
     np.testing.assert_allclose(found.displacements, HOLES / 1e3, rtol=1e-6)
     expected = np.full(6, 1e-4) if name == "dolfinx.xdmf" else SIGMA / 1e3

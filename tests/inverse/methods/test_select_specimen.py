@@ -141,7 +141,8 @@ def test_studies_are_complete_in_themselves(study):
             '"normal", mean = -1e4',
             "candidates.right.parameters: 99.4 % of the values are impossible; at the medians, material: not stable",
         ),
-        ('file = "table.csv"', 'file = "table.csv"\nunits = 1', "data.units: unknown key; did you mean 'unit'"),
+        ('file = "table.csv"', 'file = "table.csv"\nunit_ = 1', "data.unit_: unknown key; did you mean 'unit"),
+        ('file = "table.csv"', 'file = "table.csv"\nunits = 1', "data.units: input should be a valid string; given 1"),
     ],
 )
 def test_one_line_for_a_mistake(study, old, new, told):

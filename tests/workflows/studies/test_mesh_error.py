@@ -1,6 +1,7 @@
 """The error of the mesh over the distribution: studies of bodies, against finer meshes."""
 
 import json
+import re
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from uq.findings import findings
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, dump, load, parse
 from workflows.run.plan import plan
+from workflows.run.run import run as run_study
 
 TINY = ROOT / "configs" / "tiny.toml"
 OFF = "accuracy.mesh_error=false"
@@ -116,6 +118,19 @@ def test_every_method_has_them(method):
         assert (found["total_error"] > abs(found["mesh_error"])).all() or "bias_error" in found
         assert (found["total_error"] >= found["mean_error"]).all()
         assert (found["std_total_error"] >= found["std_error"]).all()
+
+
+@pytest.mark.fem
+def test_comparisons_with_one_finer_mesh_end_in_words(tmp_path, capsys):
+    """They have an error of the mesh, and no total one."""
+    method = (
+        "{kind='compare', repeats=2, textbook=0, mesh_error=true, methods=[{kind='monte-carlo', budgets=[4]}],"
+        " reference={kind='chaos', samples=8, max_order=2}}"
+    )
+    study = load(TINY, [f"method={method}", "model.body.cells=[2, 1, 1]", OFF])
+    run_study(study, "tiny", tmp_path / "out", report=False)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  mean")][:1]
+    assert re.search(r"[+-]\d\S* +– +–", line), line
 
 
 @pytest.mark.fem
