@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uq.estimators.moments import Coefficient, Moments, estimate, estimate_from_samples, half_width, monomials
+from uq.estimators.tails import skewed
 from workflows.report.plots.figure import CONTROLLED, DARK, HIGH, PLAIN, axes, count_axis, quantity, text_of
 
 if TYPE_CHECKING:
@@ -42,12 +44,20 @@ def running_estimates(
     deviations = dataset["values"].sel(output=output).to_numpy()[ok] - nominal
     if not controlled:
         sums = monomials(deviations, None).cumsum(axis=1)
-        return [estimate(sums[:, n - 1], n, nominal) for n in counts]
+        return [_lengthened(estimate(sums[:, n - 1], n, nominal), deviations[:n]) for n in counts]
     steps = (dataset["points"] - dataset["parameter_mean"]).transpose("sample", "parameter").to_numpy()[ok]
     controls = steps @ dataset["derivative"].sel(output=output).to_numpy()
     coefficient: Coefficient = "one" if bool((dataset["coefficient"] == 1).all()) else "optimal"
     unused = np.zeros_like(nominal)  # the variance of the control, on which the mean does not depend
-    return [estimate_from_samples(deviations[:n], controls[:n], nominal, unused, coefficient) for n in counts]
+    found = [estimate_from_samples(deviations[:n], controls[:n], nominal, unused, coefficient) for n in counts]
+    return [
+        _lengthened(one, deviations[:n] - one.coefficient * controls[:n]) for one, n in zip(found, counts, strict=True)
+    ]
+
+
+def _lengthened(found: Moments, first: NDArray[np.float64]) -> Moments:
+    """Count the skewness of the samples (n,) of a mean in its error, as the study does."""
+    return replace(found, mean_error=found.mean_error * skewed(first))
 
 
 def convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
