@@ -280,6 +280,17 @@ def _own_fields(inputs: Inputs, order: int, points: FloatArray, fields: FloatArr
     return moments["mean"], moments["std"]
 
 
+def quiet_openturns() -> Any:
+    """Return OpenTURNS without its log, or None where it is not installed, and say so."""
+    try:
+        import openturns
+    except ImportError:
+        print("OpenTURNS is not installed and left out: pip install -c constraints.txt -e '.[benchmarks]'\n")
+        return None
+    openturns.Log.Show(openturns.Log.NONE)
+    return openturns
+
+
 def main(arguments: Sequence[str] = ()) -> None:
     """Print errors on samples of their own, averaged over designs (root mean squares), and times of field fits.
 
@@ -288,13 +299,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks chaos")
     parser.add_argument("--cases", default="")
     options = parser.parse_args(arguments)
-    try:
-        import openturns
-    except ImportError:
-        openturns = None
-        print("OpenTURNS is not installed and left out: pip install -c constraints.txt -e '.[benchmarks]'\n")
-    else:
-        openturns.Log.Show(openturns.Log.NONE)
+    openturns = quiet_openturns()
     print(f"{SEEDS} designs each; mean and standard deviation relative, Sobol' indices the largest, of first order")
     print(f"\n{HEAD}\n|{'---|' * 9}")
     for case in _cases():

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.chaos import quiet_openturns
 from benchmarks.coverage import CASES, Case, Vectorised, truth
 from forward.model import FloatArray
 from uq.evaluation.evaluate import Request
@@ -118,14 +119,7 @@ def _indices() -> None:
 
 def main() -> None:
     """Print both tables."""
-    try:
-        import openturns
-    except ImportError:
-        openturns = None
-        print("OpenTURNS is not installed and left out: pip install -c constraints.txt -e '.[benchmarks]'\n")
-    else:
-        openturns.Log.Show(openturns.Log.NONE)
-    _deviations(openturns)
+    _deviations(quiet_openturns())
     print()
     try:
         _indices()

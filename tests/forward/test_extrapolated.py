@@ -38,8 +38,8 @@ def test_outputs_and_derivatives_are_those_of_the_limit():
     assert found.mesh_error() is None
 
 
-def test_other_meshes_take_the_place_of_those_without_an_answer():
-    """At some parameters; or at all, where there is none at the start: searches without an answer take minutes."""
+def without_answer_at_one():
+    """A mesh that has no answer where the first parameter is 1, and the values of it that were tried."""
     tried = []
 
     def fails(p):
@@ -49,7 +49,13 @@ def test_other_meshes_take_the_place_of_those_without_an_answer():
             raise SolveError(message)
         return on(0.2).function(p)
 
-    there, start = FunctionModel(fails, NAMES, ("y", "z")), np.array([1.0, 1.0])
+    return FunctionModel(fails, NAMES, ("y", "z")), tried
+
+
+def test_other_meshes_take_the_place_of_those_without_an_answer():
+    """At some parameters; or at all, where there is none at the start: searches without an answer take minutes."""
+    there, tried = without_answer_at_one()
+    start = np.array([1.0, 1.0])
     other = Extrapolated(on(0.4), on(0.5), 0.7)
     lost = Extrapolated(there, on(0.3), 0.8, start, otherwise=other)
     np.testing.assert_array_equal(lost.solve(POINT).outputs, other.solve(POINT).outputs)
@@ -62,21 +68,13 @@ def test_other_meshes_take_the_place_of_those_without_an_answer():
 
 
 def test_a_start_without_an_answer_is_none():
-    tried = []
-
-    def fails(p):
-        tried.append(p[0])
-        if p[0] == 1.0:
-            message = "not there"
-            raise SolveError(message)
-        return on(0.2).function(p)
-
-    model = Extrapolated(FunctionModel(fails, NAMES, ("y", "z")), on(0.3), 0.8, np.array([1.0, 1.0]))
+    there, tried = without_answer_at_one()
+    model = Extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
     np.testing.assert_allclose(model.solve(POINT).outputs, MODEL.solve(POINT).outputs)
     with pytest.raises(SolveError, match="not there"):
         model.solve(np.array([1.0, 1.0]))
     tried.clear()
-    first = Extrapolated(FunctionModel(fails, NAMES, ("y", "z")), on(0.3), 0.8, np.array([1.0, 1.0]))
+    first = Extrapolated(there, on(0.3), 0.8, np.array([1.0, 1.0]))
     with pytest.raises(SolveError, match="not there"):
         first.solve(np.array([1.0, 1.0]))
     assert tried == [1.0]  # a search without an answer takes minutes, and is not repeated
