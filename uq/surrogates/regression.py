@@ -239,12 +239,15 @@ class _Folds:
         Index (n,) of the selection that leaves the sample out.
     which
         Functions (K, P) of each selection.
+    coefficients
+        Those (K, P, m) of the fit of each selection.
     errors
         Errors (n, rows, m) at each sample, by the fit without it.
     """
 
     held: IntArray
     which: IntArray
+    coefficients: FloatArray
     errors: FloatArray
 
 
@@ -264,10 +267,11 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     order = np.argsort(held, kind="stable")
     data, held = data.some(order), held[order]
     left, right = data.left(largest), data.right
-    scores, least = _scores(candidates, left, right, data, held, slice(None))
+    products = _Products.of(left, held)
+    scores, least = _scores(candidates, products, right, data, held, slice(None))
     explained = least <= NOTHING
     if explained.any() and not explained.all():
-        scores, _ = _scores(candidates, left, right, data, held, np.flatnonzero(explained))
+        scores, _ = _scores(candidates, products, right, data, held, np.flatnonzero(explained))
     if not scores:
         message = f"{n} samples have an answer, too few for an expansion of order 1"
         raise SolveError(message)
@@ -283,7 +287,12 @@ _Scores = list[tuple[float, Candidate, _Folds | None]]
 
 
 def _scores(
-    candidates: Candidates, left: FloatArray, right: FloatArray, data: Data, held: IntArray, judged: slice | IntArray
+    candidates: Candidates,
+    products: _Products,
+    right: FloatArray,
+    data: Data,
+    held: IntArray,
+    judged: slice | IntArray,
 ) -> tuple[_Scores, FloatArray]:
     """Return the largest leave-one-out error of the outputs `judged` by each choice, and the least of each output (m,).
 
@@ -296,7 +305,6 @@ def _scores(
     for candidate in candidates.sets:
         terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
         if candidate.sparse and (d > FULL or n * rows > d):
-            products = _Products.of(left[:, :, candidate.which], held)
             score, chosen, folds, relative = _select(products, right, data, candidate, held, most, judged)
             scores.append((score, chosen, folds))
         elif (
@@ -304,7 +312,7 @@ def _scores(
             and terms <= n * rows
             and (candidate.order == 1 or len(candidates.sets) == 1 or terms <= most)
         ):
-            q, r = np.linalg.qr(left[:, :, candidate.which].reshape(n * rows, -1))
+            q, r = np.linalg.qr(products.columns[:, candidate.which])
             size = np.abs(np.diag(r))
             if size.min() > 1e-10 * size.max():
                 blocks = q.reshape(n, rows, terms)
@@ -340,47 +348,52 @@ def _left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> Float
 class _Products:
     """Inner products of the columns of a regression, without the rows of each number in turn.
 
+    They are computed where they are asked for, once for all dictionaries.
+
     Attributes
     ----------
     columns
         The matrix (n rows, P), samples that are left out together next to each other.
     parts
         The rows of each number.
-    gram
-        Products (P, P) over all rows.
     """
 
     columns: FloatArray
     parts: tuple[slice, ...]
-    gram: FloatArray
     _known: dict[int, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, left: FloatArray, held: IntArray) -> _Products:
         """Take the matrix (n, rows, P) of samples with ascending numbers `held` (n,)."""
         ends = left.shape[1] * np.searchsorted(held, np.arange(held.max() + 2))
-        columns = left.reshape(-1, left.shape[2])
-        return cls(columns, tuple(slice(*pair) for pair in pairwise(ends.tolist())), columns.T @ columns)
+        return cls(left.reshape(-1, left.shape[2]), tuple(slice(*pair) for pair in pairwise(ends.tolist())))
 
     def lengths(self) -> FloatArray:
         """Squared lengths (F + 1, P) of the columns without the rows of each number; the last with all rows."""
-        total = np.diag(self.gram)
-        return np.array([*(total - (self.columns[part] ** 2).sum(axis=0) for part in self.parts), total])
+        return _without_each(np.array([np.einsum("rp,rp->p", part, part) for part in self._within]))
 
     def rows(self, pick: IntArray, likely: IntArray) -> FloatArray:
-        """Products (F + 1, P) of all columns with column `pick` (F + 1,) for each number.
+        """Products (F + 1, P) of all columns with column `pick` (F + 1,) for each number; the last with all rows.
 
-        Products within the parts are computed for many columns at once: for those `likely` to be needed next.
+        They are computed for many columns at once: for those `likely` to be needed next.
         """
-        missing = [j for j in dict.fromkeys(pick[:-1].tolist()) if j not in self._known]
+        missing = [j for j in dict.fromkeys(pick.tolist()) if j not in self._known]
         if missing:
             wanted = [*missing, *(j for j in likely.tolist() if j not in missing and j not in self._known)]
-            found = [self.columns[part][:, wanted].T @ self.columns[part] for part in self.parts]
-            self._known.update(zip(wanted, np.stack(found, axis=1), strict=True))
-        rows = self.gram[pick]
-        for k, j in enumerate(pick[:-1].tolist()):
-            rows[k] -= self._known[j][k]
-        return rows
+            found = np.stack([part[:, wanted].T @ part for part in self._within], axis=1)
+            self._known.update((j, _without_each(one)) for j, one in zip(wanted, found, strict=True))
+        return np.array([self._known[j][k] for k, j in enumerate(pick.tolist())])
+
+    @property
+    def _within(self) -> Iterator[FloatArray]:
+        """The rows of each number."""
+        return (self.columns[part] for part in self.parts)
+
+
+def _without_each(parts: FloatArray) -> FloatArray:
+    """Sums (F + 1, P) of parts (F, P) without each of them, and of all."""
+    total = parts.sum(axis=0)
+    return np.array([*(total - part for part in parts), total])
 
 
 def _select(
@@ -404,19 +417,23 @@ def _select(
         The relative error at the samples left out, the functions selected from all samples, and those without some;
         the least relative error (m,) of each output at any step.
     """
+    from scipy.linalg import solve_triangular
+
     n, rows, m = right.shape
-    columns, parts, folds = products.columns, products.parts, len(products.parts)
+    which, parts, folds = dictionary.which, products.parts, len(products.parts)
     size, scale = (np.linalg.norm(one, axis=(0, 1)) for one in (right, right - right.mean(axis=0)))
     scale = np.where(scale > ROUNDING * size, scale, np.maximum(size, 1e-300))  # a constant needs no function
     rest = (right / scale).reshape(n * rows, m)
-    explained = np.tile(columns.T @ rest, (folds + 1, 1, 1))
+    explained = np.tile((products.columns.T @ rest)[which], (folds + 1, 1, 1))
     for k, part in enumerate(parts):
-        explained[k] -= columns[part].T @ rest[part]
-    lengths = products.lengths()
+        explained[k] -= (products.columns[part].T @ rest[part])[which]
+    lengths = products.lengths()[:, which]
     every = np.arange(folds + 1)
     left_over = lengths.copy()
-    limit = min(most, columns.shape[1])
-    q, triangles = np.empty((n * rows, limit)), np.empty((folds + 1, limit, columns.shape[1]))
+    limit = min(most, which.size)
+    # By columns: memory that no function needs is never touched.
+    q, triangles = np.empty((n * rows, limit), order="F"), np.empty((folds + 1, limit, which.size))
+    rotated = np.empty((folds + 1, limit, m))
     taken: list[IntArray] = []
     scores: list[float] = []
     left_out: list[FloatArray] = []
@@ -434,14 +451,14 @@ def _select(
         size = np.sqrt(left_over[every, pick])
         gain = explained[every, pick] / size[:, None]
         before = triangles[every, :step, pick]
-        row = products.rows(pick, likely) - (before[:, None] @ triangles[:, :step])[:, 0]
+        row = products.rows(which[pick], which[likely])[:, which] - (before[:, None] @ triangles[:, :step])[:, 0]
         row /= size[:, None]
-        triangles[:, step] = row
+        triangles[:, step], rotated[:, step] = row, gain
         explained -= row[:, :, None] * gain[:, None]
         left_over -= row**2
         left_over[every, pick] = 0.0
         for k, part in enumerate(parts):
-            direction = (columns[part, pick[k]] - q[part, :step] @ before[k]) / size[k]
+            direction = (products.columns[part, which[pick[k]]] - q[part, :step] @ before[k]) / size[k]
             rest[part] -= direction[:, None] * gain[k]
             q[part, step] = direction
         taken.append(pick)
@@ -450,9 +467,12 @@ def _select(
         least = np.fmin(least, relative)
         scores.append(float(relative[judged].max()))
     count = 1 + int(np.argmax(np.array(scores) <= 1.05 * min(scores) + 1e-13))
-    picks = dictionary.which[np.array(taken[:count])]
-    chosen = Candidate(dictionary.order, dictionary.q, picks[:, -1], sparse=True)
-    return scores[count - 1], chosen, _Folds(held, picks[:, :-1].T, left_out[count - 1]), least
+    picks = np.array(taken[:count])
+    coefficients = np.array(
+        [solve_triangular(triangles[k, :count, picks[:, k]].T, rotated[k, :count] * scale) for k in range(folds)]
+    )
+    chosen = Candidate(dictionary.order, dictionary.q, which[picks[:, -1]], sparse=True)
+    return scores[count - 1], chosen, _Folds(held, which[picks[:, :-1].T], coefficients, left_out[count - 1]), least
 
 
 def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate, folds: _Folds | None) -> Fit:
@@ -474,10 +494,8 @@ def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate,
     else:
         held, errors = folds.held, folds.errors
         without = np.zeros((len(folds.which), left.shape[2], m))
-        for k, which in enumerate(folds.which):
-            kept = folds.held != k
-            q, r = np.linalg.qr(left[np.ix_(np.flatnonzero(kept), np.arange(rows), which)].reshape(-1, which.size))
-            without[k, which] = solve_triangular(r, q.T @ right[kept].reshape(-1, m))
+        for one, which, found in zip(without, folds.which, folds.coefficients, strict=True):
+            one[which] = found
     squares = (residual**2).sum(axis=(0, 1))
     sampled = _sampled(blocks, residual, triangle)
     unseen = errors[:, 0] / np.sqrt(data.weights)[:, None]
