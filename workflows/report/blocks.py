@@ -50,22 +50,24 @@ class Pairs(Block):
 
 @dataclass(frozen=True)
 class Table(Block):
-    """A table; the columns `text` are flush left, and those of them in `long` are wrapped."""
+    """A table; the columns `text` are flush left, and those of them in `long` are wrapped; row `strong` stands out."""
 
     macro = "table"
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     text: frozenset[int] = frozenset({0})
     long: frozenset[int] = frozenset()
+    strong: int | None = None
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in base64 with a caption; a `wide` one has many panels and needs the whole width of the page."""
+    """A picture in base64 with a caption; a `wide` one has many panels and needs the whole width of the page."""
 
     data: str
     caption: str
     wide: bool = False
+    kind: Literal["png", "svg+xml"] = "png"
 
     @classmethod
     def of(cls, png: bytes, caption: str) -> Picture:
@@ -76,7 +78,7 @@ class Picture:
     def drawn(cls, ax: Axes, caption: str) -> Picture:
         """Show the figure of axes."""
         wide = ax.figure.get_figure(root=True).get_size_inches()[0] > HALF
-        return cls(base64.b64encode(plots.png(ax)).decode(), caption, wide=wide)
+        return cls(base64.b64encode(plots.svg(ax)).decode(), caption, wide=wide, kind="svg+xml")
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,54 @@ class Pictures(Block):
     macro = "pictures"
     items: Sequence[Picture]
     small: bool = False
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One number that was asked for.
+
+    Attributes
+    ----------
+    name
+        What it is.
+    value
+        The number, rounded to its error, in a fitting unit.
+    lines
+        What belongs to it: an interval, its errors, what drives it.
+    curve
+        Its distribution: heights (n,) at equal distances over a range, of any scale; empty if it has none.
+    inside
+        Ends of its 95 % interval as parts of that range.
+    ends
+        Words at both ends of the range.
+    leads
+        Whether it is the first of several candidates.
+    """
+
+    name: str
+    value: str
+    lines: Sequence[str] = ()
+    curve: Sequence[float] = ()
+    inside: tuple[float, float] = (0.0, 1.0)
+    ends: tuple[str, str] = ("", "")
+    leads: bool = False
+
+    @property
+    def path(self) -> str:
+        """The curve as a path of SVG, 100 wide and 20 high."""
+        top = max(self.curve, default=0.0) or 1.0
+        step = 100 / max(len(self.curve) - 1, 1)
+        points = "L".join(f"{step * k:.2f} {20 - 19 * y / top:.2f}" for k, y in enumerate(self.curve))
+        return f"M0 20L{points}L100 20Z"
+
+
+@dataclass(frozen=True)
+class Card(Block):
+    """The question of a study in words, and its answers side by side."""
+
+    macro = "card"
+    question: str
+    answers: Sequence[Answer] = ()
 
 
 @dataclass(frozen=True)

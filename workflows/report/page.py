@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -18,6 +19,7 @@ from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 from workflows.run import own_code
 
+TOP = ("answer", "findings", "body")  # sections of the first screen
 Parts = list[tuple[str, list[Block]]]  # sections by their names
 
 
@@ -116,10 +118,31 @@ def render(title: str, parts: Parts) -> str:
     markup = [block for _, blocks in parts for block in _inside(blocks) if isinstance(block, Html)]
     return environment.get_template("report.html.jinja").render(
         title=title,
-        sections=parts,
+        groups=_grouped(parts),
         styles=dict.fromkeys(block.style for block in markup if block.style),
         scripts=dict.fromkeys(block.script for block in markup if block.script),
     )
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Sections below each other; of the first screen, with the body at the side if there is one."""
+
+    sections: Parts
+    top: bool = False
+
+    @property
+    def two(self) -> bool:
+        return any(name == "body" for name, _ in self.sections)
+
+
+def _grouped(parts: Parts) -> list[_Group]:
+    """Put the sections of the first screen into one group, the others before and after it into others."""
+    numbers = [i for i, (name, _) in enumerate(parts) if name in TOP]
+    if not numbers:
+        return [_Group(parts)]
+    first, last = numbers[0], numbers[-1] + 1
+    return [_Group(parts[:first]), _Group(parts[first:last], top=True), _Group(parts[last:])]
 
 
 def _inside(blocks: Iterable[Block]) -> Iterator[Block]:

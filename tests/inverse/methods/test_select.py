@@ -511,7 +511,7 @@ def test_a_study_from_the_command_line(small):
         "Is the best one good?",
         "predicted from the others",
         "Posteriors of",
-        "data:image/png",
+        "data:image/svg+xml",
     ):
         assert words in page
     again = run(None, TISSUQ, "run", small, "--out", small.parent / "one")

@@ -25,7 +25,7 @@ from workflows.results.summary import summarise
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 HEXAHEDRON = [[0, 4, 6, 2, 1, 5, 7, 3]]
-PNG = b"\x89PNG"
+PNG, SVG = b"\x89PNG", b"<svg/>"
 
 
 def study(**method):
@@ -144,7 +144,7 @@ def sampled():
 def undrawn(monkeypatch):
     """Pictures that cost nothing."""
     monkeypatch.setattr(bodies, "pictures", lambda dataset, shown: dict.fromkeys(shown, PNG))
-    monkeypatch.setattr(plots, "png", lambda ax: PNG)
+    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
 
 
 def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
@@ -179,9 +179,9 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
 
 def test_report_is_one_file(tmp_path, sampled, undrawn):
     page = write_report(write(tmp_path / "out", sampled)).read_text()
-    sources = re.findall(r'\bsrc="(.{22})', page)
-    assert set(sources) == {"data:image/png;base64,"}
-    assert not re.search(r"<(script|link|iframe)|url\(|@import|\bhref=", page)
+    sources = re.findall(r'\bsrc="([^,"]*)', page)
+    assert set(sources) == {"data:image/png;base64", "data:image/svg+xml;base64"}
+    assert not re.search(r"<(link|iframe)|<script src|url\((?!#)|@import|\bhref=|fetch\(|https?://", page)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.html", "results.nc", "summary.json"]
 
 
@@ -356,7 +356,7 @@ def test_study_without_fields_has_no_bodies(tmp_path, undrawn, monkeypatch):
 
 
 def test_bodies_that_cannot_be_drawn_leave_a_line(tmp_path, sampled, monkeypatch):
-    monkeypatch.setattr(plots, "png", lambda ax: PNG)
+    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
     monkeypatch.setattr(sys, "executable", "/bin/false")
     page = write_report(write(tmp_path / "out", sampled)).read_text()
     assert NO_BODY in page

@@ -9,7 +9,7 @@ from workflows.report.plots import inversion, selection
 from workflows.report.plots.against_cost import Cost, errors
 from workflows.report.plots.averaged import parts_of_variance
 from workflows.report.plots.budget import error_budget
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, LOW, PLAIN, axes, grid, png, span, svg
 from workflows.report.plots.indices import (
     BARS,
     active_summary,
@@ -65,6 +65,7 @@ __all__ = [
     "span",
     "spectrum",
     "standard_error",
+    "svg",
     "tolerance_bars",
     "tornado",
 ]

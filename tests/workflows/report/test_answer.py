@@ -1,0 +1,115 @@
+"""The answer before everything else, in numbers that people read."""
+
+import html
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import integrate, stats
+
+from tests.workflows.report.test_report import PNG, SVG, solve, study, study_of, write
+from workflows.report import bodies, plots
+from workflows.report.page import write_report
+from workflows.report.readable import interval, percent, quantity, rounded, scale, size, spoken
+from workflows.report.sections import answer
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch):
+    monkeypatch.setattr(bodies, "pictures", lambda dataset, shown: dict.fromkeys(shown, PNG))
+    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "text"),
+    [
+        (0.122790, 4.1e-4, "m", "12.28 cm"),
+        (0.12279, 4.3e-8, "m", "12.2790 cm"),
+        (-0.0035, 1e-4, "m", "−3.5 mm"),
+        (2.345e6, 2e3, "Pa", "2.345 MPa"),
+        (812.3, 15.0, "Pa", "810 Pa"),
+        (3.2e-6, 1e-7, "J", "3.2 µJ"),
+        (7.8e-6, 3e-7, "m³", "7.8 cm³"),
+        (7.8e-6, 0.0, "kg/m³", "7.8 × 10⁻⁶ kg/m³"),
+        (73.739, 0.005, "1", "73.739"),
+        (0.0, 0.0, "m", "0 m"),
+        (0.99999, 1e-6, "m", "99.9990 cm"),
+        (float("nan"), 1.0, "m", "–"),
+    ],
+)
+def test_numbers_are_read_without_counting_zeros(value, error, unit, text):
+    assert quantity(value, error, unit).replace("\u00a0", " ") == text
+
+
+def test_units_fit_over_thirty_powers_of_ten():
+    """What is written is the number, in every unit."""
+    for unit in ("m", "Pa", "N", "J", "m²", "m³", "N/m", "1", "kg"):
+        for value in 3.7 * 10.0 ** np.arange(-15, 16):
+            one, name = scale(value, unit)
+            assert (one == 1.0) == (name == unit)
+            assert rounded(value / one, 0.01 * value / one) != "0"
+
+
+def test_intervals_and_shares_are_short():
+    assert interval(0.11012, 0.13712, "m", 0.1228) == "11.0–13.7\u00a0cm"
+    assert interval(-0.2, 0.31, "1", 0.1) == "−0.20 to 0.31"
+    assert size(3.3e-4, "m") == "330\u00a0µm"
+    assert [percent(x).replace("\u00a0", " ") for x in (0.7123, 0.032, 1e-9, 0.99999, 1.0)] == [
+        "71 %",
+        "3.2 %",
+        "below 0.1 %",
+        "above 99.9 %",
+        "100 %",
+    ]
+    assert spoken("loads.gravity.density") == "gravity density"
+    assert spoken("E") == "E"
+
+
+def test_the_answer_is_on_the_first_screen(tmp_path):
+    dataset = solve(study())
+    page = html.unescape(write_report(write(tmp_path / "out", dataset)).read_text()).replace("\u00a0", " ")
+    places = [page.index(f'<section id="{name}">') for name in ("header", "answer", "body", "distribution", "moments")]
+    assert places == sorted(places)
+    sag = dataset.sel(output="sag")
+    low, high = np.quantile(sag["values"], (0.025, 0.975))
+    said = quantity(float(sag["mean"]), float(sag["mean_error"]), "m").replace("\u00a0", " ")
+    assert f'<p class="value">{said}</p>' in page
+    assert f"95 %: {interval(low, high, 'm', float(sag['mean']))}".replace("\u00a0", " ") in page
+    assert "if gravity density and D1 are uncertain?" in page
+    assert "driven, to first order, by gravity density (" in page
+
+
+def test_intervals_of_an_expansion_are_those_of_its_density():
+    dataset = solve(study(kind="chaos", samples=8, fields=False))
+    one = dataset.sel(output="sag")
+    rng = np.random.default_rng(0)
+    normal = rng.normal(3e5, 2e4, 400_000)
+    exact = np.quantile(0.1 * (rng.uniform(600, 900, 400_000) / 750) ** 2 / (normal / 3e5), (0.025, 0.975))
+    np.testing.assert_allclose(answer.middle(one)[:2], exact, rtol=0.01)
+
+
+def test_small_densities_are_densities():
+    values = stats.norm(5, 2).rvs(4000, random_state=1)
+    at, curve = answer.smooth(values)
+    scaled = curve / integrate.trapezoid(curve, at)
+    np.testing.assert_allclose(scaled, stats.norm(5, 2).pdf(at), atol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["local-sensitivity", "sobol", "derivative-based", "monte-carlo"])
+def test_every_kind_answers(tmp_path, kind):
+    case = study_of({"kind": kind} if kind == "local-sensitivity" else {"kind": kind, "samples": 64})
+    page = write_report(write(tmp_path / "out", solve(case))).read_text()
+    assert page.count('<p class="value">') == 2
+    assert ("moved, by one standard deviation of" in page) == (kind == "local-sensitivity")
+    assert ("<li>driven by" in page) == (kind in ("sobol", "derivative-based"))
+
+
+def test_a_comparison_of_methods_names_the_best(tmp_path):
+    rows = {
+        "a": [{"cost": 10, "cpu_seconds": 1.0, "error": 1e-3}],
+        "b": [{"cost": 10, "cpu_seconds": 1.0, "error": 1e-5}],
+    }
+    results = answer.Results(xr.Dataset(), {"methods": json.loads(json.dumps(rows))}, None)
+    card = answer.compared(results)
+    assert [one.name for one in card.answers if one.leads] == ["b"]

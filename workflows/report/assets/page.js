@@ -1,0 +1,69 @@
+"use strict";
+// Tables are sorted by their heads and saved as CSV; pictures are saved as they are.
+(() => {
+  const save = (name, url) => { const a = document.createElement("a"); a.href = url; a.download = name; a.click(); };
+  const slug = (text) => text.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "").slice(0, 60) || "report";
+  const study = slug(document.title.split(" – ")[0]);
+  const button = (words, label, action) => {
+    const b = document.createElement("button");
+    b.type = "button"; b.textContent = words; b.setAttribute("aria-label", label); b.addEventListener("click", action);
+    return b;
+  };
+  const tools = (...buttons) => { const d = document.createElement("div"); d.className = "tools"; d.append(...buttons); return d; };
+  const before = (element) => {
+    const heads = [...document.querySelectorAll("h1, h2, h3")].filter(
+      (h) => !h.closest(".answer") && h.compareDocumentPosition(element) & Node.DOCUMENT_POSITION_FOLLOWING);
+    return heads.length ? heads[heads.length - 1].textContent : "table";
+  };
+  // The number at the beginning of a cell: "(1.2 ± 0.1) × 10⁻⁴ m" is 1.2e-4.
+  const digits = "⁰¹²³⁴⁵⁶⁷⁸⁹";
+  const numeric = (text) => {
+    const plain = text.replace(/−/g, "-").replace(/,/g, "");
+    const found = plain.match(/^[(\s]*([+-]?\d*\.?\d+(?:e[+-]?\d+)?)/i);
+    if (!found) return null;
+    const power = plain.match(/× 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)/);
+    const exponent = power ? Number([...power[1]].map((c) => (c === "⁻" ? "-" : digits.indexOf(c))).join("")) : 0;
+    return Number(found[1]) * 10 ** exponent;
+  };
+  const sort = (table, column, head) => {
+    const ascending = head.getAttribute("aria-sort") !== "ascending";
+    for (const th of table.tHead.rows[0].cells) th.removeAttribute("aria-sort");
+    head.setAttribute("aria-sort", ascending ? "ascending" : "descending");
+    const body = table.tBodies[0], rows = [...body.rows];
+    const keys = new Map(rows.map((row) => [row, row.cells[column] ? row.cells[column].textContent.trim() : ""]));
+    const numbers = rows.every((row) => keys.get(row) === "" || keys.get(row) === "–" || numeric(keys.get(row)) !== null);
+    const value = (row) => (numbers ? numeric(keys.get(row)) : keys.get(row));
+    const last = (row) => keys.get(row) === "" || keys.get(row) === "–";  // stays below, either way
+    rows.sort((a, b) => {
+      if (last(a) || last(b)) return last(a) - last(b);
+      const order = numbers ? value(a) - value(b) : value(a).localeCompare(value(b), "en", { numeric: true });
+      return ascending ? order : -order;
+    });
+    body.append(...rows);
+  };
+  const cell = (text) => (/[",\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text);
+  const csv = (table) => [...table.rows].map(
+    (row) => [...row.cells].map((c) => cell(c.textContent.trim())).join(",")).join("\n") + "\n";
+  for (const table of document.querySelectorAll(".scroll > table")) {
+    const name = before(table);
+    [...table.tHead.rows[0].cells].forEach((head, column) => {
+      if (table.tBodies[0].rows.length < 2) return;
+      const words = document.createElement("button");
+      words.type = "button"; words.title = "sort"; words.append(...head.childNodes);
+      words.addEventListener("click", () => sort(table, column, head));
+      head.append(words);
+    });
+    const file = () => {
+      const url = URL.createObjectURL(new Blob(["\ufeff" + csv(table)], { type: "text/csv" }));
+      save(`${study}-${slug(name)}.csv`, url);
+      setTimeout(() => URL.revokeObjectURL(url), 1000);
+    };
+    table.parentElement.before(tools(button("CSV", `save the table of ${name} as CSV`, file)));
+    table.csv = () => csv(table);
+  }
+  for (const image of document.querySelectorAll("figure > img[src^='data:image/']")) {
+    const kind = image.src.startsWith("data:image/svg") ? "svg" : "png";
+    const words = `save the picture: ${image.alt}`;
+    image.after(tools(button(kind.toUpperCase(), words, () => save(`${study}-${slug(image.alt)}.${kind}`, image.src))));
+  }
+})();

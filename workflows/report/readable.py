@@ -1,0 +1,103 @@
+"""Numbers as people say them: in a unit of the right size, with as many digits as their error allows."""
+
+from __future__ import annotations
+
+import math
+
+from forward.words import NONE, number
+
+# From large to small: what one of it is in the SI unit, and its name. The first that a value reaches is taken.
+SIZES: dict[str, tuple[tuple[float, str], ...]] = {
+    "m": ((1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm")),
+    "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa"), (1e-3, "mPa")),
+    "N": ((1e3, "kN"), (1.0, "N"), (1e-3, "mN"), (1e-6, "µN")),
+    "J": ((1e3, "kJ"), (1.0, "J"), (1e-3, "mJ"), (1e-6, "µJ"), (1e-9, "nJ")),
+    "m²": ((1.0, "m²"), (1e-4, "cm²"), (1e-6, "mm²")),
+    "m³": ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³")),
+    "N/m": ((1e3, "kN/m"), (1.0, "N/m"), (1e-3, "mN/m")),
+}
+LEAD = ("loads", "material", "inclusions", "regions", "fields", "model")  # of paths, not said
+MOST = 6  # digits of a number without an error
+
+
+def scale(value: float, unit: str) -> tuple[float, str]:
+    """Return what one of the fitting unit is in the SI unit, and its name: of 0.12 m, (0.01, "cm").
+
+    What is zero, not finite or beyond all units keeps its own.
+    """
+    sizes = SIZES.get(unit)
+    if sizes is None or not math.isfinite(value) or value == 0:
+        return 1.0, unit
+    smallest = sizes[-1][0]
+    for one, name in sizes:
+        if abs(value) >= one * (1 - 1e-12):
+            return (one, name) if abs(value) < 1e6 * sizes[0][0] else (1.0, unit)
+    return (smallest, sizes[-1][1]) if abs(value) > 1e-3 * smallest else (1.0, unit)
+
+
+def _decimals(error: float, digits: int) -> int:
+    return digits - 1 - math.floor(math.log10(error))
+
+
+def rounded(value: float, error: float, digits: int = 1) -> str:
+    """Write a number, rounded to so many digits of its error; to six digits if it has none."""
+    if not math.isfinite(value):
+        return number(value)
+    if not (math.isfinite(error) and error > 0):
+        return number(value, 4)
+    size = max(abs(value), error)
+    if not 1e-4 <= size < 1e7:
+        kept = max(1, min(MOST, _decimals(error, digits) + 1 + math.floor(math.log10(size))))
+        return number(value, kept)
+    most = MOST - 1 - math.floor(math.log10(size))
+    places = min(_decimals(error, digits), most)
+    return f"{round(value, places):,.{max(places, 0)}f}".replace("-", "−")
+
+
+def quantity(value: float, error: float, unit: str) -> str:
+    """Write a value to the first digit of its error in a fitting unit: 12.28 cm."""
+    one, name = scale(value, unit)
+    return _with(rounded(value / one, error / one), name)
+
+
+def size(value: float, unit: str, digits: int = 2, like: float | None = None) -> str:
+    """Write a number without an error in a fitting unit, as an error itself is: 0.33 mm; or in that of `like`."""
+    one, name = scale(value if like is None else like, unit)
+    return _with(number(value / one, digits), name)
+
+
+def and_error(value: float, error: float, unit: str) -> str:
+    """Write a value and its error in one unit: 12.311 ± 0.009 cm."""
+    one, name = scale(value, unit)
+    return _with(f"{rounded(value / one, error / one)} ± {rounded(error / one, error / one)}", name)
+
+
+def interval(lower: float, upper: float, unit: str, at: float) -> str:
+    """Write an interval, to three digits of its width, in the unit of `at`: 11.0–13.7 cm."""
+    if not (math.isfinite(lower) and math.isfinite(upper)):
+        return NONE
+    one, name = scale(at, unit)
+    width = (upper - lower) / one
+    ends = [rounded(end / one, width / 10 if width > 0 else 0.0) for end in (lower, upper)]
+    return _with((" to " if min(lower, upper) < 0 else "–").join(ends), name)
+
+
+def spoken(path: str) -> str:
+    """Name a number of a model by the end of its path: `loads.gravity.density` is the gravity density."""
+    parts = path.split(".")
+    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in LEAD else parts)
+
+
+def percent(share: float) -> str:
+    """Write a share: 71 %, 3.2 %, below 0.1 %."""
+    if not math.isfinite(share):
+        return NONE
+    if share < 1e-3:
+        return "below 0.1\u00a0%"
+    if 0.9995 <= share < 1:
+        return "above 99.9\u00a0%"
+    return f"{100 * share:.{0 if share >= 0.1 else 1}f}\u00a0%"
+
+
+def _with(text: str, unit: str) -> str:
+    return text if unit == "1" or text == NONE else f"{text}\u00a0{unit}"

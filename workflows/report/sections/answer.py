@@ -1,0 +1,390 @@
+"""The answer, before everything else: the question in words, and each number that was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.words import duration, number
+from workflows.report.blocks import Answer, Block, Card, Text
+from workflows.report.readable import and_error, interval, percent, quantity, size, spoken
+from workflows.report.section import Results, Section
+from workflows.report.sections.error_budget import counting, parts_of
+from workflows.studies.findings_selection import bayes_factor, by_probability, grade
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import FloatArray
+
+ENDS = (0.025, 0.975)
+LEAST = 40  # samples of which quantiles are told
+CURVE = 48  # points of a small density
+TILES = 12  # answers; the others are in the tables
+DRIVERS = 3  # parameters named in a line
+UNSEEN = 0.01  # part of an error that is not worth a word
+SAID = 0.02  # share of the variance that is worth a word
+NAMED = 4  # names in a question
+
+
+class AnswerFirst(Section):
+    """What was asked and found, for every kind of study."""
+
+    def applies(self, results: Results) -> bool:
+        """Return whether it does: always."""
+        return True
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """One card."""
+        dataset = results.dataset
+        for has, card in (
+            ("probability", selection),
+            ("alone_eigenvalue", inversion),
+            ("population_draw", population),
+            ("estimator", compared),
+            ("clean", made),
+            ("nominal", forward),
+            ("candidate_mean", forward),
+        ):
+            if has in dataset or has in dataset.dims:
+                found = card(results)
+                yield Card(found.question, found.answers[:TILES])
+                if len(found.answers) > TILES:
+                    yield Text(f"The other {len(found.answers) - TILES} are in the tables below.")
+                return
+
+
+def forward(results: Results) -> Card:
+    """Each output: its mean, spread, errors, and what drives it; at the mean parameters if nothing was sampled."""
+    of = results.dataset
+    sampled = "mean" in of
+    names = [spoken(str(name)) for name in of["parameter"].values] if "parameter" in of.coords else []
+    path = " at the last step of the path" if "step" in of.coords else ""
+    verb = "is" if len(names) == 1 else "are"
+    uncertain = f"{listed(names)} {verb} uncertain"
+    if not names and sampled:
+        question = (
+            f"How large {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}, by all candidates?"
+        )
+    elif not names:
+        question = f"What {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}?"
+    elif sampled:
+        question = (
+            f"How large {'is' if len(results.drawn) == 1 else 'are'} {listed(results.drawn)}{path}, if {uncertain}?"
+        )
+    else:
+        question = f"How do {listed(names)} change {listed(results.drawn)}{path}?"
+    counts = dict(
+        zip(results.outputs, counting(results) if meshed(results) else np.ones(len(results.outputs)), strict=True)
+    )
+    answers = []
+    for output in results.drawn:
+        name = "mean" if sampled else "nominal"
+        one = of.sel(output=output)
+        value, unit = float(one[name]), results.unit(output)
+        errors = {source: float(e[results.outputs.index(output)]) for source, e in parts_of(results, name).items()}
+        if not counts[output]:
+            answers.append(Answer(output, "0", ("zero but for rounding",)))
+            continue
+        error = whole(errors)
+        lines = [] if not sampled else [spread(one, unit, value)]
+        lines += known(errors, unit, value)
+        if f"{name}_corrected" in one and np.isfinite(one[f"{name}_corrected"]):
+            doubt = f"{name}_corrected_error" if sampled else "nominal_mesh_error_doubt"
+            better, left = float(one[f"{name}_corrected"]), float(one[doubt])
+            lines.append(f"corrected for the mesh: {and_error(better, left, unit)}")
+        lines += drivers(one, unit, sampled=sampled)
+        curve, inside, ends = density(one, unit) if sampled else ((), (0.0, 1.0), ("", ""))
+        answers.append(Answer(output, quantity(value, error, unit), lines, curve, inside, ends))
+    return Card(question, answers)
+
+
+def meshed(results: Results) -> bool:
+    """Say whether the model has a mesh, and with it errors of the mesh."""
+    return bool(getattr(getattr(results.study, "spec", None), "meshed", False))
+
+
+def whole(errors: dict[str, float]) -> float:
+    """Return the total of errors by source: as estimated, otherwise the square root of the sum of squares."""
+    total = errors.get("total", np.nan)
+    parts = [e for source, e in errors.items() if source != "total" and np.isfinite(e)]
+    return total if np.isfinite(total) else float(np.sqrt(np.sum(np.square(parts))))
+
+
+def known(errors: dict[str, float], unit: str, value: float) -> Iterator[str]:
+    """Say how well a number is known, and the parts of its error."""
+    total = whole(errors)
+    parts = [
+        f"{source} {size(e, unit, like=value)}"
+        for source, e in errors.items()
+        if source != "total" and np.isfinite(e) and e >= UNSEEN * total
+    ]
+    if total > 0:
+        yield f"known to ± {size(total, unit, like=value)}" + (f": {', '.join(parts)}" if parts else "")
+    if "sampling" in errors and "mesh" in errors and not np.isfinite(errors["mesh"]):
+        yield "the error of its mesh is not known"
+
+
+def spread(one: xr.Dataset, unit: str, value: float) -> str:
+    """Say where 95 % of the values of an output lie."""
+    lower, upper, by = middle(one)
+    return f"95\u00a0%: {interval(lower, upper, unit, value)}{by}"
+
+
+def middle(one: xr.Dataset) -> tuple[float, float, str]:
+    """Return the ends of the 95 % interval of an output's distribution, and where they are from if not from it."""
+    if "density_edge" in one and np.isfinite(one["density"]).all():
+        edges = one["density_edge"].to_numpy()
+        reached = np.concatenate([[0], np.cumsum(one["density"].to_numpy() * np.diff(edges))])
+        return (*(float(x) for x in np.interp(ENDS, reached / reached[-1], edges)), "")  # type: ignore[return-value]
+    values = samples(one)
+    if len(values) >= LEAST:
+        return (*(float(x) for x in np.quantile(values, ENDS)), "")  # type: ignore[return-value]
+    mean, std = float(one["mean"]), float(one["std"])
+    return mean - 1.96 * std, mean + 1.96 * std, " (mean ± 1.96 standard deviations)"
+
+
+def samples(one: xr.Dataset) -> FloatArray:
+    """Return the values (n,) of an output that were solved at samples of one distribution."""
+    if "values" not in one or one["values"].dims != ("sample",):
+        return np.zeros(0)
+    return np.asarray(one["values"].to_numpy()[one["ok"].to_numpy()] if "ok" in one else one["values"].to_numpy())
+
+
+def density(one: xr.Dataset, unit: str) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
+    """Return a small curve of the distribution of an output, its middle 95 %, and its ends in words."""
+    if "density_edge" in one and np.isfinite(one["density"]).all():
+        edges = one["density_edge"].to_numpy()
+        at = np.linspace(edges[0], edges[-1], CURVE)
+        curve = np.interp(at, (edges[1:] + edges[:-1]) / 2, one["density"].to_numpy(), left=0, right=0)
+    else:
+        values = samples(one)
+        if len(values) < LEAST or np.ptp(values) <= 1e-12 * np.abs(values).max():
+            return (), (0.0, 1.0), ("", "")
+        at, curve = smooth(values)
+    return _curve(at, curve, middle(one)[:2], unit)
+
+
+def _curve(
+    at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str
+) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
+    low, high = float(at[0]), float(at[-1])
+    a, b = (float(np.clip((x - low) / (high - low), 0, 1)) for x in inside)
+    words = interval(low, high, unit, max(abs(low), abs(high)))
+    cut = " to " if " to " in words else "–"
+    left, _, right = words.partition(cut)
+    return [float(y) for y in curve], (a, b), (left, right)
+
+
+def smooth(values: FloatArray, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return places (m,) and the density (m,) of samples (n,) there, with Gaussian kernels on a lattice."""
+    weights = np.ones(len(values)) if weights is None else weights
+    weights = weights / weights.sum()
+    mean = weights @ values
+    std = float(np.sqrt(weights @ (values - mean) ** 2)) or 1.0
+    width = 1.06 * std * float(1 / (weights**2).sum()) ** -0.2
+    low, high = max(values.min(), mean - 5 * std), min(values.max(), mean + 5 * std)
+    at = np.linspace(low - width, high + width, CURVE)
+    counts, edges = np.histogram(values, bins=400, range=(low, high), weights=weights)
+    centres = (edges[1:] + edges[:-1]) / 2
+    return at, np.exp(-0.5 * ((at[:, None] - centres) / width) ** 2) @ counts
+
+
+def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
+    """Say which parameters an output is driven by."""
+    for name, words in (
+        ("sobol_total", "driven by"),
+        ("shapley", "driven by"),
+        ("derivative_per_std", "driven, to first order, by"),
+    ):
+        if name not in one or one[name].dims != ("parameter",):
+            continue
+        effects = one[name].to_numpy()
+        names = [spoken(str(p)) for p in one["parameter"].to_numpy()]
+        if name == "derivative_per_std":
+            if not sampled:
+                largest = np.argsort(-np.abs(effects))[:DRIVERS]
+                moved = (
+                    f"{names[i]} by {'+' if effects[i] > 0 else ''}{size(float(effects[i]), unit)}" for i in largest
+                )
+                yield f"moved, by one standard deviation of: {', '.join(moved)}"
+                return
+            effects = effects**2 / max(float((effects**2).sum()), 1e-300)
+        order = [i for i in np.argsort(-effects)[:DRIVERS] if effects[i] >= SAID]
+        if order and np.isfinite(effects).all():
+            yield f"{words} {', '.join(f'{names[i]} ({percent(float(effects[i]))})' for i in order)}"
+        return
+
+
+def inversion(results: Results) -> Card:
+    """Each unknown: its posterior, and what it was before; of several data sets, how they went."""
+    of, units = results.dataset, results.study.units_of("/")
+    sets = [str(name) for name in of["data_set"].values]
+    data = int(np.isfinite(of["measured"]).sum())
+    kind = "values" if of.attrs.get("quantity") == "output" else "displacements"
+    what = "What is inside" if kind == "displacements" else "Which parameters explain"
+    whose = sets[0] if len(sets) == 1 else f"each of {len(sets)} specimens"
+    if kind == "displacements":
+        question = f"{what} {whose}, given {data:,} measured components of displacements?"
+    else:
+        question = f"{what} {data:,} measured {kind} of {whose}?"
+    if len(sets) > 1:
+        return Card(question, [*_sets(of), *_over_sets(of, units)])
+    if not bool(of["ok"].all()):
+        return Card(question, [Answer(sets[0], "no answer", ("the data could not be inverted; the reason is below",))])
+    one = of.isel(data_set=0)
+    answers = [_unknown(one.sel(parameter=name), str(name), units.get(str(name), "1")) for name in one.parameter.values]
+    if "stiffness_mean" in one and "draw" not in one:
+        answers.insert(0, _stiffness(one))
+    return Card(question, answers)
+
+
+def _sets(of: xr.Dataset) -> Iterator[Answer]:
+    done = int(of["ok"].sum())
+    trusted = int(((of["trust"] <= 1) & of["ok"]).sum())
+    lines = [f"{trusted} with a posterior to be trusted"]
+    if done < of.sizes["data_set"]:
+        lines.append(f"{of.sizes['data_set'] - done} could not be inverted")
+    yield Answer("inverted", f"{done} of {of.sizes['data_set']}", lines)
+
+
+def _over_sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
+    good = of.isel(data_set=np.flatnonzero(of["ok"].to_numpy()))
+    if not good.sizes["data_set"]:
+        return
+    for name in good.parameter.values:
+        mean, std = (good[which].sel(parameter=name).to_numpy() for which in ("mean", "std"))
+        unit, middle_ = units.get(str(name), "1"), float(np.median(mean))
+        lines = [
+            f"specimens from {interval(float(mean.min()), float(mean.max()), unit, middle_)}",
+            f"each known to ± {size(float(np.median(std)), unit, like=middle_)} (median)",
+        ]
+        yield Answer(f"{spoken(str(name))}, median", quantity(middle_, float(np.median(std)), unit), lines)
+
+
+def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
+    mean, std, lower, upper = (float(one[which]) for which in ("mean", "std", "lower", "upper"))
+    before, wide = float(one["prior_mean"]), float(one["prior_std"])
+    narrower = wide / std if std > 0 else np.inf
+    lines = [
+        f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {size(std, unit, like=mean)}",
+        f"before the data {and_error(before, wide, unit)}: "
+        + (f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"),
+    ]
+    if np.isfinite(one["true"]):
+        inside = "inside" if lower <= float(one["true"]) <= upper else "outside the interval"
+        lines.append(f"truth {quantity(float(one['true']), std, unit)}, {inside}")
+    if "draw" in one and one["draw"].ndim == 1:
+        at, curve = smooth(one["draw"].to_numpy())
+        return Answer(spoken(name), quantity(mean, std, unit), lines, *_curve(at, curve, (lower, upper), unit))
+    return Answer(spoken(name), quantity(mean, std, unit), lines)
+
+
+def _stiffness(one: xr.Dataset) -> Answer:
+    factors = np.exp(one["stiffness_mean"].to_numpy())
+    std = one["stiffness_std"].to_numpy()
+    where = one["node_position"].to_numpy()[int(np.argmax(factors))]
+    place = ", ".join(size(float(x), "m", 3) for x in where)
+    least, most = number(float(factors.min()), 2), number(float(factors.max()), 2)
+    lines = [
+        f"stiffest at ({place}), softest {least} times the typical stiffness",
+        f"± {percent(float(np.median(np.expm1(std))))} at a typical node",
+        f"{number(float(one['determined']), 3)} of {one.sizes['node']:,} directions determined",
+    ]
+    return Answer("largest stiffness factor", most, lines)
+
+
+def selection(results: Results) -> Card:
+    """The candidates, the most probable first."""
+    of = results.dataset
+    order = by_probability(of, of["log_evidence"])
+    data = int(np.isfinite(of["measured"]).sum()) if "measured" in of else of.sizes["output"]
+    kind = {"stress": "measured stresses", "displacement": "measured displacements"}.get(
+        str(of.attrs.get("quantity")), "measured values"
+    )
+    question = f"Which of {len(order)} models do {data:,} {kind} support?"
+    answers = []
+    for rank, model in enumerate(order):
+        one = of.sel(model=model)
+        error = float(one["log_evidence_error"])
+        lines = [f"ln Z {number(float(one['log_evidence']), 6)} ± {number(error, 2)}"]
+        if rank == 0 and len(order) > 1:
+            ln_B, _ = bayes_factor(of, model, order[1])
+            lines.append(f"{_odds(ln_B)} over {order[1]}: {grade(abs(ln_B))}")
+        elif rank:
+            lines.append(f"{_odds(bayes_factor(of, order[0], model)[0])} against it")
+        answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
+    return Card(question, answers)
+
+
+def _odds(ln_B: float) -> str:
+    if ln_B > 13:
+        return f"10{str(int(ln_B / np.log(10))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))} to 1"
+    return f"{number(float(np.exp(ln_B)), 2)} to 1"
+
+
+def population(results: Results) -> Card:
+    """Each parameter: the typical specimen, and a new one."""
+    of = results.dataset
+    question = f"What are specimens of this kind like, and what will a new one be like, from {of.sizes['specimen']}?"
+    answers = []
+    for name in results.parameters:
+        unit = results.parameter_unit(name)
+        (low, mid, high), new, scale = (
+            [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
+        )
+        factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
+        spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
+        at, curve = smooth(_trimmed(of["population_draw"].sel(parameter=name).to_numpy()))
+        lines = [
+            f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
+            f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
+            f"specimens differ by {spread_} (one standard deviation)",
+        ]
+        shown = _curve(at, curve, (new[0], new[2]), unit)
+        answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
+    return Card(question, answers)
+
+
+def _trimmed(values: FloatArray) -> FloatArray:
+    """Return values without the outer per cent at each end, which may be far away."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    return np.asarray(values[(values >= low) & (values <= high)])
+
+
+def compared(results: Results) -> Card:
+    """What each method takes for the smallest error that all reach."""
+    found = {name: rows for name, rows in results.summary["methods"].items() if rows}
+    question = "Which method needs the least time for the same error?"
+    best = {name: min(rows, key=lambda row: row["error"]) for name, rows in found.items()}
+    order = sorted(best, key=lambda name: best[name]["error"] ** 2 * best[name]["cpu_seconds"])
+    return Card(
+        question,
+        [
+            Answer(
+                name,
+                f"{number(best[name]['error'], 2)}",
+                (f"error with {number(best[name]['cost'], 4)} solves, {duration(best[name]['cpu_seconds'])}",),
+                leads=rank == 0,
+            )
+            for rank, name in enumerate(order)
+        ],
+    )
+
+
+def made(results: Results) -> Card:
+    """How many data were made."""
+    counts = np.isfinite(results.dataset["values"].to_numpy()).sum(axis=1)
+    names = [str(name) for name in results.dataset["data_set"].values]
+    return Card(
+        "What would be measured, if the truth were known?",
+        [Answer(name, f"{n:,} data", ("in the folder data",)) for name, n in zip(names, counts, strict=True)],
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Write names in a sentence."""
+    names = [*names[:NAMED], f"{len(names) - NAMED} others"] if len(names) > NAMED + 1 else names
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
