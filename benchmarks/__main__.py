@@ -25,6 +25,7 @@ from benchmarks import (
     meshes,
     oddities,
     others,
+    phases,
     population,
     predictions,
     realisation,
@@ -71,6 +72,7 @@ ALL = {
     "others": others.main,
     "scaling": scaling.main,
     "startup": startup.main,
+    "phases": phases.main,
     "adaptive": adaptive.main,
     "indentation": indentation.main,
 }

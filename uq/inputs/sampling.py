@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,20 +57,43 @@ def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int
     A point depends neither on the range in which it is drawn nor on the number of scrambles. Each is uniform in the
     cube (a random linear scramble and a digital shift); different scrambles are independent.
     """
-    from scipy.stats import qmc
-
-    count = 1 << (stop - 1).bit_length()
-    # Balance, about which scipy warns, needs whole powers of two. Newer versions of scipy scramble in other ways.
-    plain = qmc.Sobol(dimension, scramble=False, bits=BITS).random(count)
-    numbers = (plain * 2.0**BITS).astype(np.uint64)
-    powers = 1 << np.arange(count.bit_length() - 1)
-    directions = numbers[powers] ^ numbers[powers - 1]  # points follow each other in Gray code
+    directions = _directions(dimension, (stop - 1).bit_length())
     shift, directions = _scramble(directions, np.random.default_rng([seed, scramble]))
     points = shift[None]
     for direction in directions:
         points = np.concatenate([points, points[::-1] ^ direction])
     # The points are lower corners of cells of this size: the centres lie strictly inside the cube.
     return points[start:stop] * 2.0**-BITS + 2.0 ** -(BITS + 1)
+
+
+def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
+    """Return the first direction numbers (count, d) of Sobol' points, of `BITS` bits.
+
+    S. Joe, F. Y. Kuo, SIAM J. Sci. Comput. 30 (2008) 2635–2654, whose primitive polynomials and first numbers scipy
+    ships; to import scipy.stats takes longer than many a study. scipy has no more dimensions either.
+    """
+    scipy = find_spec("scipy")
+    assert scipy is not None
+    assert scipy.origin is not None
+    with np.load(Path(scipy.origin).parent / "stats" / "_sobol_direction_numbers.npz") as table:
+        polynomials, firsts = (table[name].astype(np.uint64) for name in ("poly", "vinit"))
+    if dimension > len(polynomials):
+        message = f"{dimension} dimensions, expected at most {len(polynomials)} for Sobol' points"
+        raise ValueError(message)
+    found = np.ones((count, dimension), dtype=np.uint64)  # odd numbers m, below 2^(k+1) in row k
+    degrees = np.array([int(p).bit_length() - 1 for p in polynomials[:dimension]])
+    for degree in np.unique(degrees[1:]):  # the first dimension has all ones
+        columns = np.flatnonzero(degrees == degree)
+        columns = columns[columns > 0]
+        known = min(degree, count)
+        found[:known, columns] = firsts[columns, :known].T
+        for row in range(degree, count):
+            new = found[row - degree, columns]
+            for back in range(1, degree + 1):
+                chosen = polynomials[columns] >> np.uint64(degree - back) & np.uint64(1)
+                new ^= chosen * (found[row - back, columns] << np.uint64(back))
+            found[row, columns] = new
+    return np.asarray(found << (BITS - 1 - np.arange(count)).astype(np.uint64)[:, None], dtype=np.uint64)
 
 
 def _scramble(directions: NDArray[np.uint64], random: np.random.Generator) -> tuple[NDArray[np.uint64], ...]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUBDIVISION = 3  # number of times that a face of high order is halved
+SAMPLES = "4"  # of a pixel: eight, the default, take twice as long where processors draw
 DRAWING_SECONDS = 600  # time limit for drawing all bodies
 FIRST, SECOND, DARK = "#9aa5b1", "#d1622b", "#1d2733"
 COLUMNS, ROWS = 3, 3  # of names of colours
@@ -30,7 +33,29 @@ STILL = "#c9ced4"  # of nodes that do not move
 BY_NUMBER = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
 
 
-def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """The surface of an undeformed body with all fields, and its edges: what all pictures of a body share.
+
+    Curved faces of high order are subdivided until smooth. Points move with the fields interpolated there, as the
+    elements do.
+    """
+
+    surface: Any
+    edges: Any
+
+    @staticmethod
+    def of(dataset: xr.Dataset) -> Skin:
+        """Return the surface of the body of some results."""
+        whole = body_grid(dataset).pyvista()
+        surface = whole.extract_surface(nonlinear_subdivision=SUBDIVISION, algorithm="dataset_surface").clean()
+        return Skin(
+            surface,
+            surface.extract_feature_edges(feature_angle=40, manifold_edges=False, non_manifold_edges=False),
+        )
+
+
+def body(dataset: xr.Dataset, shown: str = "mean", skin: Skin | None = None) -> Any:
     """Draw the body, deformed by its mean displacement (the nominal one if there is no mean) and coloured.
 
     Parameters
@@ -44,6 +69,8 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         "sobol_total PARAMETER": that index of the displacement at the node. "dominating": a colour for the parameter
         with the largest total index. "factor FIELD i": realisation i of the factor of a random field, on the undeformed
         body.
+    skin
+        `Skin.of(dataset)`, where several pictures are drawn.
 
     Returns
     -------
@@ -52,28 +79,29 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
     """
     import pyvista
 
-    grid = body_grid(dataset)
-    motion = "mean" if "mean" in grid.point_data else "nominal"
+    skin = Skin.of(dataset) if skin is None else skin
+    motion = "mean" if "mean" in skin.surface.point_data else "nominal"
     parameter = shown.removeprefix("derivative ") if shown.startswith("derivative ") else None
     factor = 1.0 if parameter is None else float(dataset["parameter_std"].sel(parameter=parameter))
-    grid.point_data["colour"] = factor * grid.point_data[shown]
-    scalar = grid.point_data[shown].ndim == 1
     undeformed = shown.startswith("factor ")
-    displacement = np.zeros_like(grid.points) if undeformed else grid.point_data[motion]
+    still = dataset["node_position"].to_numpy()
+    moved = still if undeformed else still + dataset[f"field_{motion}"].to_numpy()
 
     # Two panels, so that the scale of the colours never covers the body.
     plotter: Any = pyvista.Plotter(
         off_screen=True, window_size=[1200, 860], shape=(2, 1), row_weights=[6, 1], border=False
     )
     plotter.set_background("white")
-    plotter.add_mesh(_edges(grid), color=FIRST, line_width=2)
+    plotter.add_mesh(skin.edges, color=FIRST, line_width=2)
     if shown == "std":
         for sign in (-1, 1):
-            edge = grid.point_data[motion] + sign * np.sign(grid.point_data[motion]) * grid.point_data["std"]
-            plotter.add_mesh(_edges(grid, edge), color=SECOND, line_width=2)
-    surface = _surface(grid, displacement)
+            edges = _moved(skin.edges, motion)
+            edges.points += sign * np.sign(edges.point_data[motion]) * edges.point_data["std"]
+            plotter.add_mesh(edges, color=SECOND, line_width=2)
+    surface, edges = (one if undeformed else _moved(one, motion) for one in (skin.surface, skin.edges))
     # The magnitude after the subdivision: between the nodes it is that of the interpolated vector, never negative.
-    colour = np.asarray(surface.point_data["colour"])
+    colour = factor * np.asarray(surface.point_data[shown])
+    scalar = colour.ndim == 1
     surface.point_data["magnitude"] = colour if scalar else np.linalg.norm(colour, axis=1)
     colours: Any = "cividis" if scalar else "plasma" if shown == "std" else "viridis"
     ends: tuple[float, float] | None = None
@@ -98,10 +126,10 @@ def body(dataset: xr.Dataset, shown: str = "mean") -> Any:
         show_scalar_bar=False,
         nan_color=STILL,
     )
-    plotter.add_mesh(_edges(grid, displacement), color=DARK, line_width=1.5)
+    plotter.add_mesh(edges, color=DARK, line_width=1.5)
     for tool in () if undeformed else tools_of(dataset):
-        plotter.add_mesh(tool_surface(tool, grid.points), color=TOOL, opacity=0.45, smooth_shading=True)
-    _show_lengths(plotter, np.concatenate([grid.points, grid.points + displacement]), _up(dataset))
+        plotter.add_mesh(tool_surface(tool, still), color=TOOL, opacity=0.45, smooth_shading=True)
+    _show_lengths(plotter, np.concatenate([still, moved]), _up(dataset))
     _look(plotter, _up(dataset))
     plotter.subplot(1, 0)
     if shown == "dominating":
@@ -129,7 +157,7 @@ def mesh(dataset: xr.Dataset, shown: str = "mesh") -> Any:
     """
     import pyvista
 
-    grid, up = mesh_grid(dataset), _up(dataset)
+    grid, up = mesh_grid(dataset).pyvista(), _up(dataset)
     density = grid.cell_data["indicator by volume"] * grid.volume
     grid.cell_data["colour"] = np.log10(np.maximum(density, 1e-3 * density.max()))
     plotter: Any = pyvista.Plotter(
@@ -168,6 +196,7 @@ def pictures(dataset: xr.Dataset, shown: Sequence[str]) -> dict[str, bytes] | No
             capture_output=True,
             check=True,
             timeout=DRAWING_SECONDS,
+            env={"PYVISTA_MULTI_SAMPLES": SAMPLES, **os.environ},
             cwd=Path(__file__).resolve().parents[2],
         )
         return dict(pickle.loads(done.stdout))
@@ -181,21 +210,11 @@ def _range(dataset: xr.Dataset, shown: str) -> tuple[float, float]:
     return float(factors.min()), float(factors.max())
 
 
-def _surface(grid: Any, displacement: FloatArray | None = None) -> Any:
-    """Return the (displaced) surface with all fields; curved faces of high order are subdivided until smooth."""
-    moved = grid.copy()
-    if displacement is not None:
-        moved.points = grid.points + displacement
-    return moved.extract_surface(nonlinear_subdivision=SUBDIVISION, algorithm="dataset_surface").clean()
-
-
-def _edges(grid: Any, displacement: FloatArray | None = None) -> Any:
-    """Return the edges of the undeformed body, displaced."""
-    whole = grid.copy()
-    whole.point_data["motion"] = np.zeros_like(grid.points) if displacement is None else displacement
-    edges = _surface(whole).extract_feature_edges(feature_angle=40, manifold_edges=False, non_manifold_edges=False)
-    edges.points = edges.points + edges.point_data["motion"]
-    return edges
+def _moved(mesh: Any, motion: str) -> Any:
+    """Return a copy of a mesh whose points are moved by one of its fields."""
+    found = mesh.copy()
+    found.points = mesh.points + mesh.point_data[motion]
+    return found
 
 
 def _up(dataset: xr.Dataset) -> FloatArray:
@@ -312,13 +331,16 @@ def _colour_title(shown: str, parameter: str | None) -> str:
 def _draw_for_parent() -> None:
     """Read a dataset and what to show from standard input, and write the pictures to standard output."""
     dataset, shown = pickle.load(sys.stdin.buffer)
-    drawn = {name: (mesh if name.startswith("mesh") else body)(dataset, name) for name in shown}
+    skin = Skin.of(dataset) if any(not name.startswith("mesh") for name in shown) else None
+    drawn = {name: mesh(dataset, name) if name.startswith("mesh") else body(dataset, name, skin) for name in shown}
     pickle.dump({name: _png(plotter) for name, plotter in drawn.items()}, sys.stdout.buffer)
 
 
 def _png(plotter: Any) -> bytes:
+    from PIL import Image
+
     file = io.BytesIO()
-    plotter.screenshot(file)
+    Image.fromarray(plotter.screenshot(return_img=True)).save(file, "png")
     plotter.close()
     return file.getvalue()
 

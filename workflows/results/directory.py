@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from forward.machine import write_whole
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
-from workflows.results.tools import surface, tools_of
+from workflows.results.tools import tool_grid, tools_of
+from workflows.results.vtu import Grid, vtu
 
 if TYPE_CHECKING:
     import xarray as xr
 
 ROUNDING = 2.0**-52
+TETRAHEDRON = 10  # of VTK
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 
@@ -103,41 +105,33 @@ def with_regions(dataset: xr.Dataset, names: Sequence[str], numbers: NDArray[np.
     return dataset.assign_coords(region=list(names)).assign(cell_region=(("cell",), numbers))
 
 
-def body_grid(dataset: xr.Dataset) -> Any:
-    """Return the undeformed mesh as a pyvista grid with the fields of the results at its nodes.
+def body_grid(dataset: xr.Dataset) -> Grid:
+    """Return the undeformed mesh with the fields of the results at its nodes.
 
     Unknown values are NaN, and fields without any values are left out: VTK cannot read vectors whose lengths are all
     infinite or NaN.
     """
-    import pyvista
+    fields = {
+        name: np.where(known, values, np.nan)
+        for name, values in node_fields(dataset).items()
+        if (known := np.isfinite(values)).any()
+    }
+    return Grid(
+        points=dataset["node_position"].to_numpy(),
+        cells=dataset["cell_nodes"].to_numpy(),
+        kind=int(dataset["cell_nodes"].attrs["vtk_cell_type"]),
+        point_data=fields,
+        cell_data={"region": dataset["cell_region"].to_numpy()} if "cell_region" in dataset else {},
+    )
 
-    cells = dataset["cell_nodes"].to_numpy()
-    sizes = np.full((len(cells), 1), cells.shape[1])
-    kinds = np.full(len(cells), dataset["cell_nodes"].attrs["vtk_cell_type"])
-    grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, dataset["node_position"].to_numpy())
-    for name, values in node_fields(dataset).items():
-        known = np.isfinite(values)
-        if known.any():
-            grid.point_data[name] = np.where(known, values, np.nan)
-    if "cell_region" in dataset:
-        grid.cell_data["region"] = dataset["cell_region"].to_numpy()
-    return grid
 
-
-def mesh_grid(dataset: xr.Dataset) -> Any:
-    """Return a mesh that was refined as a pyvista grid, with what each cell adds to errors, also by its volume."""
-    import pyvista
-
-    cells = dataset["mesh_cell_vertices"].to_numpy()
-    sizes = np.full((len(cells), 1), cells.shape[1])
-    kinds = np.full(len(cells), pyvista.CellType.TETRA)
-    points = dataset["mesh_vertex_position"].to_numpy()
-    grid = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), kinds, points)
+def mesh_grid(dataset: xr.Dataset) -> Grid:
+    """Return a mesh that was refined, with what each cell adds to errors, also by its volume."""
+    cells, points = (dataset[f"mesh_{name}"].to_numpy() for name in ("cell_vertices", "vertex_position"))
     at = points[cells]
     shares = dataset["mesh_indicator"].to_numpy()
-    grid.cell_data["indicator"] = shares
-    grid.cell_data["indicator by volume"] = shares / (np.abs(np.linalg.det(at[:, 1:] - at[:, :1])) / 6)
-    return grid
+    by_volume = shares / (np.abs(np.linalg.det(at[:, 1:] - at[:, :1])) / 6)
+    return Grid(points, cells, TETRAHEDRON, {}, {"indicator": shares, "indicator by volume": by_volume})
 
 
 def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
@@ -147,7 +141,7 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     points with what was measured and predicted there in another; a mesh that was
     refined is in one with what its cells add to errors; every tool is in one, at its depth.
     """
-    grids: dict[str, Callable[[], Any]] = {}
+    grids: dict[str, Callable[[], Grid]] = {}
     if "cell_nodes" in dataset and "data_set" in dataset.dims:
         names = dataset.data_set.values
         grids = {str(name): partial(body_grid, dataset.sel(data_set=name)) for name in names}
@@ -161,28 +155,12 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
         grids = {"mesh": partial(mesh_grid, dataset)} | grids
     if "cell_nodes" in dataset:
         points = dataset["node_position"].to_numpy()
-        grids = {f"tool-{tool.label}": partial(_tool_grid, tool, points) for tool in tools_of(dataset)} | grids
+        grids = {f"tool-{tool.label}": partial(tool_grid, tool, points) for tool in tools_of(dataset)} | grids
     for name, grid in grids.items():
         directory.mkdir(exist_ok=True)
         path = directory / f"{name}.vtu"
-        write_whole(path, _vtu(grid()))
+        write_whole(path, vtu(grid()))
     return path
-
-
-def _tool_grid(tool: Any, points: NDArray[np.float64]) -> Any:
-    return surface(tool, points).cast_to_unstructured_grid()
-
-
-def _vtu(grid: Any) -> bytes:
-    """Return a pyvista grid as a ParaView file: VTK itself could leave half a file without an error."""
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.SetInputData(grid)
-    writer.SetDataModeToBinary()
-    writer.WriteToOutputStringOn()
-    writer.Write()
-    return bytes(writer.GetOutputString().encode())
 
 
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray
+from workflows.results.vtu import Grid
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 N = 3  # axes of displacements
+VERTEX = 1  # of VTK
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +78,13 @@ def has_points(one: xr.Dataset) -> bool:
     return "datum_axis" in one and bool((one["datum_axis"] < N).any())
 
 
-def points_grid(one: xr.Dataset) -> Any:
-    """Return the points of all load cases as a pyvista grid: a vertex for each point and load case."""
-    import pyvista
-
+def points_grid(one: xr.Dataset) -> Grid:
+    """Return the points of all load cases: a vertex for each point and load case."""
     parts = [part for part in measured_points(one) if len(part.places)]
     places = np.concatenate([part.places for part in parts])
-    vertices = np.column_stack([np.ones(len(places), dtype=np.int64), np.arange(len(places))]).ravel()
-    grid: Any = pyvista.UnstructuredGrid(vertices, np.ones(len(places), dtype=np.uint8), places)
-    for name in ("measured", "predicted", "residuals", "over", "moved"):
-        grid.point_data["residual_over_error" if name == "over" else name] = np.concatenate(
-            [getattr(part, name) for part in parts]
-        )
-    grid.point_data["load_case"] = np.repeat(np.arange(len(parts)), [len(part.places) for part in parts])
-    return grid
+    data = {
+        "residual_over_error" if name == "over" else name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("measured", "predicted", "residuals", "over", "moved")
+    }
+    data["load_case"] = np.repeat(np.arange(len(parts)), [len(part.places) for part in parts])
+    return Grid(places, np.arange(len(places))[:, None], VERTEX, data)

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
+from workflows.results.vtu import Grid
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.terms.indenter import Indenter
 
+TRIANGLE = 5  # of VTK
 POINTS = 96  # of the lattice on which distances are computed, along each axis
 SHOWN = 0.35  # part of the body's extent that a tool without end is drawn over, to each side
 
@@ -68,3 +70,9 @@ def surface(tool: Indenter, points: FloatArray) -> Any:
     lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(centre - lengths))
     lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
     return lattice.contour([0.0], scalars="gap")
+
+
+def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
+    """Return the surface of a tool, in triangles."""
+    triangles = surface(tool, points).triangulate()
+    return Grid(np.asarray(triangles.points), triangles.regular_faces, TRIANGLE)

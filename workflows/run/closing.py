@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from forward.words import NONE, named
@@ -22,7 +21,7 @@ WIDTH = 24  # letters of a bar
 Row = Sequence[str]
 
 
-def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Summarise the results at the end of a run."""
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
@@ -48,8 +47,6 @@ def closing_words(directory: Path, dataset: xr.Dataset, summary: dict[str, Any])
     if "note" in summary:
         lines.append(summary["note"])
     lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
-    if (directory / "report.html").exists():
-        lines.append(f"report: {directory / 'report.html'}")
     return "\n".join(lines) + "\n"
 
 

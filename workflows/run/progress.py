@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 
 SECONDS_BETWEEN_LINES = 60.0
+SECONDS_BETWEEN_MARKS = 1.0  # that the rate is computed between
+BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} solves [{elapsed}{postfix}]"
 
 
 class Progress:
@@ -22,6 +25,11 @@ class Progress:
     failures
         Whether solves without an answer are failures, which are shown; in inversions they may be parameters with zero
         likelihood.
+
+    Notes
+    -----
+    The rate is that of the last minute, after the first solves were finished: those compile forms and factorise, which
+    is not repeated, and what was read from disk at first took no time.
     """
 
     def __init__(self, planned: int, *, quiet: bool = False, silent: bool = False, failures: bool = True) -> None:
@@ -30,7 +38,8 @@ class Progress:
         self._planned = planned
         self._failures = failures
         self._begin = time.monotonic()
-        self._shown, self._before = self._begin, 0  # when the last line was printed, and the count then
+        self._shown = self._begin  # when the last line was printed
+        self._marks: deque[tuple[float, int]] = deque()  # times and the counts then, from the first finished solve on
         self._bar = None
         terminal = sys.stderr.isatty()
         self._quiet = quiet or silent
@@ -38,19 +47,23 @@ class Progress:
         if terminal and not self._quiet:
             from tqdm import tqdm
 
-            self._bar = tqdm(total=planned, unit="solve", smoothing=0.05, dynamic_ncols=True)
+            self._bar = tqdm(total=planned, dynamic_ncols=True, bar_format=BAR)
 
     def __call__(self, done: int, failed: int) -> None:
         """Count solves that were finished, and how many of them failed."""
         self.done += done
         self.failed += failed if self._failures else 0
+        now = time.monotonic()
+        if not self._marks or now - self._marks[-1][0] >= SECONDS_BETWEEN_MARKS:
+            self._marks.append((now, self.done))
+        while len(self._marks) > 1 and now - self._marks[1][0] >= SECONDS_BETWEEN_LINES:
+            self._marks.popleft()
         if self._bar is not None:
+            self._bar.set_postfix_str(self._pace(now) + self._failures_so_far(), refresh=False)
             self._bar.update(done)
-            if self.failed:
-                self._bar.set_postfix(failed=self.failed)
-        elif self._lines and time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
-            self._print_line(self._shown, self._before)
-            self._shown, self._before = time.monotonic(), self.done
+        elif self._lines and now - self._shown >= SECONDS_BETWEEN_LINES:
+            self._print(self._pace(now))
+            self._shown = now
 
     def close(self) -> None:
         """Show the last state."""
@@ -59,16 +72,23 @@ class Progress:
             self._bar.close()
         elif not self._quiet:
             self._planned = self.done
-            self._print_line(self._begin, 0)
+            seconds = time.monotonic() - self._begin
+            self._print(f"{self.done / seconds if seconds > 0 else 0.0:.3g} per second, 0:00 left")
 
-    def _print_line(self, since: float, before: int) -> None:
-        """Print the progress, with the rate since a given time: what was read from disk at first took no time."""
-        seconds = time.monotonic() - since
-        rate = (self.done - before) / seconds if seconds > 0 else 0.0
+    def _pace(self, now: float) -> str:
+        """Solves per second since the first of the marks, and the time left by that."""
+        then, before = self._marks[0]
+        rate = (self.done - before) / (now - then) if now > then else 0.0
         left = max(self._planned - self.done, 0) / rate if rate > 0 else float("inf")
-        line = f"{self.done}/{max(self._planned, self.done)} solves, {rate:.3g} per second, {_clock(left)} left"
-        sys.stderr.write(line + (f", {self.failed} failed" if self.failed else "") + "\n")
+        return f"{rate:.3g} per second, {_clock(left)} left"
+
+    def _print(self, pace: str) -> None:
+        line = f"{self.done}/{max(self._planned, self.done)} solves, {pace}{self._failures_so_far()}"
+        sys.stderr.write(f"{line}\n")
         sys.stderr.flush()
+
+    def _failures_so_far(self) -> str:
+        return f", {self.failed} failed" if self.failed else ""
 
 
 def _clock(seconds: float) -> str:

@@ -153,10 +153,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         wall = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
         _leave(directory, dataset, evaluations, summary, checkpoint, job)
-        if report:
-            _report(directory)
-        if not quiet:
-            sys.stdout.write(closing_words(directory, dataset, summary))
+        _tell(directory, "" if quiet else closing_words(dataset, summary), report=report)
         return exit_code(summary)
 
 
@@ -211,6 +208,16 @@ def _leave(
     summary["provenance"]["results_sha256"] = digest(directory)
     write_text(directory / "summary.json", json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
     checkpoint.clear()
+
+
+def _tell(directory: Path, words: str, *, report: bool) -> None:
+    """Print the last words, if there are any, and then draw the report: what was found need not wait for pictures."""
+    sys.stdout.write(words)
+    sys.stdout.flush()
+    if report:
+        _report(directory)
+    if words and (directory / "report.html").exists():
+        sys.stdout.write(f"report: {directory / 'report.html'}\n")
 
 
 def _report(directory: Path) -> None:

@@ -18,7 +18,7 @@ from uq.inputs.distributions import (
     Uniform,
 )
 from uq.inputs.random_parameters import Inputs
-from uq.inputs.sampling import random_points
+from uq.inputs.sampling import even_points, random_points, sobol_points
 
 pytestmark = pytest.mark.unit
 
@@ -239,3 +239,16 @@ def test_normal_coordinates_of_awkward_distributions(marginal):
 def test_distributions_too_narrow_for_numbers_are_refused(build):
     with pytest.raises(ValueError, match="too narrow for double precision"):
         build()
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 7, 40, 300])
+def test_sobol_points_are_those_of_scipy_before_they_are_scrambled(dimension, monkeypatch):
+    """A scramble by the unit matrix and no shift leaves them."""
+    monkeypatch.setattr("uq.inputs.sampling._scramble", lambda found, _: (np.zeros(dimension, np.uint64), found))
+    expected = stats.qmc.Sobol(dimension, scramble=False, bits=52).random(2**9)
+    np.testing.assert_array_equal(sobol_points(1, 0, 0, 2**9, dimension) - 2.0**-53, expected)
+
+
+def test_more_dimensions_than_sobol_points_have():
+    with pytest.raises(ValueError, match="30000 dimensions, expected at most 21201"):
+        even_points(8, 30000)

@@ -44,6 +44,20 @@ def test_check_needs_neither_fenicsx_nor_mpi():
     assert "unknowns    405" in done.stdout
 
 
+def test_a_run_imports_nothing_that_draws(tmp_path):
+    """Nor scipy.stats for Sobol' points, nor VTK for files that ParaView reads."""
+    script = (
+        "import sys; from workflows.__main__ import main; code = main(['run', *sys.argv[1:], '--no-report']); "
+        "heavy = {'matplotlib', 'PIL', 'pyvista', 'vtkmodules', 'jinja2', 'chaospy', 'scipy.stats', 'inverse'}; "
+        "print(sorted(heavy & set(sys.modules))); sys.exit(code)"
+    )
+    chaos = ("--set", 'method.kind="chaos"', "--set", "method.samples=6", "--set", "method.max_order=2")
+    done = run_script(None, script, TINY, *chaos, "--set", "mesh_error=false", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert (tmp_path / "out" / "fields" / "displacement.vtu").exists()
+
+
 def test_uq_does_not_import_fenicsx():
     script = (
         "import sys, uq.methods.monte_carlo, uq.evaluation.evaluate, uq.evaluation.checkpoint; "

@@ -85,6 +85,28 @@ def tissuq(*arguments, ranks=None, case="", limits=()):
     )
 
 
+def test_results_are_printed_and_kept_before_the_report_is_drawn(study, tmp_path):
+    out = tmp_path / "out"
+    command = [TISSUQ, "run", study, "--out", out]
+    begun = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
+    assert begun.stdout is not None
+    said = []
+    while not (said and said[-1].startswith("101 solves in")):
+        said.append(begun.stdout.readline())
+        assert said[-1], said
+    begun.kill()
+    begun.wait()
+    begun.stdout.close()
+    assert said[0].startswith("y: mean 0.51")
+    assert not (out / "report.html").exists()
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["status"], summary["evaluations"]) == ("complete", 101)
+    assert tissuq("report", out).returncode == 0
+    assert (out / "report.html").exists()
+    again = tissuq("run", study, "--out", out)
+    assert (again.returncode, again.stdout) == (0, f"{out}: finished before, nothing to do\n")
+
+
 def reasons(done):
     """The lines that say why, without progress and what mpirun adds; and no traceback."""
     assert "Traceback" not in done.stderr, done.stderr

@@ -67,6 +67,30 @@ def test_a_line_a_minute_off_the_terminal(capsys, clock):
 
 
 @pytest.mark.unit
+def test_the_first_solve_does_not_spoil_the_time_left(capsys, clock, monkeypatch):
+    """It compiles and factorises, which is not repeated: 80 s here, and half a second for each of the others."""
+    shown = Progress(1001)
+    for number in range(400):
+        clock.now += 80.0 if number == 0 else 0.5
+        shown(1, 0)
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first == "1/1001 solves, 0 per second, unknown time left"
+    left = [int(line.split()[0].partition("/")[0]) for line in others]
+    assert [line.split(", ")[2] for line in others] == [
+        f"{minutes}:{seconds:02d} left" for minutes, seconds in (divmod(round((1001 - n) / 2), 60) for n in left)
+    ]
+    assert len(others) >= 3
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    clock.now = 0.0
+    shown = Progress(81)
+    for number in range(2):
+        clock.now += 80.0 if number == 0 else 0.5
+        shown(1, 0)
+    assert shown._bar.postfix == "2 per second, 0:40 left"  # not the 53 minutes of 40 s for each
+    shown.close()
+
+
+@pytest.mark.unit
 def test_quiet_runs_still_show_life(capsys, clock):
     assert lines(capsys, clock, quiet=True) == lines(capsys, clock)[:-1]
     assert lines(capsys, clock, silent=True) == []
