@@ -193,6 +193,33 @@ class Rigid:
         )
 
 
+class UncertainMotion(Settings):
+    """What is uncertain of the rigid motions of a scan.
+
+    Parameters
+    ----------
+    root
+        Lᵀ of the registration, rows of rotations (rad) and translations (m); none if that is known.
+    between
+        Standard deviations (rad, m) of motions between the undeformed scan and that of each load case.
+    centre
+        About which it turns (m); by default the mean of the points.
+    """
+
+    root: tuple[tuple[float, float, float, float, float, float], ...] = ()
+    between: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float, float] | None = None
+
+    @classmethod
+    def of(cls, registered: Registered | None, between: tuple[float, float]) -> UncertainMotion | None:
+        """Return that of a registration, and of motions between scans (rad, m); None if nothing is uncertain."""
+        known = registered is None or not registered.uncertain
+        if known and not any(between):
+            return None
+        root = () if registered is None or known else tuple(map(tuple, registered.root.tolist()))
+        return cls(root=root, between=between, centre=None if registered is None else tuple(registered.centre.tolist()))
+
+
 @dataclass(frozen=True, eq=False)
 class Registered:
     """A registration.

@@ -20,10 +20,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray
+from forward.model import FloatArray, SolveError
 from inverse.data.approximation_error import Whitening
-from inverse.data.registration import Rigid, slopes
+from inverse.data.registration import Rigid, UncertainMotion, slopes
 from inverse.fields.low_rank import Spectrum
+from uq.evaluation.evaluate import Evaluate, Request
 
 STEP = 1e-4  # of the extent of the points: how far they are moved for derivatives
 DETERMINED = 1.0  # eigenvalue from which on data say more about a motion than the registration
@@ -61,6 +62,33 @@ class SharedMotion:
     centre: FloatArray
     project: Callable[[FloatArray], FloatArray] | None = None
 
+    @classmethod
+    def of(
+        cls,
+        places: FloatArray,
+        along: FloatArray,
+        cases: NDArray[np.int64],
+        motion: UncertainMotion,
+        project: Callable[[FloatArray], FloatArray] | None = None,
+    ) -> SharedMotion | None:
+        """Return those of data, of which some may be at no place (NaN), as forces; None if none of it can move.
+
+        Parameters
+        ----------
+        places, along, cases, project
+            As of the class.
+        motion
+            What is uncertain.
+        """
+        root = np.reshape(motion.root, (-1, 6))
+        root = root[np.linalg.norm(root, axis=1) > 0]
+        there = np.isfinite(places).all(axis=1)
+        if not there.any() or not (len(root) or any(motion.between)):
+            return None
+        known = np.where(there[:, None], places, places[there][0])
+        centre = known[there].mean(axis=0) if motion.centre is None else np.array(motion.centre)
+        return cls(known, along, cases, root, np.repeat(motion.between, 3), centre, project)
+
     @cached_property
     def steps(self) -> FloatArray:
         """Motions (k, 6) by which points are moved, parallel to the rows of the root; the largest moves are small."""
@@ -87,6 +115,20 @@ class SharedMotion:
         cases = np.concatenate([np.repeat(self.cases, 3), np.tile(self.cases, len(self.root))])
         return np.argsort(cases, kind="stable")
 
+    def errors_by(self, evaluate: Evaluate) -> Shared:
+        """Return the function parameters (d,) → what the data share (k, m), given the model of what is observed.
+
+        It raises `SolveError` where that has no answer.
+        """
+
+        def errors(point: FloatArray) -> FloatArray:
+            found = evaluate(Request(point[None]))
+            for failure in found.failures:
+                raise SolveError(failure.reason)
+            return self.errors(found.outputs[0])
+
+        return errors
+
     def errors(self, outputs: FloatArray) -> FloatArray:
         """Return what the data share (k, m), given the observed outputs (n,) of a state."""
         m = len(self.places)
@@ -104,6 +146,13 @@ class SharedMotion:
             each = np.einsum("ma,mak->km", self.along, slopes(self.places + u, self.centre)) * self.between[:, None]
             rows += [row * (self.cases == case) for case in np.unique(self.cases) for row in each]
         return np.array(rows).reshape(-1, m)
+
+
+def said(values: FloatArray) -> str:
+    """Say what data determine, given the eigenvalues (k,) of `determined`."""
+    seen, count = int((values > DETERMINED).sum()), len(values)
+    words = f"of {count} rigid motions that are uncertain, the data determine {seen} better than was known before"
+    return words + ("" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise")
 
 
 def determined(spectrum: Spectrum, whitening: Whitening, shared: FloatArray, root: FloatArray) -> FloatArray:

@@ -170,11 +170,12 @@ def corrected_few(
 def _evidence(posterior: Posterior, at: Density, error: FloatArray) -> float:
     """What predictions that are larger by `error` (m,) add to ln Z of the model that is linear at a point."""
     alone = replace(posterior, mesh=None)
-    d, s = len(posterior.inputs.names), float((alone.scale(at.x) / alone.sigma)[0, 0])
+    white = alone.whitening
+    d, s = len(posterior.inputs.names), float((alone.scale(at.x) / white.sigma)[0, 0])
     which = slice(None) if posterior.which is None else list(posterior.which)
     A = s * alone.sensitivities(at)[0]
-    residual = (posterior.data - at.everything[0, which]) / posterior.sigma
-    return evidence_moved(A, residual + A @ at.x[0, :d], error / posterior.sigma, posterior.noise)
+    residual = white((posterior.data - at.everything[0, which]) / white.sigma)
+    return evidence_moved(A, residual + A @ at.x[0, :d], white(error / white.sigma), posterior.noise)
 
 
 def corrected_field(

@@ -20,8 +20,9 @@ from forward.settings import Settings
 from inverse.criticism.comparison import Assessment, Candidate, Data, comparison
 from inverse.criticism.finer import Finer, MeshFound
 from inverse.data.approximation_error import Places
+from inverse.data.shared_motion import Shared, determined
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
-from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.nested import nested
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.mesh_correction import MeshTreatment, Treatment, before_few, corrected_few
@@ -131,6 +132,7 @@ class Select(Settings):
         free: Callable[[str, str], Evaluate] | None = None,
         finer: Callable[[str, str], Finer] | None = None,
         say: Callable[[str], None] = lambda line: None,
+        shared: Mapping[tuple[str, str], Shared] | None = None,
     ) -> xr.Dataset:
         """Compare candidates.
 
@@ -148,6 +150,8 @@ class Select(Settings):
             The same on a finer mesh; by default there are no meshes.
         say
             Shows the user a line before the search of each candidate.
+        shared
+            What errors the data share, by candidate and group; by default they are independent.
 
         Returns
         -------
@@ -163,10 +167,13 @@ class Select(Settings):
         posteriors, stated, meshes = {}, {}, {}
         for name, group in pairs:
             one = started(posterior(candidates[name], data_groups[group], self.noise, evaluate(name, group)))
+            errors = None if shared is None else shared.get((name, group))
+            if errors is not None:
+                one = replace(one, shared=errors(one.inputs.mean))
             look = None if finer is None else (finer(name, group), _places(data_groups[group]))
             if look is not None and self.treatment is not None:
                 before_few(one, look[0], lambda line, name=name: say(f"{name}: {line}"))  # type: ignore[misc]
-            posteriors[name, group], stated[name, group], found = self._assess(one, (name, group), look)
+            posteriors[name, group], stated[name, group], found = self._assess(one, (name, group), look, errors)
             if found is not None:
                 meshes[name, group] = found
         variants: dict[str, dict[tuple[str, str], tuple[float, float]]] = {
@@ -196,7 +203,11 @@ class Select(Settings):
             if self.held_out
             else {}
         )
-        return comparison(candidates, data_groups, posteriors, stated, variants, checks, left_out, meshes)
+        result = comparison(candidates, data_groups, posteriors, stated, variants, checks, left_out, meshes)
+        if not shared:
+            return result
+        seen = [_motions(posteriors[pair], stated[pair].gaussian) for pair in pairs]
+        return result.assign(motion_eigenvalue=(("model", "motion"), np.array(seen)))
 
     def _without(
         self, test: str, data_groups: Mapping[str, Data], posteriors: Mapping[tuple[str, str], Posterior]
@@ -216,12 +227,20 @@ class Select(Settings):
         return None
 
     def _assess(
-        self, posterior: Posterior, pair: tuple[str, str], look: tuple[Finer, Places] | None = None
+        self,
+        posterior: Posterior,
+        pair: tuple[str, str],
+        look: tuple[Finer, Places] | None = None,
+        shared: Shared | None = None,
     ) -> tuple[Posterior, Assessment, MeshFound | None]:
         """Find mode and evidence; the posterior too, with solves that start from the mode, corrected for its mesh."""
         try:
             gaussian, found = laplace(posterior, starts=self.starts, seed=self.seed), None
-            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, : len(posterior.inputs.names)])
+            d = len(posterior.inputs.names)
+            if shared is not None:  # which depends on the displacements
+                posterior = replace(posterior, shared=shared(posterior.physical(gaussian.mode[None])[0, :d]))
+                gaussian = laplace(posterior, starts=1, first=gaussian.mode)
+            near = started(posterior, posterior.physical(gaussian.mode[None, :])[0, :d])
             if look is not None:
                 near, gaussian, found = corrected_few(near, gaussian, *look, self.treatment or "report")
             return near, Assessment(gaussian, evidence(near, gaussian, self.samples, seed=self.seed)), found
@@ -276,6 +295,15 @@ def started(posterior: Posterior, point: FloatArray | None = None) -> Posterior:
     return replace(posterior, start=start)
 
 
+def _motions(posterior: Posterior, gaussian: Laplace) -> FloatArray:
+    """What the data say about rigid motions that are uncertain, at the mode, as `determined`."""
+    from inverse.criticism.predictive import spectrum_of
+
+    assert posterior.shared is not None
+    at = posterior.at(gaussian.mode[None], derivatives=True)
+    return determined(spectrum_of(posterior, at), posterior.whitening, posterior.shared, np.ones(posterior.data.size))
+
+
 def _with_noise(posterior: Posterior, data: Data, noise: Noise) -> Posterior:
     """The same with other errors."""
     return replace(posterior, sigma=noise.sigma(data.values, data.sigma), noise=noise.factor)
@@ -294,8 +322,9 @@ def _only(posterior: Posterior, data: Data, tests: tuple[str, ...]) -> Posterior
     """The same with the data of some tests only."""
     which = np.array([i for i in range(data.values.size) if data.tests[i] in tests])
     mesh = None if posterior.mesh is None else posterior.mesh.of(which)
+    shared = None if posterior.shared is None else posterior.shared[:, which]
     values, sigma = posterior.data[which], posterior.sigma[which]
-    return replace(posterior, data=values, sigma=sigma, which=tuple(which.tolist()), mesh=mesh)
+    return replace(posterior, data=values, sigma=sigma, which=tuple(which.tolist()), mesh=mesh, shared=shared)
 
 
 def _rescaled(found: Evidence, posterior: Posterior, width: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, Severity
-from inverse.data.shared_motion import DETERMINED
+from inverse.data.shared_motion import said
 from uq.findings import add
 
 if TYPE_CHECKING:
@@ -92,11 +92,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
         found += [criticism.Doubt("note", line, "") for line in measured.warnings]
     if "motion_eigenvalue" in one:
         values = one["motion_eigenvalue"].to_numpy()
-        values = values[np.isfinite(values)]
-        seen, count = int((values > DETERMINED).sum()), len(values)
-        words = f"of {count} rigid motions that are uncertain, the data determine {seen} better than was known before"
-        rest = "" if seen == count else f"; {count - seen} cannot be separated from the unknowns and the noise"
-        found.append(criticism.Doubt("note", words + rest, ""))
+        found.append(criticism.Doubt("note", said(values[np.isfinite(values)]), ""))
     found += (
         criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
     )

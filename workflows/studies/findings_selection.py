@@ -97,6 +97,10 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
             said.append(Finding("warning", f"Whole tests are predicted best, from the others, by {predicts}."))
+    if "motion_eigenvalue" in dataset:
+        from inverse.data.shared_motion import said as determined
+
+        said.append(Finding("note", f"{best}: {determined(dataset['motion_eigenvalue'].sel(model=best).to_numpy())}."))
     doubtful, samples = _doubtful(dataset, order)
     if doubtful:
         text = f"Evidences not to be trusted: {', '.join(doubtful)}; method.samples = {samples} may help."

@@ -15,7 +15,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
-from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder, Request
+from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.evaluation.kept import KeptEvaluate, KeptModel
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
@@ -24,7 +24,7 @@ from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_meshes, solved_by
 from workflows.studies.inversion import Inversion, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
-from workflows.studies.job import MethodJob, TasksJob
+from workflows.studies.job import MOVED, MethodJob, TasksJob
 from workflows.studies.output_inversion import OutputInversion, derivable
 from workflows.studies.predictions import has_mesh
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.kept import KeptEvaluate, KeptModel
 
-MOVED = "moved points"  # in names of models
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
 
@@ -293,15 +292,7 @@ def _shared(
     if both is None:
         return None
     motion, model = both
-    evaluate = evaluation(model)
-
-    def errors(point: FloatArray) -> FloatArray:
-        found = evaluate(Request(point[None]))
-        for failure in found.failures:
-            raise SolveError(failure.reason)
-        return motion.errors(found.outputs[0])
-
-    return errors
+    return motion.errors_by(evaluation(model))
 
 
 def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | None:

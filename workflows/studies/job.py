@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from uq.evaluation.tasks import Outcome
     from uq.evaluation.turns import Progress
 
+MOVED = "moved points"  # in names of models
 ArvizGroups = Callable[["xr.Dataset"], Mapping[str, "xr.Dataset"]]
 Texts = Callable[["xr.Dataset"], Mapping[str, str]]
 

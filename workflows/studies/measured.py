@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -20,7 +20,7 @@ from forward.settings import Settings, one_line
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.observations import SCANS, Observations, Placed
 from inverse.data.readings import Units
-from inverse.data.registration import Registered, ToSurface, register
+from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from workflows.config.mistakes import lines
@@ -169,22 +169,12 @@ class Measurement:
         """Return what is uncertain of rigid motions, as errors that the data share; None if nothing is."""
         from inverse.data.shared_motion import SharedMotion
 
-        registered = self.registered
-        root = registered.root if registered is not None and registered.uncertain else np.zeros((0, 6))
-        root = root[np.linalg.norm(root, axis=1) > 0]
-        if not len(root) and not any(self.between):
+        motion = UncertainMotion.of(self.registered, self.between)
+        if motion is None:
             return None
         data = self.observations.components()
-        places = data.places
-        there = np.isfinite(places).all(axis=1)
-        if not there.any():  # other outputs alone, which do not move
-            return None
-        places = np.where(there[:, None], places, places[there][0])
-        centre = registered.centre if registered is not None else places[there].mean(axis=0)
-        surface = Surface.of(body) if self.on_surface else None
-        project = (lambda points: surface.nearest(points)[0]) if surface is not None else None
-        between = np.repeat(self.between, 3)
-        return SharedMotion(places, data.along, data.cases, root, between, centre, project)
+        project = onto(body) if self.on_surface else None
+        return SharedMotion.of(data.places, data.along, data.cases, motion, project)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -200,6 +190,12 @@ class Measurement:
                 "the data say then depends on it"
             )
         return tuple(found)
+
+
+def onto(body: Body) -> Callable[[FloatArray], FloatArray]:
+    """Return what puts points (n, 3) on the surface of a body."""
+    surface = Surface.of(body)
+    return lambda points: surface.nearest(points)[0]
 
 
 def read_on(
@@ -251,10 +247,6 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
     placed, registered, scan = read_on(path, model.measurable, model.body, data)
     found = placed.observations.with_sigma(None)
     found = replace(found, readings=found.readings.with_sigma({}))
-    uncertain = (registered is not None and registered.uncertain) or scan.between is not None
-    if len(found.readings) and uncertain:
-        message = "forces beside points of uncertain registration, expected a known registration, or data files apart"
-        raise DataError(f"{path.name}: {message}")
     truth, places, stiffness = scan.truth | data.truth, np.zeros((0, 3)), np.zeros(0)
     for name, text in found.truth.items():
         if name not in {"stiffness", "inclusions"}:

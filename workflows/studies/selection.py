@@ -30,6 +30,7 @@ from workflows.studies.material_tests import DataFile, MeasuredTest, Measurement
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
+    from inverse.data.shared_motion import SharedMotion
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
@@ -185,6 +186,14 @@ class Comparison(StudyKind):
         from workflows.studies.finer import once_on_finer_meshes
 
         return once_on_finer_meshes(make, self.models[name].inputs.mean)
+
+    def shared(self, name: str, group: str) -> SharedMotion | None:
+        """Return the errors that the data share, as a candidate sees them; None if they are independent."""
+        return None
+
+    def moved(self, model: ForwardModel, motion: SharedMotion) -> ForwardModel:
+        """Return the model, given that of a candidate, that tells what they are; collective."""
+        raise NotImplementedError
 
     @property
     def group_names(self) -> tuple[str, ...]:

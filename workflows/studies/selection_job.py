@@ -17,15 +17,20 @@ from workflows.studies.findings_selection import (
     with_right_derivatives,
 )
 from workflows.studies.finer import FINER, solved_by
-from workflows.studies.job import MethodJob
+from workflows.studies.job import MOVED, MethodJob
 from workflows.studies.selection_results import arviz_groups
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import ForwardModel
+    from inverse.data.shared_motion import SharedMotion
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.selection import Comparison
+
+
+def _moved(study: Comparison, make: Callable[[], ForwardModel], motion: SharedMotion) -> ForwardModel:
+    return study.moved(make(), motion)
 
 
 def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
@@ -35,7 +40,11 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
     why = study.unchecked
     checked = [pair for pair in study.pairs if not why.get(pair[0], "none")]
 
+    motions = {pair: found for pair in study.pairs if (found := study.shared(*pair)) is not None}
+
     def task(evaluate: Evaluate) -> xr.Dataset:
+        shared = {pair: motion.errors_by(evaluate.on(f"{'/'.join(pair)}/{MOVED}")) for pair, motion in motions.items()}
+
         def recorded(name: str, group: str) -> Evaluate:
             recorders[f"{name}/{group}"] = Recorder(evaluate.on(f"{name}/{group}"))
             return recorders[f"{name}/{group}"]
@@ -49,7 +58,8 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
                 return Finer(None, why[name])
             return solved_by(recorders[f"{name}/{group}"].on(f"{name}/{group}/{FINER}"))
 
-        return study.method.run(study.models, study.data_groups, recorded, free, finer if why else None, ensemble.say)
+        look = finer if why else None
+        return study.method.run(study.models, study.data_groups, recorded, free, look, ensemble.say, shared or None)
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = found.assign_attrs(quantity=study.quantity)
@@ -61,10 +71,11 @@ def job(study: Comparison, ensemble: Ensemble) -> MethodJob:
 
     others: dict[str, Callable[[], ForwardModel]] = {f"{name}/{group}": make for (name, group), make in makers.items()}
     finer_ones = {f"{n}/{g}/{FINER}": partial(study.build_finer, n, makers[n, g], ensemble.group) for n, g in checked}
+    moved_ones = {f"{n}/{g}/{MOVED}": partial(_moved, study, makers[n, g], one) for (n, g), one in motions.items()}
     first = makers[study.pairs[0]]()
     return MethodJob(
         first,
-        others | finer_ones,
+        others | finer_ones | moved_ones,
         task,
         recorders,
         labelled,

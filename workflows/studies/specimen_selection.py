@@ -17,16 +17,19 @@ from forward.settings import Settings
 from forward.spec import ModelSpec
 from forward.specimen import Specimen
 from inverse.criticism.comparison import Data
+from inverse.data.registration import UncertainMotion
 from inverse.data.scans import Reading
 from inverse.data.table import DataError
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.studies.material_tests import WHOLE
-from workflows.studies.measured import read_on
+from workflows.studies.measured import onto, read_on
 from workflows.studies.model_selection import ModelSelection, Positive, changed
 
 if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
+    from forward.model import FloatArray, ForwardModel
+    from inverse.data.shared_motion import SharedMotion
 
 
 class DisplacementFile(Reading):
@@ -61,9 +64,7 @@ class DisplacementFile(Reading):
             placed, registered, scan = read_on(folder / self.file, measurable, specimen.body, self)
         except DataError as error:
             raise StudyError(*(f"data: {line}" for line in error.args)) from None
-        if (registered is not None and registered.uncertain) or scan.between is not None:
-            message = f"data: {self.file}: uncertain motions are for inversions, expected a known registration here"
-            raise StudyError(message)
+        motion = UncertainMotion.of(registered, scan.moved_between(placed.observations.unit))
         found, moved = placed.observations, placed.distances
         data = found.components()
         known = bool(np.isfinite(data.sigma).all())
@@ -75,6 +76,7 @@ class DisplacementFile(Reading):
                 (*AXES, *measurable[cases[case]])[axis] for axis, case in zip(data.axes, data.cases, strict=True)
             ],
             **({} if registered is None else {"axes": found.axes.tolist()}),
+            **({} if motion is None else {"motion": motion.model_dump(exclude_none=True), "on_surface": scan.surface}),
             "cases": [cases[case] for case in data.cases],
             "measured": data.values.tolist(),
             **({"sigma": data.sigma.tolist()} if known else {}),
@@ -97,6 +99,10 @@ class MeasuredDisplacements(Settings):
         Standard deviations of their errors in the same units, if known.
     axes
         Directions in the body of x, y and z, along which components were measured; by default its own.
+    motion
+        What is uncertain of rigid motions of the scan; by default nothing.
+    on_surface
+        Whether uncertain motions leave the points on the surface of the body.
     source
         Their source, line by line.
     points_moved, largest_move
@@ -109,6 +115,8 @@ class MeasuredDisplacements(Settings):
     measured: tuple[float, ...]
     sigma: tuple[Positive, ...] | None = None
     axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    motion: UncertainMotion | None = None
+    on_surface: bool = False
     source: tuple[str, ...] = ()
     points_moved: int = 0
     largest_move: float = 0.0
@@ -209,12 +217,36 @@ class SpecimenSelection(ModelSelection):
     def build(self, name: str, group: str, comm: Any = None) -> SpecimenModel:
         """Make the model of a candidate; collective."""
         specimen = self.of_candidates[name]
-        numbers = {case.name: i for i, case in enumerate(specimen.cases)}
         model: SpecimenModel = specimen.build(comm, tuple(self.candidates[name].parameters))
-        cases = [numbers[case] for case in self.data.cases]
+        cases, along = self._cases(specimen), self._along(specimen)
+        return model.observing(np.array(self.data.places), self._axes(specimen).tolist(), cases.tolist(), along)
+
+    def shared(self, name: str, group: str) -> SharedMotion | None:
+        """Return the uncertain motions of the scan on the body of a candidate; None if there are none."""
+        from inverse.data.shared_motion import SharedMotion
+
+        data, specimen = self.data, self.of_candidates[name]
+        if data.motion is None:
+            return None
         axes = self._axes(specimen)
-        along = np.vstack([self.data.axes, np.zeros(3)])[np.minimum(axes, len(AXES))]
-        return model.observing(np.array(self.data.places), axes.tolist(), cases, along)
+        places = np.where((axes < len(AXES))[:, None], data.places, np.nan)
+        project = onto(specimen.body) if data.on_surface else None
+        return SharedMotion.of(places, self._along(specimen), self._cases(specimen), data.motion, project)
+
+    def moved(self, model: ForwardModel, motion: SharedMotion) -> ForwardModel:
+        """Return the model, on the mesh of a candidate, that tells what uncertain motions do; collective."""
+        return cast("SpecimenModel", model).observing(*motion.observed)  # type: ignore[arg-type]
+
+    def _cases(self, specimen: Specimen) -> NDArray[np.int64]:
+        """Numbers of the load cases of the data."""
+        numbers = {case.name: i for i, case in enumerate(specimen.cases)}
+        return np.array([numbers[case] for case in self.data.cases], dtype=np.int64)
+
+    def _along(self, specimen: Specimen) -> FloatArray:
+        """Directions in the body of what was measured; zeros of other outputs."""
+        rows: FloatArray = np.vstack([self.data.axes, np.zeros(3)])
+        found: FloatArray = rows[np.minimum(self._axes(specimen), len(AXES))]
+        return found
 
     def _mistakes(self) -> Iterator[Mistake]:
         if self.method.check is not None:

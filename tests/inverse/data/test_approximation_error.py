@@ -121,6 +121,18 @@ def test_what_is_small_is_left():
     np.testing.assert_allclose(found.error, 1e-3 * SHIFT / SIGMA, rtol=1e-9)
 
 
+def test_what_correcting_adds_knows_errors_that_data_share():
+    """ln Z of the linear model with the covariance σ² + SᵀS, with the error of the mesh and without."""
+    shared = 2 * SIGMA * np.random.default_rng(5).normal(size=(2, M))
+    given = posterior(shared=shared)
+    gaussian = laplace(given, starts=1)
+    _, _, found = corrected_few(given, gaussian, Finer(finer), PLACES, "report")
+    error = (FINE - COARSE) @ given.physical(gaussian.mode[None])[0] + SHIFT
+    law = multivariate_normal(np.zeros(M), np.diag(SIGMA**2) + shared.T @ shared + COARSE @ PRIOR @ COARSE.T)
+    gap = DATA - COARSE @ PRIOR_MEAN
+    assert found.log_evidence == pytest.approx(law.logpdf(gap - error) - law.logpdf(gap), rel=1e-9)
+
+
 def test_failures_are_said():
     given = posterior()
     calls = []

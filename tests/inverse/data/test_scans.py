@@ -19,7 +19,6 @@ from inverse.data.registration import turned
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from tests.fuzz import damaged_bytes
-from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.studies.measured import digest_of, read_on, scan_of
 from workflows.studies.specimen_selection import DisplacementFile, MeasuredDisplacements
@@ -341,7 +340,7 @@ def test_what_the_plan_says_of_a_scan(tmp_path):
 
 @pytest.mark.fem
 def test_comparisons_take_scans_in_their_own_frame(tmp_path):
-    """The same predictions along the axes of the scanner; uncertain motions are refused."""
+    """The same predictions along the axes of the scanner; what is uncertain of its motion is read."""
     from mpi4py import MPI
 
     specimen = Specimen.model_validate(
@@ -379,5 +378,6 @@ def test_comparisons_take_scans_in_their_own_frame(tmp_path):
     vectors = plain.solve(np.zeros(0)).outputs.reshape(-1, 3)
     np.testing.assert_allclose(seen, [(u @ R)[axis] for u, axis in zip(vectors, axes, strict=True)], atol=1e-12)
     how["registration"] = {"kind": "given", "rotation_std": 1.0}
-    with pytest.raises(StudyError, match="uncertain motions are for inversions"):
-        DisplacementFile.model_validate(how | {"tolerance": 1.0}).read(tmp_path, specimen)
+    read = DisplacementFile.model_validate(how | {"tolerance": 1.0}).read(tmp_path, specimen)
+    motion = MeasuredDisplacements.model_validate(read).motion
+    np.testing.assert_allclose(motion.root, np.diag([np.radians(1.0)] * 3 + [0.0] * 3), atol=1e-15)

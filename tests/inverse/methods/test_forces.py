@@ -292,6 +292,26 @@ def test_candidates_are_compared_by_forces_too(folder):
     assert float(found["probability"].sel(model="right").max()) > 0.99  # the other is three times softer
 
 
+def test_forces_stand_beside_points_of_uncertain_registration(folder):
+    """A motion of the scan moves points, not forces: these keep errors of their own."""
+    uncertain = '["data"]\nregistration = { kind = "given", rotation_std = 2.0, translation_std = 1e-3 }'
+    (folder / "moved.toml").write_text(FEW.replace('["data"]', uncertain))
+    study = load(folder / "moved.toml")
+    motion, forces = study.motion(0), study.measured(0).axes >= 3
+    model = study.specimen.build(MPI.COMM_SELF, study.inputs.names).observing(*motion.observed)
+    rows = motion.errors(model.solve(study.inputs.mean).outputs)
+    assert rows.shape == (6, len(forces))
+    assert not rows[:, forces].any()
+    assert np.abs(rows[:, ~forces]).max(axis=1).min() > 0
+    here(folder / "moved.toml", folder / "out-moved")
+    here(folder / "few.toml", folder / "out-few")
+    found, known = results(folder / "out-moved"), results(folder / "out-few")
+    of = {"parameter": "inclusions.lump.contrast"}
+    assert float(found["std"].sel(of)) > 1.1 * float(known["std"].sel(of))  # which displacements tell
+    assert float(found["std"].sel(parameter="material.mu") / found["prior_std"].sel(parameter="material.mu")) < 0.25
+    assert int(np.isfinite(found["motion_eigenvalue"]).sum()) == 6
+
+
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 CASES = {"pull": {"grip": "N"}, "press": {"force": "N", "pressure": "Pa"}}

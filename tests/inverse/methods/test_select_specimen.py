@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from mpi4py import MPI
 from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
 import forward.fem.finer
 from forward.fem.finer import OtherMesh, extrapolated
@@ -115,6 +116,29 @@ def test_evidence_is_that_of_quadrature(study):
         assert abs(found["log_evidence"].values[k] - exact) < 5 * found["log_evidence_error"].values[k] + 1e-3
     assert found["probability"].values[0] > 0.95
     assert found["misfit_probability"].values[0, 0] > 0.01
+
+
+def test_motions_that_are_uncertain_are_integrated_out(study):
+    """ln Z by the trapezoidal rule with the dense covariance σ² + GᵀG of the data."""
+    uncertain = 'registration = { kind = "given", rotation_std = 1.0, translation_std = 0.01 }'
+    study.write_text(study.read_text().replace('file = "table.csv"', f'file = "table.csv"\n{uncertain}'))
+    it = load(study)
+    assert parse(tomllib.loads(dump(it))) == it
+    without = ("--set", "method.mesh_error=false")
+    assert main(["run", str(study), "--out", str(study.parent / "out"), "--quiet", "--no-report", *without]) == 0
+    found = xr.load_dataset(study.parent / "out" / "results.nc")
+    data = it.data_groups["all"]
+    model, motion = it.build("right", "all", MPI.COMM_SELF), it.shared("right", "all")
+    mode = found["constant_mode"].values[0, 0, :1]
+    G = motion.errors_by(SerialEvaluate(it.moved(model, motion)))(mode)
+    assert G.shape == (6, len(data.values))
+    law = multivariate_normal(np.zeros(len(data.values)), np.diag(data.sigma**2) + G.T @ G)
+    grid, prior = np.arange(-2.4, 0.7, 0.08), LogNormal(mean=1.2e4, std=4e3)
+    points = prior.from_normal(grid)[0]
+    logs = [law.logpdf(model.solve(np.array([x])).outputs - data.values) for x in points]
+    exact = logsumexp(logs, b=0.08 * np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi))
+    assert found["log_evidence"].values[0] == pytest.approx(exact, abs=0.05)
+    assert "of 6 rigid motions that are uncertain" in (study.parent / "out" / "summary.json").read_text()
 
 
 def test_studies_are_complete_in_themselves(study):
