@@ -210,6 +210,7 @@ def _invert(
         **moments,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(posterior, draws, outputs),
+        **_points(points, weights, draws, chains),
         **of_chains(chains),
         "mode": best,
         "log_evidence": np.array(found.log_evidence),
@@ -300,6 +301,13 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Da
 
     cases = range(int(data.cases.max()) + 1)
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
+
+
+def _points(points: FloatArray, weights: FloatArray, draws: FloatArray, chains: Chains | None) -> Record:
+    """Weighted points of the posterior: those that were solved, or draws of chains that have mixed."""
+    if chains is not None and chains.mixed:
+        return {"point": draws, "point_weight": np.full(len(draws), 1 / len(draws))}
+    return {"point": points, "point_weight": weights}
 
 
 def _draws(posterior: Posterior, draws: FloatArray, outputs: FloatArray) -> Record:

@@ -99,9 +99,11 @@ def invert_field(
     finer: Finer = NOT_LOOKED,
     say: Callable[[str], None] = lambda line: None,
     shared: Shared | None = None,
+    predict: Callable[[LowRankPosterior, tuple[FloatArray, FloatArray] | None], Record] | None = None,
 ) -> xr.Dataset:
     """Invert a data set for a field; collective over the rank group of the model.
 
+    A posterior, and the values with weights that correct it if it cannot be trusted, `predict` what else is asked for.
     What errors the data share is said by a function of the values of the field; by default they are independent.
 
     Raises
@@ -176,6 +178,8 @@ def invert_field(
         "neglected": np.array(spectrum.neglected),
         "information": np.array(found.information),
     }
+    if predict is not None:
+        record |= predict(found, None if values is None else (values, weights))
     return as_dataset(record)
 
 

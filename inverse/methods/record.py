@@ -103,6 +103,8 @@ DIMS: dict[str, tuple[str, ...]] = {
     "zero_likelihood": (),
     "expansion_error": (),
     "expansion_solves": (),
+    "point": ("point", "parameter"),
+    "point_weight": ("point",),
     "draw": ("sample", "parameter"),
     "draw_log_likelihood": ("sample", "datum"),
     # of a field
@@ -114,6 +116,16 @@ DIMS: dict[str, tuple[str, ...]] = {
     "neglected": (),
     "information": (),
     "products": (),
+    # of what is predicted
+    **{
+        f"prediction_{name}": ("goal",)
+        for first in ("", "prior_")
+        for name in (f"{first}{end}" for end in ("mean", "mean_error", "std", "std_error", "lower", "upper"))
+    },
+    "prediction_share": ("goal",),
+    "prediction_mesh_error": ("goal",),
+    "prediction_solves": (),
+    "prediction_why": (),
 }
 
 
@@ -159,6 +171,11 @@ def as_dataset(record: Record) -> xr.Dataset:
             for name, (dims, value) in held.items()
         }
     )
+
+
+def with_record(found: xr.Dataset, record: Record) -> xr.Dataset:
+    """Return the results of an inversion with others."""
+    return found.merge(as_dataset(record))
 
 
 def stacked(

@@ -145,6 +145,7 @@ SECTIONS = Kinds(
         "local-sensitivities": f"{_HERE}.local_sensitivities:LocalSensitivities",
         "local-field": f"{_HERE}.local_field:LocalField",
         "batch": f"{_HERE}.batch:Batch",
+        "predictions": f"{_HERE}.predictions:Predictions",
         "posterior": f"{_HERE}.posterior:Posterior",
         "posterior-field": f"{_HERE}.posterior_field:FieldPosterior",
         "places": f"{_HERE}.places:Places",

@@ -45,9 +45,19 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
             continue
         values = [f"{path} {at['mode']:.4g} ± {at['std']:.2g}" for path, at in found["posterior"].items()]
         lines.append(f"{name}: {', '.join(values)}")
+        lines += [_predicted(f"{name}: {goal}", at) for goal, at in found.get("predictions", {}).items()]
     if "data" in summary:
         lines.append(f"{summary['data']} data made")
     return lines
+
+
+def _predicted(what: str, at: Mapping[str, Any]) -> str:
+    """Say in a line what is predicted of an output."""
+    if at["mean"] is None:
+        return f"{what} is not predicted"
+    mesh = "" if at["mesh_error"] is None else f", mesh {at['mesh_error']:+.2g}"
+    before = "" if at["prior_mean"] is None else f" (before the data {at['prior_mean']:.4g} ± {at['prior_std']:.2g})"
+    return f"{what} {at['mean']:.4g} ± {at['std']:.2g}{before}{mesh}"
 
 
 def _inversion(dataset: xr.Dataset) -> Part:

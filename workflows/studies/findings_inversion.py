@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.model import Finding, Severity
+from forward.registry import named
 from inverse.data.shared_motion import said
 from uq.findings import add
+from workflows.studies.predictions import has_mesh
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -33,6 +35,9 @@ def judged(dataset: xr.Dataset, study: InversionStudy) -> xr.Dataset:
         words[k], trust[k] = _verdict(words[k], int(trust[k]), doubts)
         said.append(Finding(SEVERITY.get(int(trust[k]), "note"), f"{name}: {words[k]}"))
         said += [Finding(doubt.severity, f"{name}: {doubt.text}.") for doubt in doubts]
+        if study.predict is not None:
+            meshed = has_mesh(study.model)
+            said += named("workflows.studies.predicted:findings")(dataset.isel(data_set=k), name, meshed=meshed)
     found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
     add(found, *said)
     return found

@@ -24,6 +24,7 @@ from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import Correlation, Parallel
 from workflows.config.mistakes import StudyError, refused
+from workflows.config.predict import Predict
 from workflows.config.priors import (
     findings_of_materials,
     mistakes_of_factor,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from workflows.studies.measured import Measurement
 
 SOLVES_OF_FIELD = 12  # for a mode
+PREDICTED = "predicted"  # name of the solves for what is predicted
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
@@ -69,6 +71,8 @@ class InversionStudy(StudyKind):
         Use of ranks.
     report
         Your own sections of the report.
+    predict
+        What else is to be known by the posterior; by default nothing.
     """
 
     model: Any
@@ -78,6 +82,7 @@ class InversionStudy(StudyKind):
     method: Invert = Invert()
     parallel: Parallel = Parallel()
     report: Report | None = None
+    predict: Predict | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
 
     stopped: ClassVar[str] = "all data sets inverted"
@@ -134,7 +139,15 @@ class InversionStudy(StudyKind):
             return method.expansion
         each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
-        return each * sum(measurement is not None for measurement in self.measurements)
+        more = 0 if self.predict is None else 1 + self.predict.solves(field=field)
+        count = sum(measurement is not None for measurement in self.measurements)
+        return (each + more) * count + more
+
+    @cached_property
+    def predicted(self) -> ModelSpec:
+        """The model of what is predicted."""
+        found: ModelSpec = named("workflows.studies.predicted:spec")(self)
+        return found
 
     @classmethod
     def forms(cls) -> Iterator[type[StudyKind]]:
@@ -155,16 +168,17 @@ class InversionStudy(StudyKind):
     def _with_finer(self, spec: Any) -> tuple[ModelSpec, ...]:
         """A model, and the same on the finer meshes that it is looked at on."""
         looked = has_mesh(spec) and self.method.treatment is not None
+        beside = () if self.predict is None else (self.predicted,)
         try:
-            return spec, *(meshes_of(spec) if looked else ())
+            return spec, *beside, *(meshes_of(spec) if looked else ())
         except ValueError:  # there are none, which is said elsewhere
-            return (spec,)
+            return spec, *beside
 
     @property
     def modules(self) -> tuple[str, ...]:
         """Modules that a user has written for the model."""
         found: tuple[str, ...] = self.model.modules
-        return found
+        return found if self.predict is None else tuple(dict.fromkeys((*found, *self.predicted.modules)))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model, and what is done for each data set; collective."""
@@ -172,7 +186,10 @@ class InversionStudy(StudyKind):
         return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
-        """Names of the unknown parameters."""
+        """Names of the unknown parameters, of those that act in what is predicted."""
+        if label == PREDICTED:
+            found: tuple[str, ...] = named("workflows.studies.predicted:parameters")(self)
+            return found
         return self.inputs.names
 
     def identity(self) -> dict[str, Any]:
@@ -246,6 +263,8 @@ class InversionStudy(StudyKind):
             if name not in self.model.scalars:
                 message = f"not a number of the model; {nearest(name, tuple(self.model.scalars))}"
                 yield ("data", "truth", name), message, value
+        if self.predict is not None:
+            yield from named("workflows.studies.predicted:mistakes")(self)
 
 
 class Inversion(InversionStudy):
@@ -267,6 +286,8 @@ class Inversion(InversionStudy):
         Use of ranks.
     report
         Your own sections of the report.
+    predict
+        What else is to be known by the posterior; by default nothing.
     """
 
     model: Specimen

@@ -12,8 +12,10 @@ import numpy as np
 
 from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
+from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
+from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import Evaluate, Evaluations, Recorder
 from uq.evaluation.kept import KeptEvaluate, KeptModel
@@ -22,7 +24,7 @@ from uq.findings import add
 from workflows.results.directory import write_text
 from workflows.studies.findings_inversion import judged
 from workflows.studies.finer import FINER, finer_meshes, solved_by
-from workflows.studies.inversion import Inversion, InversionStudy
+from workflows.studies.inversion import PREDICTED, Inversion, InversionStudy
 from workflows.studies.inversion_results import BATCH, Rows, Vertices, arviz_groups, batch_table, dataset
 from workflows.studies.job import MOVED, MethodJob, TasksJob
 from workflows.studies.output_inversion import OutputInversion, derivable
@@ -35,9 +37,12 @@ if TYPE_CHECKING:
     from forward.fem.specimen import SpecimenModel
     from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import Shared, SharedMotion
+    from inverse.methods.predict import Band
+    from inverse.methods.record import Record
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.kept import KeptEvaluate, KeptModel
+    from workflows.studies.predicted import FieldPredictions
 
 There = tuple[ForwardModel | None, str] | None  # a model on finer meshes, or why there is none; None without a mesh
 
@@ -50,10 +55,10 @@ def job(study: InversionStudy, ensemble: Ensemble, directory: Path, checkpoint: 
         assert isinstance(study, Inversion)
         made = _Specimen.of(study, ensemble)
     derivable(made.model, study.model.kind)
-    return _one(study, made, ensemble.say) if study.together else _many(study, made, ensemble, directory, checkpoint)
+    return _one(study, made, ensemble) if study.together else _many(study, made, ensemble, directory, checkpoint)
 
 
-_InvertField = Callable[[int, ForwardModel, Finer, "Ensemble", "Shared | None"], "xr.Dataset"]
+_InvertField = Callable[[int, ForwardModel, Finer, "Shared | None"], "xr.Dataset"]
 
 
 class _Made(Protocol):
@@ -186,7 +191,6 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
     expanded = cache(partial(_expanded, study, made, ensemble, checkpoint))
-    invert_field = _inverting_field(study, made) if study.field else None
 
     def beside(name: str, model: ForwardModel) -> KeptEvaluate:
         """Solve other models, on finer meshes or at moved points, which are no solves of the model."""
@@ -194,7 +198,20 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         solving.append(kept)
         return kept
 
+    def states_of(name: str, model: ForwardModel) -> KeptModel:
+        """Keep the solves for what is predicted from a field."""
+        states = KeptModel(model, ensemble.group, checkpoint, name)
+        solving.append(states)
+        return states
+
+    invert_field = _inverting_field(study, made, ensemble, states_of) if study.field else None
+    predicting = None if study.predict is None or study.field else _predicting(study, ensemble, beside)
+
     def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
+        found = inverted(number, solved)
+        return found if predicting is None else with_record(found, predicting(names[number], found))
+
+    def inverted(number: int, solved: list[Evaluations]) -> xr.Dataset:
         if study.measurements[number] is None:
             raise SolveError(study.data.sets[number].refused)
         if method.expansion is not None:
@@ -208,7 +225,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         if invert_field is not None:
             states = KeptModel(observed, ensemble.group, checkpoint, names[number], log=solved)
             solving.append(states)
-            return invert_field(number, states, finer or NOT_LOOKED, ensemble, shared)
+            return invert_field(number, states, finer or NOT_LOOKED, shared)
         kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
         solving.append(kept)
         data = study.measured(number)
@@ -265,7 +282,9 @@ def _by_expansion(study: InversionStudy, found: SharedExpansion, number: int, sa
     return one.assign(solves=0.0, expansion_error=size, expansion_solves=float(count))
 
 
-def _inverting_field(study: InversionStudy, made: _Made) -> _InvertField:
+def _inverting_field(
+    study: InversionStudy, made: _Made, ensemble: Ensemble, states_of: Callable[[str, ForwardModel], KeptModel]
+) -> _InvertField:
     """Return what inverts a data set, by its number, for a field of a specimen."""
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.methods.invert_field import Vertices, invert_field
@@ -273,16 +292,38 @@ def _inverting_field(study: InversionStudy, made: _Made) -> _InvertField:
     assert isinstance(made, _Specimen)
     model, prior = made.model, study.model.fields[0].prior(study.model.body)
     offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
+    predicting: Callable[[str], FieldPredictions] | None = None
+    if study.predict is not None:
+        other = named("workflows.studies.predicted:build")(study, ensemble)
+        predicting = named("workflows.studies.predicted:of_field")(study, lambda name: states_of(name, other))
 
-    def invert(
-        number: int, states: ForwardModel, finer: Finer, ensemble: Ensemble, shared: Shared | None
-    ) -> xr.Dataset:
+    def invert(number: int, states: ForwardModel, finer: Finer, shared: Shared | None) -> xr.Dataset:
         data, errors = study.measured(number), study.data.errors
         posterior = FieldPosterior(states, data.values, data.sigma, prior, progress=ensemble.count, errors=errors)
         vertices = Vertices(offset, prior.matern.mass)
-        return invert_field(posterior, data, study.method, vertices, finer, ensemble.say, shared)
+        predict = None if predicting is None else predicting(study.data.sets[number].name)
+        return invert_field(posterior, data, study.method, vertices, finer, ensemble.say, shared, predict)
 
     return invert
+
+
+def _predicting(
+    study: InversionStudy, ensemble: Ensemble, beside: Callable[[str, ForwardModel], Evaluate]
+) -> Callable[[str, xr.Dataset], Record]:
+    """Return what predicts from the name of a data set and its results."""
+    model: ForwardModel = named("workflows.studies.predicted:build")(study, ensemble)
+
+    @cache
+    def before() -> Band:
+        found: Band = named("workflows.studies.predicted:prior_band")(study, beside(f"prior, {PREDICTED}", model))
+        return found
+
+    def record(name: str, found: xr.Dataset) -> Record:
+        solves, of_mesh = (beside(f"{name}/{PREDICTED}{part}", model) for part in ("", ", mesh"))
+        predicted: Record = named("workflows.studies.predicted:of_few")(study, found, solves, of_mesh, before)
+        return predicted
+
+    return record
 
 
 def _shared(
@@ -303,8 +344,9 @@ def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | No
     return Finer(None, why) if model is None else solved(model)
 
 
-def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> MethodJob:
+def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
+    say = ensemble.say
     observed, data = made.observing(0), study.measured(0)
     there = made.finer(observed)
     recorders: dict[str, Recorder] = {}
@@ -315,6 +357,9 @@ def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> Meth
     both = made.shared(0)
     if both is not None:
         others[MOVED] = lambda: both[1]
+    if study.predict is not None:
+        predicted: ForwardModel = named("workflows.studies.predicted:build")(study, ensemble)
+        others[PREDICTED] = lambda: predicted
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
@@ -322,6 +367,11 @@ def _one(study: InversionStudy, made: _Made, say: Callable[[str], None]) -> Meth
         errors = study.data.errors
         shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
         found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say, shared)
+        if study.predict is not None:
+            recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
+            before = partial(named("workflows.studies.predicted:prior_band"), study, recorders[PREDICTED])
+            of_few = named("workflows.studies.predicted:of_few")
+            found = with_record(found, of_few(study, found, recorders[PREDICTED], evaluate.on(PREDICTED), before))
         return dataset(study, [Outcome(found, "", None, 0.0)], made.vertices)
 
     return MethodJob(

@@ -10,11 +10,12 @@ from workflows.config.priors import ranges
 from workflows.studies.predictions import NOT_ASKED, duration, formulation, mesh_check, times_of
 
 if TYPE_CHECKING:
-    from workflows.studies.inversion import Inversion
+    from workflows.studies.inversion import Inversion, InversionStudy
     from workflows.studies.measured import Measurement
     from workflows.studies.output_inversion import OutputInversion
 
 PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+LISTED = 8  # outputs that are named
 PRODUCT = 0.12  # time of a product, of that of a solve by Newton's method from a state nearby
 
 
@@ -38,7 +39,7 @@ def plan(study: Inversion) -> list[str]:
         seconds = textbook * 15 * study.method.starts + each * study.method.solves(field=False)
     seconds += each * study.method.chain_solves(len(study.names), field=study.field)
     once, checked = mesh_check(spec) if study.method.treatment is not None else (0.0, NOT_ASKED)
-    seconds += once
+    seconds += once + _seconds_of_predictions(study)
     return [
         f"method      {study.method.kind}",
         f"unknown     {unknown}",
@@ -50,9 +51,29 @@ def plan(study: Inversion) -> list[str]:
         *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
         *(f"warning     {line}" for one in usable for line in one.warnings),
         f"mesh check  {checked}",
+        *_predicted(study),
         f"time        about {duration(seconds)} for each on 1 core (rough)",
         *(f"warning     {item.refused}" for item in sets if item.refused),
     ]
+
+
+def _predicted(study: InversionStudy) -> list[str]:
+    """Say what is predicted, and by how many solves."""
+    if study.predict is None:
+        return []
+    names = [output.name for output in study.predicted.returned]
+    more = f" and {len(names) - LISTED} others" if len(names) > LISTED else ""
+    solves = 1 + study.predict.solves(field=study.field)
+    return [f"predicts    {', '.join(names[:LISTED])}{more}, by {solves} solves, and as many of the prior"]
+
+
+def _seconds_of_predictions(study: InversionStudy) -> float:
+    """Predict the processor time (s) of what is predicted."""
+    cost = None if study.predict is None else study.predicted.cost()
+    if cost is None or study.predict is None:
+        return 0.0
+    own = 0.0 if study.field else cost.tangents_of_sample(len(study.inputs.names))
+    return 2 * (cost.textbook + study.predict.solves(field=study.field) * (cost.sample + own))
 
 
 def _moved(count: int, usable: list[Measurement]) -> str:
@@ -76,13 +97,14 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
         f"outputs     {', '.join(study.parts)}",
         f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",
         f"solves      about {study.solves // len(counts):,} for each",
+        *_predicted(study),
     ]
     cost = spec.cost()
     if cost is None:
         derivable(study.spec.build(None, study.inputs.names), spec.kind)
     else:
         d = len(study.inputs.names)
-        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4)
+        seconds = study.solves / len(counts) * (cost.sample + cost.tangents(d) / 4) + _seconds_of_predictions(study)
         if method.treatment is not None:
             once, checked = mesh_check(spec)
             seconds += once

@@ -55,6 +55,11 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
     )
     if "mesh_checked" in held:
         held["mesh_why"] = ("data_set", ["" if one is None else str(one["mesh_why"].item()) for one in each])
+    if "prediction_why" in (next(one for one in each if one is not None)):
+        held["prediction_why"] = (
+            "data_set",
+            ["" if one is None else str(one["prediction_why"].item()) for one in each],
+        )
     held["ok"] = ("data_set", [one is not None for one in each])
     found = list(study.measurements)
     count = len(found)
@@ -80,6 +85,10 @@ def dataset(study: InversionStudy, outcomes: Sequence[Outcome], vertices: Vertic
         "axis": ["x", "y", "z"],
         "column": list(COLUMNS["field" if study.field else "parameters"]),
     }
+    if study.predict is not None:
+        goals = study.predicted.returned
+        coordinates["goal"] = [one.name for one in goals]
+        held["goal_unit"] = ("goal", [one.unit for one in goals])
     # Displacements of a specimen are what is meant where nothing is said.
     return xr.Dataset(held, coordinates, {} if vertices is not None else {"quantity": study.quantity})
 
@@ -214,7 +223,24 @@ def _one(found: xr.Dataset) -> dict[str, Any]:
         },
         **{key: _number(found[key]) for key in numbers},
         **({"mesh": _mesh(found)} if "mesh_checked" in found else {}),
+        **({"predictions": of_predictions(found)} if "goal" in found.coords else {}),
         "verdict": str(found["why"].item()),
+    }
+
+
+BAND = ("mean", "mean_error", "std", "std_error", "lower", "upper")
+OF_PREDICTIONS = {
+    **{f"{first}{end}": f"prediction_{first}{end}" for first in ("", "prior_") for end in BAND},
+    "share": "prediction_share",
+    "mesh_error": "prediction_mesh_error",
+}
+
+
+def of_predictions(found: xr.Dataset) -> dict[str, Any]:
+    """What is predicted from a data set: bands by the posterior and the prior, and errors of the mesh."""
+    return {
+        str(goal): {short: _number(found[name].sel(goal=goal)) for short, name in OF_PREDICTIONS.items()}
+        for goal in found["goal"].values
     }
 
 

@@ -110,6 +110,8 @@ class OutputInversion(InversionStudy):
         Use of ranks.
     report
         Your own sections of the report.
+    predict
+        What else is to be known by the posterior; by default nothing.
     """
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]

@@ -144,7 +144,7 @@ def _selected(path: Path, found: Arrays, group: str | None, model: str | None, d
 
 
 def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:
-    """Draws of the posterior of one data set."""
+    """Weighted points of the posterior of one data set; its draws in results that have none."""
     if model is not None:
         message = f"model = '{model}', but {path} is an inversion, which has one model"
         raise ValueError(message)
@@ -153,9 +153,9 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, d
         raise ValueError(message)
     k = _chosen("group", group, _texts(found, "data_set"), path)
     parameters = _texts(found, "parameter")
-    values = np.asarray(found["draw"])
-    values = values[k] if values.ndim == 3 else values
-    whole = np.isfinite(values).all(axis=1)
+    values = np.asarray(found["point" if "point" in found else "draw"])[k]
+    weights = np.nan_to_num(found["point_weight"][k]) if "point" in found else np.ones(len(values))
+    whole = np.isfinite(values).all(axis=1) & (weights > 0)
     here = np.array([name != NOISE for name in parameters])
     if not whole.any() or not bool(np.atleast_1d(found["ok"])[k]):
         message = f"{path}: has no draws of that data set, which could not be inverted"
@@ -164,8 +164,9 @@ def _inverted(path: Path, found: Arrays, group: str | None, model: str | None, d
     chains = int(np.nan_to_num(np.atleast_1d(found["chains"])[k])) if "chains" in found else 0
     worth = float(np.atleast_1d(found["chain_effective" if chains else "effective"])[k])
     names = tuple(name for name, one in zip(parameters, here, strict=True) if one)
-    weights = np.full(len(values), 1 / len(values))
-    return Draws(names, values, weights, min(len(values), worth) if worth > 0 else len(values), digest)
+    weights = weights[whole] / weights[whole].sum()
+    most = float(1 / (weights**2).sum())
+    return Draws(names, values, weights, min(most, worth) if worth > 0 else most, digest)
 
 
 def _of_population(path: Path, found: Arrays, group: str | None, model: str | None, digest: str) -> Draws:

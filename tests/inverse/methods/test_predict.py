@@ -1,0 +1,372 @@
+"""What inversions predict: linear chains by closed forms, few parameters and fields, meshes, ranks, kills, mistakes."""
+
+import json
+import subprocess
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from mpi4py import MPI
+
+from forward.model import FunctionModel
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.low_rank import LowRankPosterior
+from inverse.fields.newton_cg import find_mode
+from inverse.methods.predict import after_field, before_field
+from tests.launch import TISSUQ, assert_same_bits, environment, run, run_script
+from workflows.__main__ import main
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse
+from workflows.run.plan import plan
+
+# --- fields, by closed forms -----------------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(3)
+SIZE, DATA, GOALS = 60, 25, 4
+ROOT = np.tril(RNG.uniform(0, 1, (SIZE, SIZE))) / 8 + np.eye(SIZE) / 4
+SEEN, GOAL = RNG.standard_normal((DATA, SIZE)), RNG.standard_normal((GOALS, SIZE))
+SIGMA = 0.3
+PRIOR = SimpleNamespace(variance=(ROOT**2).sum(axis=1), root=lambda x: x @ ROOT.T, root_transposed=lambda g: g @ ROOT)
+
+
+def linear(matrix):
+    names = tuple(f"m{i}" for i in range(SIZE))
+    return FunctionModel(lambda m: matrix @ m + 1, names, tuple(map(str, range(len(matrix)))), lambda m: matrix)
+
+
+def test_a_linear_chain_from_data_to_prediction_is_exact_for_fields():
+    """Against dense linear algebra, to 1e-8; pairs of draws find nothing that the gradients leave out."""
+    values = SEEN @ ROOT @ RNG.standard_normal(SIZE) + 1 + SIGMA * RNG.standard_normal(DATA)
+    posterior = FieldPosterior(linear(SEEN), values, np.full(DATA, SIGMA), PRIOR)
+    found = LowRankPosterior.at(find_mode(posterior, tolerance=1e-12).point, cutoff=1e-12)
+    before = before_field(linear(GOAL), PRIOR, SIZE, 4, 0)
+    said = after_field(linear(GOAL), found, before, 4, 0, of_mesh=True)
+    prior = ROOT @ ROOT.T
+    gain = prior @ SEEN.T @ np.linalg.inv(SEEN @ prior @ SEEN.T + SIGMA**2 * np.eye(DATA))
+    covariance = prior - gain @ SEEN @ prior
+    wide, narrow = (np.sqrt(np.diag(GOAL @ C @ GOAL.T)) for C in (prior, covariance))
+    mean = GOAL @ gain @ (values - 1) + 1
+    np.testing.assert_allclose(said["prediction_mean"], mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(said["prediction_std"], narrow, rtol=1e-8)
+    np.testing.assert_allclose(said["prediction_prior_mean"], 1, rtol=1e-8)
+    np.testing.assert_allclose(said["prediction_prior_std"], wide, rtol=1e-8)
+    np.testing.assert_allclose(said["prediction_share"], 1 - (narrow / wide) ** 2, rtol=1e-8)
+    np.testing.assert_allclose(said["prediction_upper"], mean + 1.959964 * narrow, rtol=1e-6)
+    assert np.abs(said["prediction_mean_error"]).max() < 1e-10
+    assert np.isnan(said["prediction_mesh_error"]).all()  # there is none
+
+
+def test_what_gradients_leave_out_is_seen_in_pairs():
+    """A quadratic goal, whose mean and variance under the prior are known; with one adjoint alone they are wrong."""
+    names = tuple(f"m{i}" for i in range(SIZE))
+    row = GOAL[0]
+
+    def value(m):
+        return np.array([row @ m + (row @ m) ** 2])
+
+    model = FunctionModel(value, names, ("q",), lambda m: ((1 + 2 * row @ m) * row)[None])
+    variance = float(((row @ ROOT) ** 2).sum())
+    plain = before_field(model, PRIOR, SIZE, 0, 0)
+    assert plain.mean[0] == 0
+    np.testing.assert_allclose(plain.std, np.sqrt(variance), rtol=1e-10)
+    seen = before_field(model, PRIOR, SIZE, 400, 0)
+    assert abs(seen.mean[0] - variance) < 4 * seen.mean_error[0] < variance
+    assert abs(seen.std[0] - np.sqrt(variance + 2 * variance**2)) < 4 * seen.std_error[0]
+
+
+# --- few parameters, by closed forms ---------------------------------------------------------------------------------
+
+A = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.2]])
+MEAN, STD = np.array([1.0, -1.0]), np.array([0.5, 2.0])
+LINES = f"""
+import numpy as np
+
+A = np.array({A.tolist()})
+
+
+def linear(p):
+    return A @ p
+
+
+def slopes(p):
+    return A
+
+
+def other(p):
+    return np.array([p[0] - p[1] + 3])
+
+
+def others(p):
+    return np.array([[1.0, -1.0]])
+"""
+STUDY = """
+[model]
+kind = "python"
+function = "predicted_lines.linear"
+jacobian = "predicted_lines.slopes"
+parameters = { a = 1.0, b = -1.0 }
+outputs = ["u", "v", "w"]
+
+[parameters]
+a = { kind = "normal", mean = 1.0, std = 0.5 }
+b = { kind = "normal", mean = -1.0, std = 2.0 }
+
+[data]
+outputs = { u = 0.4, w = [3.1, 2.9] }
+noise = { absolute = 0.2, relative = 0.1 }
+sigma = { u = 0.05 }
+
+[predict]
+PREDICT
+
+[method]
+kind = "invert"
+samples = 1024
+starts = 1
+draws = 50
+"""
+OTHER = 'model = { function = "predicted_lines.other", jacobian = "predicted_lines.others", outputs = ["q"] }'
+VALUES, ERRORS = np.array([0.4, 3.1, 2.9]), np.array([0.05, 0.31, 0.29])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("predict")
+    (place / "predicted_lines.py").write_text(LINES)
+    for name, block in (("same", ""), ("other", OTHER)):
+        (place / f"{name}.toml").write_text(STUDY.replace("PREDICT", block))
+    return place
+
+
+def ran(study, out, *changes, report=False):
+    sets = [word for change in changes for word in ("--set", change)]
+    return main(["run", str(study), "--out", str(out), "--quiet", *([] if report else ["--no-report"]), *sets])
+
+
+def results(out):
+    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+
+
+def exactly():
+    B = A[[0, 2, 2]]
+    covariance = np.linalg.inv(np.diag(STD**-2.0) + (B / ERRORS[:, None] ** 2).T @ B)
+    return covariance @ (B.T @ (VALUES / ERRORS**2) + MEAN / STD**2), covariance
+
+
+def test_a_linear_chain_from_data_to_prediction_is_exact_for_few_parameters(folder, capsys):
+    """To the sampling error of the posterior's points; the terminal, summary.json and the report say it."""
+    out = folder / "same"
+    assert main(["run", str(folder / "same.toml"), "--out", str(out)]) == 0
+    one = results(out).isel(data_set=0)
+    mode, covariance = exactly()
+    std = np.sqrt(np.diag(A @ covariance @ A.T))
+    assert [str(goal) for goal in one["goal"].values] == ["u", "v", "w"]
+    np.testing.assert_allclose(one["prediction_mean"], A @ mode, atol=0.05 * std.max())
+    np.testing.assert_allclose(one["prediction_std"], std, rtol=0.06)
+    np.testing.assert_allclose(one["prediction_lower"], A @ mode - 1.96 * std, atol=0.3 * std.max())
+    np.testing.assert_allclose(one["prediction_prior_mean"], A @ MEAN, atol=1e-2)
+    np.testing.assert_allclose(one["prediction_prior_std"], np.linalg.norm(A * STD, axis=1), rtol=1e-2)
+    assert (np.abs(one["prediction_mean"] - A @ mode) < 4 * one["prediction_mean_error"]).all()
+    told = json.loads((out / "summary.json").read_text())["predictions"]["v"]
+    assert told["mean"] == pytest.approx(float(one["prediction_mean"][1]))
+    assert 0.9 < told["share"] < 1
+    assert told["mesh_error"] is None
+    assert "outputs: v 0.8" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert "Predictions" in page
+    assert "share of the variance" in page
+
+
+def test_another_model_with_the_same_unknowns(folder):
+    """Its outputs, and those of a linear function of them; a study reads itself."""
+    assert ran(folder / "other.toml", folder / "other") == 0
+    one = results(folder / "other").isel(data_set=0)
+    mode, covariance = exactly()
+    row = np.array([1.0, -1.0])
+    std = float(np.sqrt(row @ covariance @ row))
+    assert abs(float(one["prediction_mean"][0]) - (row @ mode + 3)) < 0.1 * std
+    assert float(one["prediction_std"][0]) == pytest.approx(std, rel=0.06)
+    study = load(folder / "other.toml")
+    assert parse(document(study), folder=folder) == study
+    assert any("predicts    q, by 33 solves" in line for line in plan(study, 1))
+
+
+def test_a_batch_predicts_from_each_posterior(folder):
+    """The same of each data set as alone; the prior is solved for once."""
+    (folder / "data").mkdir()
+    for name, scale in (("one", 1.0), ("two", 1.1)):
+        rows = f"output,value,sigma\nu,{0.4 * scale},0.05\nw,3.1,0.31\nw,2.9,0.29\n"
+        (folder / "data" / f"{name}.csv").write_text(rows)
+    assert ran(folder / "same.toml", folder / "batch", "data={files='data'}", "method.samples=32") == 0
+    assert ran(folder / "same.toml", folder / "alone", "data={files='data/two.csv'}", "method.samples=32") == 0
+    both, alone = results(folder / "batch"), results(folder / "alone")
+    for name in ("prediction_mean", "prediction_std", "prediction_lower", "prediction_prior_mean"):
+        np.testing.assert_allclose(both[name][1], alone[name][0], rtol=1e-12)
+    assert (both["prediction_mean"][0] != both["prediction_mean"][1]).all()
+
+
+@pytest.mark.mpi
+def test_neither_ranks_nor_kills_matter(folder, tmp_path):
+    """The same bytes with two ranks, and after an end among the solves for what is predicted, where it goes on."""
+    (tmp_path / "study.toml").write_text((folder / "same.toml").read_text())
+    (tmp_path / "predicted_lines.py").write_text(
+        LINES + "import os, itertools\ncount, known = itertools.count(), linear\n"
+        "def linear(p):\n    if next(count) > 55 and os.environ.get('KILL'): os._exit(9)\n    return known(p)\n"
+    )
+    command = [TISSUQ, "run", tmp_path / "study.toml", "--quiet", "--no-report", "--set", "method.samples=32", "--out"]
+    for ranks in (1, 2):
+        done = run(ranks, *command, tmp_path / f"on-{ranks}")
+        assert done.returncode == 0, done.stderr
+    for status in (9, 0):
+        words = list(map(str, [*command, tmp_path / "cut"]))
+        done = subprocess.run(words, env=environment() | {"KILL": "1"[status == 0 :]}, capture_output=True, check=False)
+        assert done.returncode == status, done.stderr
+    for other in ("on-2", "cut"):
+        assert_same_bits(tmp_path / "on-1", tmp_path / other)
+
+
+@pytest.mark.parametrize(
+    ("block", "said"),
+    [
+        ("cases = [{ name = 'pull' }]", "predict.cases: a model of kind 'python' has none"),
+        ("model = { outputz = ['q'] }", "predict.model.outputz: unknown key; did you mean 'outputs'?"),
+        ("model = { kind = 'hyperelastic' }", "predict.model.kind: expected 'python'"),
+        ("model = { outputs = [] }", "predict"),
+        ("samples = 3", "predict.samples: expected at least 8"),
+        ("sample = 3", "predict.sample: unknown key; did you mean 'samples'?"),
+        ("model = { parameters = { c = 1.0 } }", "none of the unknown numbers (a, b)"),
+    ],
+)
+def test_what_cannot_be_predicted(folder, block, said):
+    path = folder / "wrong.toml"
+    path.write_text(STUDY.replace("PREDICT", block))
+    with pytest.raises(StudyError) as refused:
+        load(path)
+    assert said in str(refused.value)
+
+
+def test_an_inversion_that_predicts_nothing_imports_nothing_of_it(folder):
+    (folder / "none.toml").write_text(STUDY.replace("[predict]\nPREDICT\n", ""))
+    script = (
+        "import sys; from workflows.__main__ import main; "
+        "assert main(['run', sys.argv[1], '--out', sys.argv[2], '--quiet', '--set', 'method.samples=32']) == 0; "
+        "print([n for n in sys.modules if n.endswith(('methods.predict', 'studies.predicted', 'inputs.draws'))])"
+    )
+    done = run_script(None, script, folder / "none.toml", folder / "none")
+    assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
+    assert not [name for name in results(folder / "none").variables if "predict" in str(name) and "ion_" in str(name)]
+
+
+# --- a specimen ------------------------------------------------------------------------------------------------------
+
+CUBE = """
+[model]
+kind = "specimen"
+body = { size = [1.0, 1.0, 1.0], cells = [2, 2, 2], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e4, lmbda = 4e4 }
+cases = [{ name = "shear", clamp = ["z-min"], loads = [TRACTION, direction = [1, 0, 0] }] }]
+MORE
+
+[data]
+files = ["points.csv"]
+sigma = 1e-3
+
+[predict]
+observed = [{ at = [[1.0, 0.5, 1.0]], components = "xz", cases = ["pull"] }]
+
+[[predict.cases]]
+name = "pull"
+clamp = ["z-min"]
+loads = [TRACTION, direction = [0, 0, 1] }]
+outputs = [{ name = "energy", kind = "strain-energy" }]
+
+[[predict.cases]]
+name = "shear"
+outputs = [{ name = "energy", kind = "strain-energy" }]
+
+[method]
+kind = "invert"
+samples = 32
+starts = 1
+draws = 20
+mesh_error = "report"
+""".replace("TRACTION", '{ kind = "traction", on = "z-max", size = 300')
+NUMBER = '\n[parameters]\n"material.mu" = { kind = "log-normal", mean = 1.2e4, std = 4e3 }\n'
+FIELD = 'fields = [{ of = "stiffness", length = 0.6, std = 0.4, basis = "nodes" }]\n'
+POINTS = "case,x,y,z,ux,uy,uz\nshear,1,0,1,0.028,0,-0.006\nshear,0,1,1,0.028,0,0.006\nshear,1,1,0.5,0.014,0,-0.002\n"
+NAMES = ["pull.points.0.x", "pull.points.0.z", "pull.energy", "shear.energy"]
+
+
+@pytest.fixture(scope="module")
+def specimens(tmp_path_factory):
+    place = tmp_path_factory.mktemp("specimens")
+    (place / "points.csv").write_text(POINTS)
+    (place / "few.toml").write_text(CUBE.replace("MORE", NUMBER))
+    (place / "field.toml").write_text(CUBE.replace("MORE", FIELD))
+    return place
+
+
+@pytest.mark.fem
+def test_other_loads_and_places_of_a_specimen(specimens):
+    """What is predicted is what the model gives at the posterior's points; the mesh is estimated."""
+    assert ran(specimens / "few.toml", specimens / "few") in (0, 3)
+    found = results(specimens / "few").isel(data_set=0)
+    assert [str(goal) for goal in found["goal"].values] == NAMES
+    assert [str(unit) for unit in found["goal_unit"].values] == ["m", "m", "J", "J"]
+    study = load(specimens / "few.toml")
+    model = study.predicted.build(MPI.COMM_SELF, ("material.mu",))
+    weights, points = found["point_weight"].to_numpy(), found["point"].to_numpy()
+    outputs = np.array([model.solve(point).outputs for point in points])
+    mean = weights @ outputs
+    std = np.sqrt(weights @ (outputs - mean) ** 2)
+    np.testing.assert_allclose(found["prediction_mean"], mean, atol=1e-3 * std.max())
+    np.testing.assert_allclose(found["prediction_std"][1:], std[1:], rtol=1e-2)
+    assert (found["prediction_share"][1:] > 0.5).all()
+    assert np.isfinite(found["prediction_mesh_error"]).all()
+    said = json.loads((specimens / "few" / "summary.json").read_text())["findings"]
+    assert any("the mesh is estimated to move" in one["text"] for one in said)
+
+
+@pytest.mark.fem
+def test_a_field_predicts_by_adjoints(specimens):
+    """Against draws of the stored posterior, through the model."""
+    assert ran(specimens / "field.toml", specimens / "field", "method.draws=2000") in (0, 3)
+    found = results(specimens / "field").isel(data_set=0)
+    study = load(specimens / "field.toml")
+    assert [str(goal) for goal in found["goal"].values] == NAMES
+    model = study.predicted.build(MPI.COMM_SELF, study.model.coefficients)
+    offset = np.log(study.model.fields[0].mean) - study.model.fields[0].log_std ** 2 / 2
+    outputs = np.array([model.solve(values - offset).outputs for values in found["stiffness_draw"].to_numpy()])
+    error = outputs.std(axis=0) / np.sqrt(len(outputs))
+    assert (
+        np.abs(found["prediction_mean"] - outputs.mean(axis=0)) < 4 * np.hypot(error, found["prediction_mean_error"])
+    ).all()
+    np.testing.assert_allclose(found["prediction_std"], outputs.std(axis=0), rtol=0.25)
+    assert ((found["prediction_share"] > 0) & (found["prediction_share"] < 1)).all()
+    assert (found["prediction_prior_std"] > found["prediction_std"]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("predict.cases=[{name='pul'}]", "predict.cases[0].name"),
+        ("predict.cases=[{name='shear'}]", "nothing is predicted in this load case"),
+        ("predict.observed=[]", None),
+        ("predict.observed=[{at=[[3.0, 0, 0]]}]", "outside the body"),
+        ("predict.observed=[{on='z-max'}]", "expected points ('at')"),
+        ("predict.observed=[{at=[[1.0, 0, 0]], cases=['shaer']}]", "did you mean 'shear'?"),
+        ("predict.model={outputs=[]}", "expected predict.cases and predict.observed"),
+        ("predict={cases=[{name='shear', outputs=ENERGY}, {name='shear', outputs=ENERGY}]}", "different names"),
+        ("predict={}", "nothing is predicted, expected predict.cases or predict.observed"),
+        ("predict.cases=[{name='shear', outputs=[{name='e', kind='strain-energi'}]}]", "did you mean 'strain-energy'?"),
+    ],
+)
+def test_what_cannot_be_predicted_of_a_specimen(specimens, change, said):
+    if said is None:
+        assert load(specimens / "few.toml", [change]).predict.observed == ()
+        return
+    with pytest.raises(StudyError) as refused:
+        load(specimens / "few.toml", [change.replace("ENERGY", "[{name='e', kind='strain-energy'}]")])
+    assert said in str(refused.value)
+    assert len(refused.value.args) == 1

@@ -1,0 +1,241 @@
+"""What an inversion predicts: the models of it, mistakes in asking, and how posteriors are put into them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import ValidationError
+
+from forward.model import Finding, FloatArray, ForwardModel
+from forward.settings import nearest
+from forward.specimen import SHARED, LoadCase, Specimen
+from inverse.methods import predict
+from uq.inputs.draws import Draws
+from uq.inputs.sampling import sobol_points
+from workflows.config.predict import LEAST
+from workflows.config.priors import ranges
+from workflows.studies.inversion import PREDICTED
+from workflows.studies.predictions import has_mesh
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec
+    from inverse.fields.low_rank import LowRankPosterior
+    from inverse.methods.predict import Band, Record
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.evaluate import Evaluate
+    from workflows.config.predict import Predict
+    from workflows.studies.inversion import InversionStudy
+
+FieldPredictions = Callable[["LowRankPosterior", "tuple[FloatArray, FloatArray] | None"], "Record"]
+ACTING = ("clamp", "displacements", "loads")
+POINTS = 4096  # that stand for the prior
+LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
+
+
+# --- what is asked ---------------------------------------------------------------------------------------------------
+
+
+def spec(study: InversionStudy) -> ModelSpec:
+    """Return the model whose outputs are predicted, in the form of the measured one; a ValidationError says no."""
+    asked = _asked(study)
+    if isinstance(study.model, Specimen):
+        own = study.model.over(ranges(study.parameters))
+        known = {case.name: case for case in own.cases}
+        cases = tuple(_acting(case, known) for case in asked.cases) or own.cases
+        shared = {name: getattr(own, name) for name in SHARED}
+        return Specimen(formulation=own.formulation, cases=cases, observed=asked.observed, **shared)
+    kept = {name: getattr(study.model, name) for name in type(study.model).model_fields}
+    made: ModelSpec = type(study.model).model_validate(kept | asked.model)
+    return made.over(ranges({name: one for name, one in study.parameters.items() if name in made.scalars}))
+
+
+def _asked(study: InversionStudy) -> Predict:
+    assert study.predict is not None
+    return study.predict
+
+
+def _acting(case: LoadCase, known: dict[str, LoadCase]) -> LoadCase:
+    """Return a load case with what acts in the measured one of that name, where it says nothing itself."""
+    if case.name not in known or any(getattr(case, name) for name in ACTING):
+        return case
+    return known[case.name].model_copy(update={"outputs": case.outputs})
+
+
+def parameters(study: InversionStudy) -> tuple[str, ...]:
+    """Names of the unknowns that act in what is predicted."""
+    made = study.predicted
+    known = {*made.scalars, *made.coefficients}
+    return tuple(name for name in _unknown(study) if name in known)
+
+
+def _unknown(study: InversionStudy) -> tuple[str, ...]:
+    return study.model.coefficients if study.field else study.inputs.names
+
+
+def mistakes(study: InversionStudy) -> Iterator[Mistake]:
+    """Find what cannot be predicted."""
+    asked, specimen = _asked(study), isinstance(study.model, Specimen)
+    if specimen and asked.model:
+        message = "a specimen is predicted in load cases and at places, expected predict.cases and predict.observed"
+        yield ("predict", "model"), message, asked.model
+        return
+    for name in ("cases", "observed") if not specimen else ():
+        if getattr(asked, name):
+            message = f"a model of kind '{study.model.kind}' has none, expected predict.model = {{ outputs = [...] }}"
+            yield ("predict", name), message, [str(one.name) for one in getattr(asked, name)]
+            return
+    if not study.field and asked.solves(field=False) < LEAST:
+        yield ("predict", "samples"), f"expected at least {LEAST}", asked.samples
+    wrong = list(_of_cases(study, asked)) if specimen else list(_of_model(study, asked))
+    yield from wrong
+    if wrong:
+        return
+    try:
+        made = spec(study)
+    except ValidationError as error:
+        for line in error.errors(include_url=False):
+            where = () if specimen else ("model",)
+            yield ("predict", *where, *line["loc"]), line["msg"], line["input"]
+        return
+    try:
+        outputs = made.returned
+    except ValueError as error:  # nodes of a boundary, which only the mesh knows
+        yield ("predict", "observed"), str(error).removeprefix("observed"), [one.on for one in asked.observed]
+        return
+    if not outputs:
+        yield ("predict",), "nothing is predicted, expected outputs or places", {}
+        return
+    if not {*made.scalars, *made.coefficients} & set(_unknown(study)):
+        message = f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted"
+        yield ("predict",), message, {}
+
+
+def _of_cases(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
+    known = tuple(case.name for case in study.model.cases)
+    if not asked.cases and not asked.observed:
+        yield ("predict",), "nothing is predicted, expected predict.cases or predict.observed", {}
+    everywhere = any(not one.cases for one in asked.observed)
+    seen = {name for one in asked.observed for name in one.cases}
+    for i, case in enumerate(asked.cases):
+        if case.name not in known and not any(getattr(case, name) for name in ACTING):
+            message = f"is no measured load case, and nothing acts in it; {nearest(case.name, known)}"
+            yield ("predict", "cases", i, "name"), message, case.name
+        elif not case.outputs and not everywhere and case.name not in seen:
+            message = "nothing is predicted in this load case, expected outputs or predict.observed"
+            yield ("predict", "cases", i), message, case.name
+
+
+def _of_model(study: InversionStudy, asked: Predict) -> Iterator[Mistake]:
+    known = tuple(name for name in type(study.model).model_fields if name != "kind")
+    if asked.model.get("kind", study.model.kind) != study.model.kind:
+        yield ("predict", "model", "kind"), f"expected '{study.model.kind}', as what was measured", asked.model["kind"]
+    for name in asked.model:
+        if name not in known and name != "kind":
+            yield ("predict", "model", name), f"unknown key; {nearest(name, known)}", asked.model[name]
+
+
+# --- what is done ----------------------------------------------------------------------------------------------------
+
+
+def build(study: InversionStudy, ensemble: Ensemble) -> ForwardModel:
+    """Make the model of what is predicted; collective over the group."""
+    model: ForwardModel = study.predicted.build(ensemble.group, parameters(study))
+    return model
+
+
+def of_few(
+    study: InversionStudy, found: xr.Dataset, evaluate: Evaluate, of_mesh: Evaluate, before: Callable[[], Band]
+) -> Record:
+    """Return what the posterior of few parameters, in the dataset of its inversion, says on what is predicted.
+
+    Parameters
+    ----------
+    study, found
+        The study, and the results of the inversion.
+    evaluate, of_mesh
+        The model of what is predicted, for solves, and for estimates of the error of its mesh.
+    before
+        What the prior says.
+    """
+    names = parameters(study)
+    weights = found["point_weight"].to_numpy()
+    used = weights > 0
+    columns = [study.names.index(name) for name in names]
+    points = found["point"].to_numpy()[used][:, columns]
+    kept = weights[used] / weights[used].sum()
+    draws = Draws(names, points, kept, float(1 / (kept**2).sum()))
+    asked, seed = _asked(study), study.method.seed
+    after = predict.of_draws(draws, evaluate, asked.solves(field=False), seed)
+    looked = study.method.treatment is not None and has_mesh(study.predicted)
+    mesh = predict.mesh_error_at(draws, of_mesh) if looked and not np.isnan(after.mean).all() else np.nan
+    return predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
+
+
+def prior_band(study: InversionStudy, evaluate: Evaluate) -> Band:
+    """Return what the prior says, which is solved for once for all data sets."""
+    names, every = parameters(study), study.inputs.names
+    points = study.inputs.points(sobol_points(study.method.seed, 0, 0, POINTS, len(every)))
+    values = points[study.inputs.allowed(points)][:, [every.index(name) for name in names]]
+    draws = Draws(names, values, np.full(len(values), 1 / len(values)), float(len(values)))
+    return predict.of_draws(draws, evaluate, _asked(study).solves(field=False), study.method.seed)
+
+
+def of_field(study: InversionStudy, model: Callable[[str], ForwardModel]) -> Callable[[str], FieldPredictions]:
+    """Return what predicts from the posterior of a field of a data set, by its name.
+
+    Parameters
+    ----------
+    study
+        The study.
+    model
+        The model of what is predicted, whose solves are kept under a name.
+    """
+    prior = study.model.fields[0].prior(study.model.body)
+    pairs, seed, size = _asked(study).solves(field=True) // 2, study.method.seed, len(parameters(study))
+
+    @cache
+    def before() -> Band:
+        return predict.before_field(model(f"prior, {PREDICTED}"), prior, size, pairs, seed)
+
+    def of(name: str) -> FieldPredictions:
+        def record(found: LowRankPosterior, weighted: tuple[FloatArray, FloatArray] | None) -> Record:
+            there, looked = model(f"{name}/{PREDICTED}"), study.method.treatment is not None
+            return predict.after_field(there, found, before(), pairs, seed, weighted, of_mesh=looked)
+
+        return record
+
+    return of
+
+
+# --- what is said ----------------------------------------------------------------------------------------------------
+
+
+def findings(one: xr.Dataset, name: str, *, meshed: bool) -> Iterator[Finding]:
+    """Say what is doubtful of the predictions of a data set."""
+    why = str(one["prediction_why"].item())
+    if why:
+        yield Finding("warning", f"{name}: predictions: {why}.")
+    std, mesh = one["prediction_std"].to_numpy(), one["prediction_mesh_error"].to_numpy()
+    off = _over(one, np.abs(mesh), std)
+    if off:
+        text = f"the mesh is estimated to move {off} standard deviations, which the intervals do not hold: a finer mesh"
+        yield Finding("warning", f"{name}: predictions: {text} helps, or add what is said of it.")
+    rough = _over(one, one["prediction_mean_error"].to_numpy(), std)
+    if rough:
+        text = f"the mean is known to {rough} standard deviations only: more predict.samples reduce that"
+        yield Finding("warning", f"{name}: predictions: {text}.")
+    untold = [str(goal) for goal, error in zip(one["goal"].values, mesh, strict=True) if np.isnan(error)]
+    if meshed and untold and np.isfinite(std).any():
+        yield Finding("note", f"{name}: predictions: the error of the mesh is not estimated of {', '.join(untold)}.")
+
+
+def _over(one: xr.Dataset, errors: FloatArray, std: FloatArray) -> str:
+    """Name the outputs whose errors (k,) are large against their standard deviations (k,)."""
+    parts = zip(one["goal"].values, errors, std, strict=True)
+    return ", ".join(f"{goal} by {error / width:.2g}" for goal, error, width in parts if error > LARGE * width > 0)
