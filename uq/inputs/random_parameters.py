@@ -218,6 +218,29 @@ class Inputs:
         values, slopes = zip(*(marginal.from_normal(z) for marginal, z in columns), strict=True)
         return np.column_stack(values), np.column_stack(slopes)[:, :, None] * factor
 
+    def whitened(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map points (n, d) of the open unit cube to parameters, with derivatives by standard normal coordinates there.
+
+        Of parameters that are given by draws these are roots of their covariance, of logarithms where coordinates are.
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            ω (n, d), and ∂ω_i/∂x_j (n, d, d).
+        """
+        from scipy.special import ndtri
+
+        if self.draws is None:
+            return self.from_normals(ndtri(uniforms))
+        first = self.joint.start
+        points, slopes = self.points(uniforms), np.zeros((*uniforms.shape, uniforms.shape[1]))
+        if first:
+            slopes[:, :first, :first] = self._own.from_normals(ndtri(uniforms[:, :first]))[1]
+        of_draws = self.coordinates
+        size = np.where(of_draws.logarithmic, points, 1.0)[:, first:] * of_draws.scale[first:]
+        slopes[:, first:, first:] = size[:, :, None] * self.draws.mixing
+        return points, slopes
+
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return ln of the density (n,) at points (n, d), unrestricted; −∞ outside."""
         with np.errstate(divide="ignore"):

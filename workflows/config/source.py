@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, model_serializer, model_validator
 
 from forward.registry import named
 from forward.settings import Settings
@@ -63,3 +63,32 @@ class Source(Settings):
         """The draws, by their names in the source; a ValueError says what is wrong with it."""
         found: Draws = named(f"{READER}:read")(self.file, self.group, self.model)
         return found
+
+
+class Sourced(Settings):
+    """A study whose file may name draws among its parameters.
+
+    Parameters
+    ----------
+    source
+        Draws of further numbers; in a file it is ``parameters.from``.
+    """
+
+    source: Source | None = None
+
+    @model_serializer(mode="wrap")
+    def _source_among_parameters(self, handler: Any) -> dict[str, Any]:
+        """Write the source where files have it."""
+        found: dict[str, Any] = handler(self)
+        source = found.pop("source", None)
+        return found if source is None else found | {"parameters": {"from": source, **found["parameters"]}}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_source(cls, value: Any) -> Any:
+        """Take the source from among the parameters."""
+        parameters = value.get("parameters") if isinstance(value, dict) else None
+        if not isinstance(parameters, dict) or "from" not in parameters:
+            return value
+        rest = {path: block for path, block in parameters.items() if path != "from"}
+        return value | {"parameters": rest, "source": parameters["from"]}

@@ -15,7 +15,7 @@ from forward.settings import cut
 from uq.methods.method import METHODS
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import located
-from workflows.config.source import KEPT
+from workflows.config.source import KEPT, Sourced
 from workflows.studies.study import SAMPLING, STUDIES, WITHOUT_EFFECT, StudyKind
 
 _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
@@ -158,10 +158,11 @@ def schema() -> dict[str, Any]:
             found["$defs"] |= table.pop("$defs", {}) | {name: table}
             data = found["$defs"][form.__name__]["properties"]
             data["data"] = {"anyOf": [data["data"], {"$ref": _REFERENCE.format(model=name)}]}
-    # Draws stand among the parameters that they are of.
-    sampled = found["$defs"][STUDIES[SAMPLING].__name__]
-    properties = sampled["properties"]
-    properties["parameters"] |= {"properties": {"from": {"anyOf": [{"type": "string"}, properties.pop("source")]}}}
+    for form in forms:  # draws stand among the parameters that they are of
+        if issubclass(form, Sourced):
+            properties = found["$defs"][form.__name__]["properties"]
+            source = properties.pop("source")
+            properties["parameters"] |= {"properties": {"from": {"anyOf": [{"type": "string"}, source]}}}
     # A tolerance for all errors stands in place of a method.
     sampled = found["$defs"][STUDIES[SAMPLING].__name__]
     sampled["required"].remove("method")

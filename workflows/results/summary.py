@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Part = dict[str, Any]
+LISTED = 20  # observations of a design
 OTHER_ESTIMATES = (
     *("variance_ratio", "std_variance_ratio", "loo_error"),
     *("bias_error", "total_error", "std_bias_error", "std_total_error"),
@@ -48,6 +49,8 @@ def inverted(summary: Mapping[str, Any]) -> list[str]:
         lines += [_predicted(f"{name}: {goal}", at) for goal, at in found.get("predictions", {}).items()]
     if "data" in summary:
         lines.append(f"{summary['data']} data made")
+    if "design" in summary:
+        lines += _design_in_words(summary["design"])
     return lines
 
 
@@ -68,6 +71,45 @@ def _inversion(dataset: xr.Dataset) -> Part:
 
 def _synthetic(dataset: xr.Dataset) -> Part:
     return {"data": int(np.isfinite(dataset["values"]).sum())}
+
+
+def _design(dataset: xr.Dataset) -> Part:
+    chosen = dataset.isel(candidate=dataset["chosen"].to_numpy())
+    place = [[None if np.isnan(x) else x for x in at] for at in chosen["candidate_place"].to_numpy().tolist()]
+    columns = {
+        "name": [str(name) for name in chosen["candidate"].values],
+        "case": [str(case) for case in chosen["candidate_case"].values],
+        "place": place,
+        "measured": [str(part) for part in chosen["candidate_part"].values],
+        "gain": dataset["gain"].to_numpy().tolist(),
+        "information": dataset["information"].to_numpy().tolist(),
+        "cost": dataset["cost"].to_numpy().tolist(),
+    }
+    equal = _number(dataset["random_equal"])
+    return {
+        "design": {
+            "candidates": dataset.sizes["candidate"],
+            "chosen": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+            "random_equal": None if equal is None else int(equal),
+            "random_most": dataset.sizes["random_number"],
+        }
+    }
+
+
+def _design_in_words(design: Mapping[str, Any]) -> list[str]:
+    """Say which observations were chosen, and how many random ones are worth as much."""
+    chosen = design["chosen"]
+    lines = [
+        f"{k}. {one['name']}: {one['gain']:+.3g} nat, {one['information']:.4g} nat together"
+        for k, one in enumerate(chosen[:LISTED], start=1)
+    ]
+    if len(chosen) > LISTED:
+        last = chosen[-1]["information"]
+        lines.append(f"{len(chosen) - LISTED} more are in design.csv, {last:.4g} nat together")
+    equal = design["random_equal"]
+    worth = f"{equal}" if equal is not None else f"more than {design['random_most']}"
+    lines.append(f"{len(chosen)} of {design['candidates']} candidates are worth {worth} random ones")
+    return lines
 
 
 def _comparison(dataset: xr.Dataset) -> Part:
@@ -251,6 +293,7 @@ def _number(value: Any) -> float | None:
 _PARTS: tuple[tuple[set[str], Callable[[xr.Dataset], Part]], ...] = (  # what each needs
     ({"alone_eigenvalue"}, _inversion),
     ({"clean"}, _synthetic),
+    ({"random_equal"}, _design),
     ({"probability"}, _comparison),
     ({"nominal", "mean"}, _moments),
     ({"quantiles", "mean"}, _quantiles),

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, ValidationError, model_serializer, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from forward.machine import MIB
 from forward.model import Finding, ModelError
@@ -29,7 +29,7 @@ from workflows.config.priors import (
     ranges,
 )
 from workflows.config.report import Report
-from workflows.config.source import AVERAGED, KEPT, READER, Source
+from workflows.config.source import AVERAGED, KEPT, READER, Sourced
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 OF_TOLERANCE = "workflows.studies.tolerance_asked"  # what a tolerance of all errors decides and forbids
 
 
-class Study(StudyKind):
+class Study(Sourced, StudyKind):
     """What to compute.
 
     Parameters
@@ -74,7 +74,6 @@ class Study(StudyKind):
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     parameters: dict[str, Distribution] = Field(default={})
-    source: Source | None = None
     correlations: tuple[Correlation, ...] = ()
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
@@ -284,23 +283,6 @@ class Study(StudyKind):
         if self.source is None or self.source.model == AVERAGED:
             return {}
         return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
-
-    @model_serializer(mode="wrap")
-    def _source_among_parameters(self, handler: Any) -> dict[str, Any]:
-        """Write the source where files have it."""
-        found: dict[str, Any] = handler(self)
-        source = found.pop("source", None)
-        return found if source is None else found | {"parameters": {"from": source, **found["parameters"]}}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _take_source(cls, value: Any) -> Any:
-        """Take the source from among the parameters."""
-        parameters = value.get("parameters") if isinstance(value, dict) else None
-        if not isinstance(parameters, dict) or "from" not in parameters:
-            return value
-        rest = {path: block for path, block in parameters.items() if path != "from"}
-        return value | {"parameters": rest, "source": parameters["from"]}
 
     @model_validator(mode="before")
     @classmethod

@@ -192,6 +192,7 @@ STUDIES = Kinds(
         "invert": "workflows.studies.inversion:InversionStudy",
         "synthesize": "workflows.studies.synthesis:SynthesisStudy",
         "population": "workflows.studies.population:PopulationStudy",
+        "design": "workflows.studies.design:DesignStudy",
     },
     objection=_objection,
 )

@@ -1,0 +1,162 @@
+"""Values of a model that may be measured, and what is measured together as one observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+IntArray = NDArray[np.int64]
+Each = Literal["value", "point", "place", "case", "output", "step"]
+NEAR = 12  # decimals of coordinates (m) of points that are the same
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """What a model gives, m values.
+
+    Attributes
+    ----------
+    names
+        Of the values.
+    places
+        Where (m, 3) each is measured in the undeformed body (m); NaN of those at no point.
+    case
+        Name of the load case, or the number of the step, of each; empty without.
+    part
+        Component of the displacement, or name of the output.
+    """
+
+    names: tuple[str, ...]
+    places: FloatArray
+    case: tuple[str, ...]
+    part: tuple[str, ...]
+
+    @property
+    def displaced(self) -> NDArray[np.bool_]:
+        """Which are displacements of points (m,)."""
+        return np.asarray(np.isfinite(self.places).all(axis=1))
+
+    @property
+    def kinds(self) -> list[tuple[str, str]]:
+        """What errors may be relative to: displacements in a load case, or an output."""
+        where = zip(self.case, self.part, self.displaced, strict=True)
+        return [(case, "") if at else (case if case and not case.isdigit() else "", part) for case, part, at in where]
+
+    def matching(self, pattern: str) -> NDArray[np.bool_]:
+        """Return which names (m,) match a pattern."""
+        return np.array([fnmatchcase(name, pattern) for name in self.names], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Observations that can be chosen.
+
+    Attributes
+    ----------
+    names
+        Of the c candidates.
+    which
+        Number (m,) of the candidate that each value belongs to; -1 of values that are not measured.
+    places
+        Where (c, 3) they are (m); NaN of those at no point, or at several.
+    cases, parts
+        Load case of each, empty if in several; and what is measured, such as "xyz" or "force".
+    """
+
+    names: tuple[str, ...]
+    which: IntArray
+    places: FloatArray
+    cases: tuple[str, ...]
+    parts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, values: Values, each: Each, goals: NDArray[np.bool_]) -> Candidates:
+        """Gather values, but for goals (m,), into observations. The same value at one point counts once."""
+        which, seen = np.full(len(values.names), -1), set()
+        keys: dict[tuple[object, ...], list[int]] = {}
+        for k, (name, case, part, at) in enumerate(
+            zip(values.names, values.case, values.part, values.displaced, strict=True)
+        ):
+            place = tuple((np.round(values.places[k], NEAR) + 0.0).tolist()) if at else ()
+            same = (case, place, part) if at else (name,)
+            if goals[k] or same in seen:
+                continue
+            seen.add(same)
+            match each:
+                case "value":
+                    key: tuple[object, ...] = (name,)
+                case "point":
+                    key = (case, place) if at else (name,)
+                case "place":
+                    key = (place,) if at else (name,)
+                case "output":
+                    key = ("", part) if at else (values.kinds[k][0], part)
+                case _:
+                    key = (case,)
+            keys.setdefault(key, []).append(k)
+        for number, rows in enumerate(keys.values()):
+            which[rows] = number
+        every = list(keys.values())
+        return cls(
+            tuple(_name(values, rows, each) for rows in every),
+            which,
+            np.array([_one([values.places[k] for k in rows]) for rows in every]).reshape(-1, 3),
+            tuple(_common([values.case[k] for k in rows]) for rows in every),
+            tuple(_parts([values.part[k] for k in rows]) for rows in every),
+        )
+
+    def numbers(self, given: Mapping[str, float]) -> FloatArray:
+        """Return a number (c,) for each candidate, by patterns of names of which the last that matches counts; else 1.
+
+        Raises
+        ------
+        ValueError
+            If a pattern matches none.
+        """
+        found = np.ones(len(self.names))
+        for pattern, value in given.items():
+            mine = np.array([fnmatchcase(name, pattern) for name in self.names], dtype=bool)
+            if not mine.any():
+                message = f"'{pattern}' is the name of no candidate, such as {', '.join(self.names[:3])}"
+                raise ValueError(message)
+            found[mine] = value
+        return found
+
+
+def _name(values: Values, rows: Sequence[int], each: Each) -> str:
+    first = values.names[rows[0]]
+    match each:
+        case "value":
+            return first
+        case "point":
+            return first.rpartition(".")[0] if values.displaced[rows[0]] else first
+        case "place":
+            middle = first.partition(".")[2] if values.case[rows[0]] else first
+            return middle.rpartition(".")[0] if values.displaced[rows[0]] else first
+        case "output":
+            return "displacements" if values.displaced[rows[0]] else values.part[rows[0]]
+        case _:
+            return values.case[rows[0]] or first
+
+
+def _one(places: Sequence[FloatArray]) -> FloatArray:
+    """The place of all of them, or NaN."""
+    same = all(np.array_equal(np.round(one, NEAR), np.round(places[0], NEAR), equal_nan=True) for one in places)
+    return places[0] if same else np.full(3, np.nan)
+
+
+def _common(words: Sequence[str]) -> str:
+    return words[0] if len(set(words)) == 1 else ""
+
+
+def _parts(words: Sequence[str]) -> str:
+    """The parts in their order, each once: "xyz" of components."""
+    each = list(dict.fromkeys(words))
+    return ("" if all(len(word) == 1 for word in each) else " ").join(each)

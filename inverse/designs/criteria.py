@@ -1,0 +1,181 @@
+"""What a set of observations tells, of models that are linear in standard normal unknowns.
+
+A model is linearised at a draw of the prior, ψ(x + z) ≈ ψ(x) + A z with z ~ N(0, I) and rows of A over the standard
+deviations of the errors. The observations S leave z with the covariance C = (I + A_SᵀA_S)⁻¹. What they tell (nat) is
+
+    ½ ln det(I + A_SᵀA_S),
+
+the expected divergence of the posterior from the prior (D. V. Lindley, Ann. Math. Stat. 27 (1956) 986–1005), largest
+for D-optimal designs; the variance of goals G z that they take away is tr G(I − C)Gᵀ, largest for A-optimal ones (K.
+Chaloner, I. Verdinelli, Statist. Sci. 10 (1995) 273–304). Both are averaged over draws. The first is submodular: what
+an observation adds never grows as others are added.
+
+Candidates are arrays (c, k, r) for each draw: k rows for each of c candidates, of which some may be zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+
+IntArray = NDArray[np.int64]
+
+
+class Criterion(Protocol):
+    """What a growing set of observations is worth.
+
+    Attributes
+    ----------
+    submodular
+        Whether what an observation adds never grows as others are added.
+    """
+
+    submodular: ClassVar[bool]
+
+    @property
+    def count(self) -> int:
+        """Number of candidates."""
+
+    def gains(self, which: IntArray) -> FloatArray:
+        """Return what each of some candidates (w,), by number, would add (w,)."""
+
+    def take(self, one: int) -> None:
+        """Add a candidate to the set."""
+
+
+def grouped(rows: FloatArray, which: IntArray, count: int) -> FloatArray:
+    """Return rows (m, r) as candidates (count, k, r), given the number (m,) of the candidate of each; -1 of none.
+
+    Of a candidate with more than r rows, as many are kept as tell the same, a triangular factor of them.
+    """
+    parts = [rows[which == number] for number in range(count)]
+    r = rows.shape[1]
+    parts = [np.linalg.qr(part, mode="r") if len(part) > r else part for part in parts]
+    found = np.zeros((count, max(map(len, parts), default=0), r))
+    for number, part in enumerate(parts):
+        found[number, : len(part)] = part
+    return found
+
+
+def told(rows: FloatArray) -> FloatArray:
+    """Return what observations tell, ½ ln det(I + RRᵀ) (...), of rows (..., k, r) in whitened unknowns."""
+    k = rows.shape[-2]
+    return np.asarray(np.linalg.slogdet(np.eye(k) + rows @ np.swapaxes(rows, -1, -2))[1] / 2)
+
+
+def told_along(rows: FloatArray) -> FloatArray:
+    """Return what the first, the first two, … of observations (n, k, r) tell together (n,): by one Cholesky factor.
+
+    Where the same is told again and again, rounding is 1e-16 of the largest eigenvalue of RRᵀ, in nat.
+    """
+    n, k, r = rows.shape
+    flat = rows.reshape(n * k, r)
+    diagonal = np.diag(np.linalg.cholesky(np.eye(n * k) + flat @ flat.T))
+    return np.asarray(np.log(diagonal).cumsum()[k - 1 :: k])
+
+
+def conditioned(root: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return a root T (r, r) of the covariance that is left, C = TTᵀ, once rows (k, r) were observed.
+
+    With R = rows · T = U s Vᵀ, it is T(I + RᵀR)^(−1/2) = T − TRᵀU a²/(1 + a) UᵀR, a = (1 + s²)^(−1/2): no difference of
+    large numbers, however much is told.
+    """
+    seen = rows @ root
+    squares, U = np.linalg.eigh(seen @ seen.T)
+    a = (1 + np.maximum(squares, 0.0)) ** -0.5
+    turned = U.T @ seen
+    return np.asarray(root - (root @ turned.T * (a**2 / (1 + a))) @ turned)
+
+
+class Information:
+    """D-optimality: the mean over draws of what observations tell (nat).
+
+    Parameters
+    ----------
+    candidates
+        Of each draw (c, k, r).
+    """
+
+    submodular: ClassVar[bool] = True
+
+    def __init__(self, candidates: Sequence[FloatArray]) -> None:
+        self._candidates = candidates
+        self.roots = [np.eye(one.shape[-1]) for one in candidates]
+
+    @property
+    def count(self) -> int:
+        """Number of candidates."""
+        return len(self._candidates[0])
+
+    def of_draws(self, which: IntArray) -> FloatArray:
+        """Return what each of some candidates (w,) would add at each draw (draws, w)."""
+        pairs = zip(self._candidates, self.roots, strict=True)
+        return np.array([told(rows[which] @ root) for rows, root in pairs])
+
+    def gains(self, which: IntArray) -> FloatArray:
+        """Return what each of some candidates (w,) would add (w,)."""
+        return np.asarray(self.of_draws(which).mean(axis=0))
+
+    def take(self, one: int) -> None:
+        """Add a candidate to the set."""
+        pairs = zip(self.roots, self._candidates, strict=True)
+        self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
+
+
+class Variance:
+    """A-optimality: the mean over draws of the share of the variance of goals that observations take away.
+
+    Parameters
+    ----------
+    candidates
+        Of each draw (c, k, r).
+    goals
+        GᵀG (r, r) of each draw, with the goals G in units in which their prior variances add up to one.
+    """
+
+    submodular: ClassVar[bool] = False
+
+    def __init__(self, candidates: Sequence[FloatArray], goals: Sequence[FloatArray]) -> None:
+        self._candidates, self._goals = candidates, goals
+        self.roots = [np.eye(len(one)) for one in goals]
+
+    @property
+    def count(self) -> int:
+        """Number of candidates."""
+        return len(self._candidates[0])
+
+    @property
+    def left(self) -> FloatArray:
+        """What is left of the variance (draws,), among unknowns that observations can tell."""
+        pairs = zip(self._goals, self.roots, strict=True)
+        return np.array([np.trace(root.T @ goal @ root) for goal, root in pairs])
+
+    def gains(self, which: IntArray) -> FloatArray:
+        """Return what each of some candidates (w,) would take away (w,)."""
+        found = np.zeros(len(which))
+        for rows, goal, root in zip(self._candidates, self._goals, self.roots, strict=True):
+            seen = rows[which] @ root
+            across = np.swapaxes(seen, -1, -2)
+            within = np.eye(seen.shape[1]) + seen @ across
+            taken = np.linalg.solve(within, seen @ (root.T @ goal @ root) @ across)
+            found += np.trace(taken, axis1=-2, axis2=-1)
+        return found / len(self._goals)
+
+    def take(self, one: int) -> None:
+        """Add a candidate to the set."""
+        pairs = zip(self.roots, self._candidates, strict=True)
+        self.roots = [conditioned(root, rows[one]) for root, rows in pairs]
+
+
+def along(criterion: Criterion, order: Sequence[int]) -> Iterator[float]:
+    """Go through what the first, the first two, … of candidates in an order are worth together."""
+    worth = 0.0
+    for one in order:
+        worth += float(criterion.gains(np.array([one]))[0])
+        criterion.take(one)
+        yield worth

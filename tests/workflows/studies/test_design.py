@@ -1,0 +1,247 @@
+"""Studies of designs: from files to results, as inputs of other studies, on ranks, and what is refused."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.launch import TISSUQ, assert_same_bits
+from tests.launch import run as on_ranks
+from workflows.config.mistakes import StudyError
+from workflows.config.study import document, load, parse
+from workflows.run.run import run
+
+MODULE = """
+import numpy as np
+
+G = np.random.default_rng(1).standard_normal((12, 3)) * 10.0 ** np.linspace(-1, 1, 12)[:, None]
+
+def value(p):
+    return (G @ p).tolist()
+
+def slopes(p):
+    return G.tolist()
+"""
+NAMES = [f"y{i}" for i in range(12)]
+PYTHON = """
+[model]
+kind = "python"
+function = "line.value"
+jacobian = "line.slopes"
+parameters = {{ a = 1.0, b = 2.0, c = 0.0 }}
+outputs = [{outputs}]
+[parameters]
+{parameters}
+[method]
+kind = "design"
+noise = {{ absolute = 0.5 }}
+{method}
+"""
+NORMAL = "\n".join(f'{name} = {{ kind = "normal", mean = 1, std = {i + 1} }}' for i, name in enumerate("abc"))
+CUBE = """
+[model]
+kind = "specimen"
+body = {{ kind = "box", size = [0.05, 0.05, 0.05], cells = [2, 2, 2], degree = 1 }}
+material = {{ kind = "neo-hookean-coupled", mu = 1e3, lmbda = 2e3 }}
+inclusions = [{{ name = "lump", x = 0.02, y = 0.025, z = 0.03, radius = 0.015, contrast = 3, width = 0.02 }}]
+observed = [{{ on = "x-max" }}, {{ on = "z-max" }}]
+[[model.cases]]
+name = "shear"
+clamp = ["z-min"]
+displacements = [{{ on = "z-max", x = 0.004, y = 0, z = 0 }}]
+[[model.cases]]
+name = "pull"
+clamp = ["z-min"]
+displacements = [{{ on = "z-max", x = 0, y = 0, z = 0.004 }}]
+outputs = [{{ name = "grip", kind = "reaction", on = "z-max", component = "z" }}]
+{more}
+"""
+PRIORS = """
+[parameters]
+"inclusions.lump.x" = {{ kind = "uniform", lower = 0.015, upper = 0.035 }}
+"material.mu" = {{ kind = "log-normal", mean = 1e3, std = 300 }}
+[method]
+kind = "design"
+noise = {{ relative = 0.01 }}
+draws = 2
+{method}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "line", raising=False)
+    (tmp_path / "line.py").write_text(MODULE)
+    return tmp_path
+
+
+def line(folder, method="number = 4", parameters=NORMAL):
+    outputs = ", ".join(f'{{ name = "{name}" }}' for name in NAMES)
+    path = folder / "line.toml"
+    path.write_text(PYTHON.format(outputs=outputs, parameters=parameters, method=method))
+    return path
+
+
+def cube(folder, method, more=""):
+    path = folder / "cube.toml"
+    path.write_text(CUBE.format(more="") + more + PRIORS.format(method=method))
+    return path
+
+
+def exact(chosen, std=(1, 2, 3)):
+    """Information of outputs of the line, and covariance of the parameters after them."""
+    scope = {}
+    exec(MODULE, scope)
+    A = scope["G"][chosen] * np.array(std) / 0.5
+    P = np.eye(3) + A.T @ A
+    return np.linalg.slogdet(P)[1] / 2, np.linalg.inv(P) * np.outer(std, std)
+
+
+def test_a_linear_model_is_the_closed_form_with_any_ranks(folder):
+    path = line(folder)
+    study = load(path)
+    assert parse(document(study)) == study
+    for ranks in (None, 3):
+        done = on_ranks(ranks, TISSUQ, "run", path, "--out", folder / f"out-{ranks}", "--quiet")
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(folder / "out-None", folder / "out-3")
+    found = xr.load_dataset(folder / "out-3" / "results.nc")
+    chosen = found["chosen"].to_numpy()
+    for n in range(4):
+        assert float(found["information"][n]) == pytest.approx(exact(chosen[: n + 1])[0], rel=1e-9)
+    np.testing.assert_allclose(found["posterior_std"], np.sqrt(np.diag(exact(chosen)[1])), rtol=1e-9)
+    best = max(range(12), key=lambda i: exact([i])[0])
+    assert chosen[0] == best
+    assert (found["random_upper"].to_numpy()[:4] <= found["information"].to_numpy() + 1e-9).all()
+    summary = json.loads((folder / "out-3" / "summary.json").read_text())
+    design = summary["design"]
+    assert [one["name"] for one in design["chosen"]] == [NAMES[i] for i in chosen]
+    assert design["random_equal"] is None or design["random_equal"] >= 4
+    assert "Which observations tell most" in (folder / "out-3" / "report.html").read_text()
+    table = (folder / "out-3" / "design.csv").read_text().splitlines()
+    assert [row.split(",")[1] for row in table[1:]] == [NAMES[i] for i in chosen]
+
+
+def test_a_posterior_is_a_prior(folder):
+    """The next observations, with draws of what the first ones left, are those of the closed form."""
+    first = load(line(folder, "number = 2")).run()
+    chosen = first["chosen"].to_numpy()
+    covariance = exact(chosen)[1]
+    draws = np.random.default_rng(3).multivariate_normal(np.ones(3), covariance, 4000)
+    table = "a,b,c\n" + "\n".join(",".join(map(repr, row)) for row in draws.tolist()) + "\n"
+    (folder / "draws.csv").write_text(table)
+    path = line(folder, "number = 1", 'from = "draws.csv"')
+    study = load(path)
+    assert parse(document(study)) == study
+    assert "digest" in document(study)["parameters"]["from"]
+    found = study.run()
+    now = exact(chosen)[0]
+    best = max(range(12), key=lambda i: exact([*chosen, i])[0])
+    assert int(found["chosen"][0]) == best
+    assert float(found["information"][0]) == pytest.approx(exact([*chosen, best])[0] - now, rel=0.1)
+
+
+def test_variances_of_parameters_and_predictions(folder):
+    by_parameters = load(line(folder, 'number = 2\ncriterion = "parameters"')).run()
+    chosen = by_parameters["chosen"].to_numpy()
+    left = np.diag(exact(chosen)[1]) / np.array([1, 4, 9])
+    assert float(by_parameters["worth"][-1]) == pytest.approx(1 - left.mean(), rel=1e-9)
+    goal = load(line(folder, 'number = 1\ncriterion = "predictions"\ngoals = ["y0"]')).run()
+    assert "y0" not in goal["candidate"].values
+    scope = {}
+    exec(MODULE, scope)
+    g = scope["G"][0]
+
+    def taken(i):
+        return 1 - g @ exact([i])[1] @ g / (g**2 @ np.array([1, 4, 9]))
+
+    best = max(range(1, 12), key=taken)
+    assert str(goal["candidate"][int(goal["chosen"][0])].item()) == NAMES[best]
+    assert float(goal["worth"][0]) == pytest.approx(taken(best), rel=1e-9)
+
+
+@pytest.mark.fem
+def test_chosen_points_are_what_other_studies_take(folder):
+    path = cube(folder, "number = 6\ncosts = { 'pull.grip' = 1.5 }\nnoises = { '*.grip' = { relative = 0.02 } }")
+    assert run(load(path), "cube", folder / "out", quiet=True) == 0
+    found = xr.load_dataset(folder / "out" / "results.nc")
+    names = found["candidate"].values[found["chosen"].to_numpy()]
+    assert "pull.grip" in names  # displacements alone say nothing of the modulus where all that acts is a displacement
+    assert {len(one) for one in (set(names), names)} == {6}
+    assert float(found["cost"][-1]) == 6.5
+    # The chosen ones as the observations of a study that makes data, and these as the data of an inversion.
+    text = (folder / "out" / "observed.toml").read_text()
+    made = CUBE.format(more="").replace('observed = [{ on = "x-max" }, { on = "z-max" }]', text)
+    (folder / "make.toml").write_text(made + '[method]\nkind = "synthesize"\nnoise = { relative = 0.01 }\n')
+    assert run(load(folder / "make.toml"), "make", folder / "made", quiet=True, report=False) == 0
+    data = (folder / "made" / "data" / "make.csv").read_text()
+    inversion = cube(folder, "").read_text().split("[method]")[0] + (
+        '[data]\nfiles = ["made/data/make.csv"]\n[method]\nkind = "invert"\n'
+    )
+    (folder / "invert.toml").write_text(inversion)
+    study = load(folder / "invert.toml")
+    assert len(study.measurements[0].observations.places) == 5
+    # The form to be filled in has the same rows, and is a table of data once it is.
+    form = (folder / "out" / "observed.csv").read_text().splitlines()
+    places = {tuple(np.round([float(x) for x in row.split(",")[:3]], 6)) for row in form[2:] if row[0] != ","}
+    rows = [row for row in data.splitlines() if not row.startswith("#")]
+    assert places == {tuple(np.round([float(x) for x in row.split(",")[:3]], 6)) for row in rows[1:] if row[0] != ","}
+    filled = [
+        ",".join([*row.split(",")[:3], "1e-4,1e-4,1e-4", *row.split(",")[6:]])
+        if row[0] != ","
+        else row.replace("grip,,", "grip,0.3,")
+        for row in form[2:]
+    ]
+    (folder / "filled.csv").write_text("\n".join([*form[:2], *filled]) + "\n")
+    (folder / "invert.toml").write_text(inversion.replace("made/data/make.csv", "filled.csv"))
+    assert len(load(folder / "invert.toml").measurements[0].observations.places) == 5
+
+
+@pytest.mark.fem
+def test_whole_load_cases_are_observations(folder):
+    found = load(cube(folder, 'number = 1\neach = "case"')).run()
+    assert found["candidate"].values.tolist() == ["shear", "pull"]
+    alone = found["candidate_information"].to_numpy()
+    assert int(found["chosen"][0]) == int(alone.argmax())
+    with pytest.raises(Exception, match="candidates, expected at least number = 400"):
+        load(cube(folder, "number = 400")).run()
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("number = 13", "method.number: more than there are candidates, expected at most 12; given 13"),
+        ("", "expected number, how many observations, or budget, what they may cost"),
+        ("number = 1\ncriterion = 'predictions'", "expected the names of values that are predicted"),
+        ("number = 1\ngoals = ['y1']", "expected criterion = 'predictions'"),
+        ("number = 1\neach = 'pont'", "method.each: input should be 'value', 'point'"),
+    ],
+)
+def test_designs_that_cannot_be(folder, method, said):
+    with pytest.raises(StudyError) as error:
+        load(line(folder, method))
+    assert len(error.value.args) == 1, error.value.args
+    assert said in error.value.args[0]
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("number = 2\ncosts = { z = 2 }", "method.costs: 'z' is the name of no candidate, such as y0, y1, y2"),
+        ("number = 2\nnoises = { z = { absolute = 2 } }", "'z' is the name of no value of the model, such as y0"),
+        ("budget = 0.5", "budget = 0.5, expected at least the cost of the cheapest candidate, 1"),
+    ],
+)
+def test_names_that_fit_nothing_end_in_one_line(folder, method, said):
+    done = on_ranks(None, TISSUQ, "run", line(folder, method), "--out", folder / "out", "--quiet")
+    assert done.returncode in (1, 2)
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_other_studies_do_not_import_designs():
+    code = "import sys, workflows.studies.sampling; print([name for name in sys.modules if 'design' in name])"
+    assert on_ranks(None, sys.executable, "-c", code).stdout.strip() == "[]"

@@ -1,0 +1,65 @@
+"""Observations that were chosen before they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from forward.words import NONE, number
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.plots import design as plots
+from workflows.report.section import Results, Section
+
+WORTH = {
+    "information": "What they tell (nat)",
+    "parameters": "Share of the parameters' variances that they take away",
+    "predictions": "Share of the predictions' variances that they take away",
+}
+
+
+class ChosenObservations(Section):
+    """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
+
+    def applies(self, results: Results) -> bool:
+        """Whether observations were chosen."""
+        return "chosen" in results.dataset
+
+    def content(self, results: Results) -> Iterator[Block]:
+        """How many random ones they are worth, where they are, and each of them."""
+        found, design = results.dataset, results.summary["design"]
+        n, equal = found.sizes["choice"], design["random_equal"]
+        worth = f"{equal} random ones" if equal is not None else f"more than {design['random_most']} random ones"
+        yield Heading("Which observations tell most")
+        yield Text(
+            f"{n} chosen of {design['candidates']:,} candidates are worth {worth}. Together they tell "
+            f"{number(float(found['information'][-1]))} nat on average over {found.sizes['draw_number']} draws of what "
+            "is not known. They are in design.csv in their order.",
+            "lead",
+        )
+        method = results.study.method
+        ax = plots.against_number(found, WORTH[method.criterion])
+        drawn = [Picture.drawn(ax, "Chosen observations, and the band of 90 % of random ones.")]
+        if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
+            bounds = results.study.model.body.bounds
+            drawn.append(Picture.drawn(plots.on_body(found, bounds), "Candidates and chosen points, in their order."))
+        yield Pictures(drawn)
+        yield _table(results)
+        if "posterior_std" in found:
+            rows = [
+                (name, *(number(float(one[f"{which}_std"])) for which in ("prior", "posterior")))
+                for name in results.leading(found["posterior_std"] / found["prior_std"])
+                for one in [found.sel(parameter=name)]
+            ]
+            yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
+            yield Table(("parameter", "before", "after"), rows)
+
+
+def _table(results: Results) -> Table:
+    rows = []
+    for k, one in enumerate(results.summary["design"]["chosen"], start=1):
+        place = NONE if None in one["place"] else ", ".join(f"{x:.4g}" for x in one["place"])
+        cells = (str(k), one["name"], one["case"] or NONE, place, one["measured"])
+        rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
+    head = ("", "observation", "load case", "place (m)", "measured", "adds (nat)", "together (nat)", "cost")
+    return Table(head, rows, text=frozenset({1, 2, 3, 4}))

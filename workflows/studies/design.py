@@ -1,0 +1,189 @@
+"""Studies that say which observations to make: of those that a model could be given, the ones that tell most."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from pydantic import Field, model_validator
+
+from forward.model import Finding
+from forward.registry import OfKind, named
+from forward.scalars import Mistake
+from forward.spec import MODELS, ModelSpec
+from forward.specimen import Specimen
+from inverse.methods.design import Design
+from uq.inputs.distributions import Distribution, Normal
+from uq.inputs.random_parameters import Inputs
+from workflows.config.blocks import Correlation, Parallel
+from workflows.config.mistakes import refused
+from workflows.config.priors import findings_of_materials, mistakes_of_draws, mistakes_of_priors, ranges
+from workflows.config.report import Report
+from workflows.config.source import AVERAGED, KEPT, READER, Sourced
+from workflows.studies.predictions import duration
+from workflows.studies.study import StudyKind
+
+if TYPE_CHECKING:
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.inputs.draws import Draws
+    from workflows.studies.job import Job
+
+
+class DesignStudy(Sourced, StudyKind):
+    """What could be observed, and how much of it.
+
+    Parameters
+    ----------
+    model
+        What is measured: a specimen, whose `observed` displacements and outputs of load cases are the candidates, or
+        any other model, whose outputs are.
+    parameters
+        Priors by the paths of the unknown numbers of the model; none for a field of nodal values.
+    source
+        Draws of unknown numbers; in a file it is ``parameters.from``: a posterior as prior.
+    correlations
+        Correlations between them.
+    method
+        What is chosen and how.
+    parallel
+        Use of ranks.
+    report
+        Your own sections of the report.
+    """
+
+    stopped: ClassVar[str] = "a design"
+    explains: ClassVar[bool] = False
+
+    model: Annotated[ModelSpec, OfKind(MODELS, "specimen")]
+    parameters: dict[str, Distribution] = Field(default={})
+    correlations: tuple[Correlation, ...] = ()
+    method: Design
+    parallel: Parallel = Parallel()
+    report: Report | None = None
+
+    @cached_property
+    def draws(self) -> Draws | None:
+        """Draws of numbers of the model, if there is a source of them."""
+        found: Draws | None = None
+        if self.source is not None:
+            found = named(f"{READER}:draws_of")(self.source, self.model.scalars)
+        return found
+
+    @property
+    def given(self) -> dict[str, Distribution]:
+        """The distributions by the paths of the numbers that they replace, those of draws too."""
+        return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
+
+    @property
+    def inputs(self) -> Inputs:
+        """The unknowns: those that are given, draws, and the standard normal coefficients of random fields."""
+        own = self.parameters | dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+        pairs = tuple((*c.between, c.value) for c in self.correlations)
+        return Inputs(own, pairs, self.model.materials(self.given), draws=self.draws)
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The model, in the form that suits all values of its parameters."""
+        return self.model.over(ranges(self.given))
+
+    @property
+    def specs(self) -> tuple[ModelSpec, ...]:
+        """The model."""
+        return (self.spec,)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the model."""
+        return self.model.modules
+
+    @property
+    def planned(self) -> int:
+        """Number of solves: one for each draw."""
+        return self.method.draws
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings about model and prior before anything is solved."""
+        found = (*self.model.findings_over(ranges(self.given)), *findings_of_materials(self.inputs))
+        return found if self.source is None else (*found, *named(f"{READER}:findings")(self, self.source))
+
+    def plan(self, rank_groups: int) -> list[str]:
+        """Say what can be chosen, and how long that will take."""
+        method, cost, d = self.method, self.spec.cost(), len(self.inputs.names)
+        limits = [f"{method.number} observations" if method.number is not None else ""]
+        limits += [f"a budget of {method.budget:g}" if method.budget is not None else ""]
+        seconds = 0.0 if cost is None else method.draws * (cost.textbook + cost.tangents(d))
+        return [
+            f"method      {method.kind}, criterion {method.criterion}",
+            *(f"{what:10}  {found}" for what, found in self.model.described(ranges(self.given))),
+            f"unknown     {d}: {', '.join(self.inputs.names[:12])}{', …' if d > 12 else ''}",
+            f"chosen      {', '.join(filter(None, limits))}; one is a {method.each}",
+            f"solves      {self.planned}, each with its derivatives",
+            *([] if cost is None else [f"time        about {duration(seconds)} on 1 core (rough)"]),
+        ]
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the model; collective."""
+        found: Job = named("workflows.studies.design_job:job")(self, ensemble, name)
+        return found
+
+    def parameters_of(self, label: str) -> tuple[str, ...]:
+        """Names of the unknowns."""
+        return self.inputs.names
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that evaluations depend on; files count by their contents, not their path."""
+        found = super().identity() | {"model": self.model.identity()}
+        if self.source is None:
+            return found
+        own = {path: one.model_dump(mode="json") for path, one in self.parameters.items()}
+        return found | {"parameters": {"from": self.source.digest, **own}}
+
+    @property
+    def beside(self) -> Mapping[str, bytes]:
+        """The draws, as they were read."""
+        return {} if self.source is None else {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
+
+    @model_validator(mode="after")
+    def _check(self) -> DesignStudy:
+        refused("Design", list(self._mistakes()))
+        return self
+
+    def _mistakes(self) -> Iterator[Mistake]:
+        if self.source is not None:
+            if self.source.model == AVERAGED:
+                yield ("parameters", "from", "model"), "one model is linearised, expected one of them", AVERAGED
+                return
+            wrong = list(named(f"{READER}:mistakes")(self.source, self.model, tuple(self.parameters)))
+            yield from wrong
+            if wrong:
+                return
+        if not self.inputs.names:
+            yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
+        yield from self.model.mistakes_of_mesh()
+        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
+        if self.draws is not None:
+            yield from mistakes_of_draws(self.model.scalars, self.draws)
+        if isinstance(self.model, Specimen):
+            yield from self._mistakes_of_specimen(self.model)
+        else:
+            yield from self._mistakes_of_count(len(self.model.returned))
+
+    def _mistakes_of_specimen(self, model: Specimen) -> Iterator[Mistake]:
+        if not model.observed and not any(case.outputs for case in model.cases):
+            message = "nothing is observed, expected boundaries or points, or outputs of load cases"
+            yield ("model", "observed"), message, ()
+        elif self.method.each == "case":
+            yield from self._mistakes_of_count(len(model.cases))
+        elif all(item.on is None for item in model.observed):
+            yield from self._mistakes_of_count(len(model.outputs))
+
+    def _mistakes_of_count(self, most: int) -> Iterator[Mistake]:
+        """Find that there are fewer candidates than asked for: at most as many as this."""
+        wanted = self.method.number
+        if wanted is not None and wanted > most:
+            message = f"more than there are candidates, expected at most {most}"
+            yield ("method", "number"), message, wanted
