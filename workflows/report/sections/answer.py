@@ -11,6 +11,7 @@ from forward.words import duration, number
 from workflows.report.blocks import Answer, Block, Card, Text
 from workflows.report.readable import and_error, interval, percent, quantity, size, spoken
 from workflows.report.section import Results, Section
+from workflows.report.sections.design import card as design
 from workflows.report.sections.error_budget import counting, parts_of
 from workflows.studies.findings_selection import bayes_factor, by_probability, grade
 
@@ -45,6 +46,7 @@ class AnswerFirst(Section):
             ("population_draw", population),
             ("estimator", compared),
             ("clean", made),
+            ("chosen", design),
             ("nominal", forward),
             ("candidate_mean", forward),
         ):

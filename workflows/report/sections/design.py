@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from forward.words import NONE, number
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import design as plots
 from workflows.report.section import Results, Section
 
@@ -28,8 +29,7 @@ class ChosenObservations(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """How many random ones they are worth, where they are, and each of them."""
         found, design = results.dataset, results.summary["design"]
-        n, equal = found.sizes["choice"], design["random_equal"]
-        worth = f"{equal} random ones" if equal is not None else f"more than {design['random_most']} random ones"
+        n, worth = found.sizes["choice"], _worth(design)
         yield Heading("Which observations tell most")
         yield Text(
             f"{n} chosen of {design['candidates']:,} candidates are worth {worth}. Together they tell "
@@ -53,6 +53,23 @@ class ChosenObservations(Section):
             ]
             yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
             yield Table(("parameter", "before", "after"), rows)
+
+
+def card(results: Results) -> Card:
+    """The first of the chosen observations, and what all are worth."""
+    found, design = results.dataset, results.summary["design"]
+    together = f"{number(float(found['information'][-1]), 3)} nat"
+    answers = [Answer(f"{found.sizes['choice']} observations", together, (f"worth {_worth(design)}",))]
+    for k, one in enumerate(design["chosen"], start=1):
+        where = [] if None in one["place"] else [f"at ({', '.join(f'{x:.4g}' for x in one['place'])}) m"]
+        case = [f"load case {one['case']}"] if one["case"] else []
+        answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 3)} nat", [*case, *where]))
+    return Card("Which observations tell most of what is not known?", answers)
+
+
+def _worth(design: Mapping[str, Any]) -> str:
+    equal = design["random_equal"]
+    return f"{equal} random ones" if equal is not None else f"more than {design['random_most']} random ones"
 
 
 def _table(results: Results) -> Table:
