@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from forward.model import Finding, FloatArray, ModelError, SolveError
@@ -61,6 +62,8 @@ class Design(Settings):
         Draws at which the model is linearised; one is at the medians.
     random
         Random choices that the chosen ones are compared with.
+    rank
+        Largest number of directions of a field of nodal values that candidates tell.
     seed
         Of draws and random choices.
     """
@@ -76,6 +79,7 @@ class Design(Settings):
     costs: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
     draws: Annotated[int, Field(ge=1)] = 16
     random: Annotated[int, Field(ge=2)] = 64
+    rank: Annotated[int, Field(ge=1)] = 400
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -132,11 +136,45 @@ class Design(Settings):
         ).assign_coords(parameter=list(inputs.names))
         return self.with_values(result, values, sigma, candidates)
 
+    def of_fields(self, draws: Sequence[xr.Dataset], values: Values) -> xr.Dataset:
+        """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
+
+        Raises
+        ------
+        ModelError
+            As `run`.
+        """
+        candidates, _, costs = self.candidates(values)
+        sigma = self.sigma(values, np.array([one["output"].to_numpy() for one in draws]))
+        rows = [one["row"].to_numpy() * (one["sigma"].to_numpy() / sigma)[:, None] for one in draws]
+        goals = [one["field_goal"].to_numpy() for one in draws]
+        if self.criterion == "predictions":
+            goals = [row.T @ row / len(row) for row in (one["goal_row"].to_numpy() for one in draws)]
+        told = Linearised([grouped(one, candidates.which, len(candidates.names)) for one in rows], goals)
+        result = self.chosen(told, candidates, costs)
+        taken = Variance(told.rows, [one["field_goal"].to_numpy() for one in draws])
+        share = list(along(taken, result["chosen"].to_numpy().tolist()))
+        neglected = max(float(one["neglected"]) for one in draws)
+        result = result.assign(field_variance_told=("choice", share), neglected=neglected)
+        if neglected > 1:
+            text = (
+                f"All candidates together tell more than the {self.rank} directions that are kept: of the next one the "
+                f"data would be {np.sqrt(neglected):.2g} times as exact as the prior. Take a larger method.rank."
+            )
+            add(result, Finding("warning", text))
+        return self.with_values(result, values, sigma, candidates)
+
+    def whitened(self, number: int, size: int) -> FloatArray:
+        """Draw `number` (size,) of standard normal numbers, for a field; a single one is at the median."""
+        if self.draws == 1:
+            return np.zeros(size)
+        return np.random.default_rng([self.seed, 1, number]).standard_normal(size)
+
     def uniforms(self, d: int) -> FloatArray:
         """Points (draws, d) of the unit cube."""
         return np.full((1, d), 0.5) if self.draws == 1 else sobol_points(self.seed, 0, 0, self.draws, d)
 
-    def candidates(self, values: Values) -> tuple[Candidates, FloatArray, FloatArray]:
+    def candidates(self, values: Values) -> tuple[Candidates, NDArray[np.bool_], FloatArray]:
         """Return the candidates, which values (m,) are goals, and what candidates cost (c,).
 
         Raises

@@ -22,6 +22,7 @@ from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_materials, mistakes_of_draws, mistakes_of_priors, ranges
 from workflows.config.report import Report
 from workflows.config.source import AVERAGED, KEPT, READER, Sourced
+from workflows.studies.inversion_plan import PRODUCT
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
 
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from uq.inputs.draws import Draws
     from workflows.studies.job import Job
+
+
+PRODUCTS = 600  # with the derivative, for the directions of a field that many candidates tell
 
 
 class DesignStudy(Sourced, StudyKind):
@@ -78,9 +82,18 @@ class DesignStudy(Sourced, StudyKind):
         return {**self.parameters, **(self.draws.marginals if self.draws is not None else {})}
 
     @property
+    def field(self) -> bool:
+        """Whether values of a field at the vertices are what is unknown."""
+        return any(field.basis == "nodes" for field in getattr(self.model, "fields", ()))
+
+    @property
     def inputs(self) -> Inputs:
-        """The unknowns: those that are given, draws, and the standard normal coefficients of random fields."""
-        own = self.parameters | dict.fromkeys(self.model.coefficients, Normal(mean=0.0, std=1.0))
+        """The unknowns: those that are given, draws, and the standard normal coefficients of random fields.
+
+        None for a field of nodal values.
+        """
+        standard = dict.fromkeys(() if self.field else self.model.coefficients, Normal(mean=0.0, std=1.0))
+        own = self.parameters | standard
         pairs = tuple((*c.between, c.value) for c in self.correlations)
         return Inputs(own, pairs, self.model.materials(self.given), draws=self.draws)
 
@@ -113,13 +126,17 @@ class DesignStudy(Sourced, StudyKind):
     def plan(self, rank_groups: int) -> list[str]:
         """Say what can be chosen, and how long that will take."""
         method, cost, d = self.method, self.spec.cost(), len(self.inputs.names)
+        unknown = f"{d}: {', '.join(self.inputs.names[:12])}{', …' if d > 12 else ''}"
+        if self.field:
+            unknown = f"{len(self.model.coefficients):,} values of ln stiffness"
         limits = [f"{method.number} observations" if method.number is not None else ""]
         limits += [f"a budget of {method.budget:g}" if method.budget is not None else ""]
-        seconds = 0.0 if cost is None else method.draws * (cost.textbook + cost.tangents(d))
+        derivatives = 0.0 if cost is None else PRODUCTS * PRODUCT * cost.textbook if self.field else cost.tangents(d)
+        seconds = 0.0 if cost is None else method.draws * (cost.textbook + derivatives)
         return [
             f"method      {method.kind}, criterion {method.criterion}",
             *(f"{what:10}  {found}" for what, found in self.model.described(ranges(self.given))),
-            f"unknown     {d}: {', '.join(self.inputs.names[:12])}{', …' if d > 12 else ''}",
+            f"unknown     {unknown}",
             f"chosen      {', '.join(filter(None, limits))}; one is a {method.each}",
             f"solves      {self.planned}, each with its derivatives",
             *([] if cost is None else [f"time        about {duration(seconds)} on 1 core (rough)"]),
@@ -127,7 +144,7 @@ class DesignStudy(Sourced, StudyKind):
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         """Make the model; collective."""
-        found: Job = named("workflows.studies.design_job:job")(self, ensemble, name)
+        found: Job = named("workflows.studies.design_job:job")(self, ensemble, checkpoint)
         return found
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
@@ -161,7 +178,15 @@ class DesignStudy(Sourced, StudyKind):
             yield from wrong
             if wrong:
                 return
-        if not self.inputs.names:
+        fields = getattr(self.model, "fields", ())
+        nodal = [i for i, field in enumerate(fields) if field.basis == "nodes"]
+        if nodal and (len(fields) > 1 or self.given):
+            message = "a field of nodal values is unknown alone, expected no other fields and no parameters"
+            yield ("model", "fields", nodal[0], "basis"), message, "nodes"
+            return
+        if nodal and fields[nodal[0]].of != "stiffness":
+            yield ("model", "fields", nodal[0], "of"), "expected stiffness", "density"
+        if not nodal and not self.inputs.names:
             yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
         yield from self.model.mistakes_of_mesh()
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)

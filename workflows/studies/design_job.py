@@ -6,32 +6,41 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from forward.bodies.geometry import AXES
+from forward.model import SolveError
 from forward.specimen import Specimen
 from inverse.designs.candidates import NEAR, Values
+from inverse.designs.fields import of_field
 from uq.evaluation.evaluate import Recorder
-from workflows.studies.job import MethodJob
+from uq.evaluation.kept import KeptModel
+from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.output_inversion import derivable
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.specimen import SpecimenModel
+    from forward.model import ForwardModel
     from forward.spec import ModelSpec
+    from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from uq.evaluation.evaluate import Evaluate
+    from uq.evaluation.evaluate import Evaluate, Evaluations
+    from uq.evaluation.tasks import Outcome
     from workflows.studies.design import DesignStudy
+    from workflows.studies.job import Job
 
 
-def job(study: DesignStudy, ensemble: Ensemble, name: str) -> MethodJob:
+def job(study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint) -> Job:
     """Make the model; collective over the group."""
-    model = study.spec.build(ensemble.group, study.inputs.names)
+    model = study.spec.build(ensemble.group, study.model.coefficients if study.field else study.inputs.names)
     derivable(model, study.model.kind)
     values = values_of(study.spec, model)
+    if study.field:
+        return _of_field(study, ensemble, checkpoint, model, values)
     recorders: dict[str, Recorder] = {}
 
     def task(evaluate: Evaluate) -> xr.Dataset:
@@ -39,6 +48,51 @@ def job(study: DesignStudy, ensemble: Ensemble, name: str) -> MethodJob:
         return study.method.run(study.inputs, recorders["/"], values)
 
     return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(study, found))
+
+
+def _of_field(
+    study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint, model: ForwardModel, values: Values
+) -> TasksJob:
+    """Each draw of the field is a task of one group."""
+    method, spec = study.method, cast("Specimen", study.spec)
+    prior = spec.fields[0].prior(spec.body)
+    names = [f"draw {number}" for number in range(method.draws)]
+    solving: list[KeptModel] = []  # of the draw at hand
+    goals = method.candidates(values)[1]
+
+    def linearise(number: int, solved: list[Evaluations]) -> xr.Dataset:
+        kept = KeptModel(model, ensemble.group, checkpoint, names[number], log=solved)
+        solving.append(kept)
+        whitened = method.whitened(number, len(model.parameters))
+        try:
+            solution = kept.solve(prior.root(whitened))
+        except SolveError:
+            ensemble.count(1, 1)
+            raise
+        ensemble.count(1, 0)
+        sigma = method.sigma(values, solution.outputs[None])
+        return of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
+
+    def forget() -> None:
+        while solving:
+            solving.pop().forget()
+
+    def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
+        found = [one.dataset for one in outcomes if one.dataset is not None]
+        if not found:
+            message = f"the model has no answer at any of the {len(outcomes)} draws: {outcomes[0].reason}"
+            raise SolveError(message)
+        return method.of_fields(found, values)
+
+    return TasksJob(
+        names,
+        linearise,
+        lambda number, outcome: None,
+        forget,
+        results,
+        lambda found: found,
+        texts=lambda found: files(study, found),
+    )
 
 
 def values_of(spec: ModelSpec, model: Any) -> Values:

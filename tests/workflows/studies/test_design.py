@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
+from mpi4py import MPI
 
 from tests.launch import TISSUQ, assert_same_bits
 from tests.launch import run as on_ranks
@@ -208,6 +209,92 @@ def test_whole_load_cases_are_observations(folder):
     assert int(found["chosen"][0]) == int(alone.argmax())
     with pytest.raises(Exception, match="candidates, expected at least number = 400"):
         load(cube(folder, "number = 400")).run()
+
+
+FIELD = """
+[model]
+kind = "specimen"
+body = { kind = "box", size = [1.0, 1.0, 1.0], cells = [2, 2, 2], degree = 1 }
+material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 2e3 }
+fields = [{ of = "stiffness", length = 0.5, std = 0.6, basis = "nodes" }]
+observed = [{ on = "x-max" }, { on = "z-max" }]
+[[model.cases]]
+name = "shear"
+clamp = ["z-min"]
+loads = [{ kind = "traction", on = "z-max", direction = [1, 0, 0], size = 100 }]
+[[model.cases]]
+name = "pull"
+clamp = ["z-min"]
+loads = [{ kind = "traction", on = "z-max", direction = [0, 0, 1], size = 100 }]
+outputs = [{ name = "top", kind = "mean-displacement", on = "z-max", component = "z" }]
+[method]
+kind = "design"
+noise = { relative = 0.01 }
+"""
+
+
+def dense(study, found):
+    """Whitened rows of all values of a field's study at the median field, and the prior's root, as matrices."""
+    spec = study.spec
+    model, prior = spec.build(MPI.COMM_SELF, spec.coefficients), spec.fields[0].prior(spec.body)
+    N = len(model.parameters)
+    slopes = model.solve(np.zeros(N)).adjoint(np.eye(len(model.outputs)))
+    root = prior.root(np.eye(N)).T
+    return slopes @ root, root, prior.matern.mass, found["value_sigma"].to_numpy()
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("criterion", ["information", "parameters", "predictions"])
+def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
+    goals = '\ngoals = ["pull.top"]' if criterion == "predictions" else ""
+    (tmp_path / "field.toml").write_text(FIELD + f'number = 3\ndraws = 1\ncriterion = "{criterion}"{goals}\n')
+    study = load(tmp_path / "field.toml")
+    assert parse(document(study)) == study
+    found = study.run()
+    slopes, root, mass, sigma = dense(study, found)
+    A, which = slopes / sigma[:, None], found["value_candidate"].to_numpy()
+
+    def after(chosen):
+        rows = A[np.isin(which, chosen)]
+        return np.eye(A.shape[1]) + rows.T @ rows
+
+    def worth(chosen):
+        P = after(chosen)
+        if criterion == "information":
+            return np.linalg.slogdet(P)[1] / 2
+        goal = slopes[[list(found["value"].values).index("pull.top")]] if goals else root
+        weights = 1.0 if goals else mass
+        C = goal @ np.linalg.inv(P) @ goal.T
+        return 1 - (weights * np.diag(C)).sum() / (weights * (goal**2).sum(axis=1)).sum()
+
+    chosen = found["chosen"].to_numpy()
+    # Directions with λ < 0.1 are left out.
+    for n in range(3):
+        assert float(found["worth"][n]) == pytest.approx(worth(chosen[: n + 1]), rel=5e-3)
+    every = range(found.sizes["candidate"])
+    assert worth(chosen[:1]) > 0.999 * max(worth([i]) for i in every)
+    left = root @ np.linalg.inv(after(chosen)) @ root.T
+    share = 1 - (mass * np.diag(left)).sum() / (mass * np.diag(root @ root.T)).sum()
+    assert float(found["field_variance_told"][-1]) == pytest.approx(share, rel=5e-3)
+
+
+@pytest.mark.fem
+def test_draws_of_a_field_are_shared_by_ranks(tmp_path):
+    (tmp_path / "field.toml").write_text(FIELD + "number = 3\ndraws = 3\n")
+    for ranks in (None, 2):
+        done = on_ranks(ranks, TISSUQ, "run", tmp_path / "field.toml", "--out", tmp_path / f"out-{ranks}", "--quiet")
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "out-None", tmp_path / "out-2")
+    assert "Share of the variance" in (tmp_path / "out-2" / "report.html").read_text()
+
+
+def test_a_field_is_unknown_alone(tmp_path):
+    more = FIELD.replace(
+        "[method]", '[parameters]\n"material.mu" = { kind = "normal", mean = 1e3, std = 10 }\n[method]'
+    )
+    (tmp_path / "field.toml").write_text(more + "number = 3\n")
+    with pytest.raises(StudyError, match="a field of nodal values is unknown alone"):
+        load(tmp_path / "field.toml")
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,9 @@ class ChosenObservations(Section):
             drawn.append(Picture.drawn(plots.on_body(found, bounds), "Candidates and chosen points, in their order."))
         yield Pictures(drawn)
         yield _table(results)
+        if "field_variance_told" in found:
+            share = number(100 * float(found["field_variance_told"][-1]), 3)
+            yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
         if "posterior_std" in found:
             rows = [
                 (name, *(number(float(one[f"{which}_std"])) for which in ("prior", "posterior")))

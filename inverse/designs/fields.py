@@ -1,0 +1,86 @@
+"""Candidates for a field of thousands of values: rows of A in the span of the directions that they tell together.
+
+All candidates together tell AᵀA ≈ UΛUᵀ (`inverse.fields.low_rank`); the row of a candidate in the coordinates U is a
+column of AU, which the search for the pairs has formed anyway. A set S of candidates has A_SᵀA_S ≤ AᵀA, so that what is
+left out adds at most ½ Σ ln(1 + λ) over the pairs that were neglected. No row of A itself is needed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray, Solution
+from inverse.fields.field_posterior import FieldPosterior, Point, Prior
+from inverse.fields.low_rank import leading_pairs
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.model import ForwardModel
+
+
+def of_field(
+    model: ForwardModel,
+    solution: Solution,
+    whitened: FloatArray,
+    prior: Prior,
+    mass: FloatArray,
+    sigma: FloatArray,
+    goals: NDArray[np.bool_],
+    rank: int,
+    seed: int,
+) -> xr.Dataset:
+    """Linearise at one draw of a field.
+
+    Parameters
+    ----------
+    model
+        The model; its parameters are the N values of the field.
+    solution
+        Its solution at the draw.
+    whitened
+        The draw ξ (N,).
+    prior
+        Prior of the field.
+    mass
+        Volume (N,) of each vertex.
+    sigma
+        Standard deviations (m,) of the errors of its outputs.
+    goals
+        Which outputs (m,) are not measured but predicted.
+    rank
+        Largest number of directions.
+    seed
+        Of the search for them.
+
+    Returns
+    -------
+    xarray.Dataset
+        `output` (m,), `sigma`, `row` (m, r), zero for goals; `field_goal` (r, r), what the directions add to the mean
+        variance of the field, over that of the prior; `goal_row` (q, r) of goals over their prior standard deviation;
+        and `neglected`, the first λ that was.
+    """
+    import xarray as xr
+
+    data = np.where(goals, np.nan, 0.0)
+    posterior = FieldPosterior(model, data, sigma, prior)
+    point = Point(posterior, whitened, posterior.values(whitened), solution)
+    spectrum = leading_pairs(point.jvp, point.vjp, posterior.size, rank=rank, seed=seed)
+    directions = prior.root(spectrum.vectors)
+    units = np.eye(len(sigma))[goals]
+    slopes = prior.root_transposed(solution.adjoint(units)) if len(units) else np.zeros((0, posterior.size))
+    sizes = np.linalg.norm(slopes, axis=1, keepdims=True)
+    rows = np.divide(slopes, sizes, out=np.zeros_like(slopes), where=sizes > 0) @ spectrum.vectors.T
+    return xr.Dataset(
+        {
+            "output": ("value", np.array(solution.outputs)),
+            "sigma": ("value", sigma),
+            "row": (("value", "direction"), spectrum.images.T),
+            "field_goal": (("direction", "other"), (directions * mass) @ directions.T / (mass @ prior.variance)),
+            "goal_row": (("goal", "direction"), rows),
+            "neglected": spectrum.neglected,
+        }
+    )
