@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.criticism.stacking import stacking
 from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.low_dimensional.evidence import Evidence
@@ -212,12 +213,15 @@ def comparison(
     scores = np.array([np.concatenate([critics[name, group].scores for group in data_groups]) for name in names])
     behind = scores - scores[scores.sum(axis=1).argmax()]
     count = scores.shape[1]
+    stacked, stacked_errors = stacking(scores)
     variables: dict[str, Any] = {
         "log_evidence": ("model", sums[0]),
         "log_evidence_error": ("model", errors[0]),
         "probability": ("model", P),
         "probability_error": ("model", _chance_errors(P, errors[0])),
         "prior_probability": ("model", weights / weights.sum()),
+        "stacking": ("model", stacked),
+        "stacking_error": ("model", stacked_errors),
         "variant_log_evidence": (("variant", "model"), np.array(sums)),
         "variant_log_evidence_error": (("variant", "model"), np.array(errors)),
         "variant_probability": (("variant", "model"), chances),

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from uq.inputs.draws import Draws
 
 KEPT = "draws.npz"  # beside study.toml: the draws as they were read
-AVERAGED = "averaged"
+AVERAGED = "averaged"  # all candidates, by their probabilities
+STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
 READER = "workflows.studies.posteriors"  # reads files of draws, once a study names one
 
 
@@ -29,7 +30,8 @@ class Source(Settings):
     group
         The group of data of ``select``, or the data set of ``invert``; may be left out if there is only one.
     model
-        The candidate of ``select``: its name, "best", the most probable one, or "averaged", all of them.
+        The candidate of ``select``: its name, "best", the most probable one, or "averaged", all of them by
+        their probabilities, or "stacked", by the weights with which their mixture predicts left-out data best.
     names
         Names in the source by the paths of numbers of the model, where they differ. Without it every name of the source
         is looked for among the paths: as it is, or as the end of a path, if only one ends so. With it, only
@@ -51,7 +53,7 @@ class Source(Settings):
 
     @model_validator(mode="after")
     def _read(self) -> Source:
-        found: str = named(f"{READER}:digest_of")(self.file) if self.model == AVERAGED else self.drawn.digest
+        found: str = named(f"{READER}:digest_of")(self.file) if self.model in (AVERAGED, STACKED) else self.drawn.digest
         if self.digest and found != self.digest:
             message = f"{self.file} has changed since the study was begun: hash {self.digest} → {found}"
             raise ValueError(message)

@@ -113,7 +113,7 @@ def _design_in_words(design: Mapping[str, Any]) -> list[str]:
 
 
 def _comparison(dataset: xr.Dataset) -> Part:
-    shown = ("log_evidence", "log_evidence_error", "probability")
+    shown = ("log_evidence", "log_evidence_error", "probability", *(("stacking",) if "stacking" in dataset else ()))
     trusted = dataset["trusted"].all("group")
     return {
         "models": {

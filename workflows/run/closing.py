@@ -25,7 +25,7 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Summarise the results at the end of a run."""
     lines = [
         f"{model}: ln Z {found['log_evidence']:.2f} ± {found['log_evidence_error']:.2g}, "
-        f"probability {found['probability']:.3g}"
+        f"probability {found['probability']:.3g}{_stacking(found)}"
         for model, found in summary.get("models", {}).items()
     ]
     lines += inverted(summary)
@@ -48,6 +48,10 @@ def closing_words(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         lines.append(summary["note"])
     lines += [f"{one['severity']}: {one['text']}" for one in summary["findings"]]
     return "\n".join(lines) + "\n"
+
+
+def _stacking(found: Mapping[str, Any]) -> str:
+    return f", stacking {found['stacking']:.3g}" if found.get("stacking") is not None else ""
 
 
 def _outputs(dataset: xr.Dataset, outputs: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

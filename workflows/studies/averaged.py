@@ -18,6 +18,7 @@ from uq.estimators.averaged import averaged
 from uq.evaluation.evaluate import Evaluate, Recorder
 from uq.findings import add
 from workflows.config.mistakes import lines
+from workflows.config.source import STACKED
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.posteriors import NamedCandidate, candidates, read
@@ -42,15 +43,15 @@ LEAST = 1e-3  # probability of candidates that are left out
 class AveragedStudy(Study):
     """The study of a body whose material is one of several, by the probabilities that a comparison has given them.
 
-    The blocks are those of `Study`; `parameters.from` has ``model = "averaged"``, and constants that candidates do not
-    have (D1) are those of the material in the model.
+    The blocks are those of `Study`; `parameters.from` has ``model = "averaged"`` or, with weights of stacking in place
+    of probabilities, ``"stacked"``; constants that candidates lack (D1) are those of the model's material.
     """
 
     @cached_property
     def candidates(self) -> tuple[NamedCandidate, ...]:
         """The candidates that are not improbable, with probabilities of sum 1."""
         assert self.source is not None
-        every = candidates(self.source.file)
+        every = candidates(self.source.file, "stacking" if self.source.model == STACKED else "probability")
         kept = [one for one in every if one.probability >= LEAST]
         total = sum(one.probability for one in kept)
         return tuple(one._replace(probability=one.probability / total, error=one.error / total) for one in kept)
@@ -143,7 +144,8 @@ class AveragedStudy(Study):
                 recorders[one] = Recorder(evaluate if part is self._first else evaluate.on(one))
                 found[one] = with_errors_of_draws(part, part.method.run(part.inputs, recorders[one]))
             p, errors = zip(*((one.probability, one.error) for one in self.candidates), strict=True)
-            return _told(averaged(found, p, errors))
+            assert self.source is not None
+            return _told(averaged(found, p, errors).assign_attrs(weights=str(self.source.model)))
 
         others = {one: partial(part.spec.build, ensemble.group, part.inputs.names) for one, part in parts.items()}
         model = others.pop(next(iter(parts)))()
@@ -168,22 +170,23 @@ class AveragedStudy(Study):
         return {"candidates": {one.name: one.probability for one in self.candidates}}
 
     def _mistakes(self) -> Iterator[Mistake]:
-        place = ("parameters", "from")
+        assert self.source is not None
+        place, said = ("parameters", "from"), self.source.model
         for what, wrong in (
             ("accuracy.tolerance", self.accuracy.tolerance is not None),
             ("model.adapt", self.model.unrefined),
             (f"method.kind = '{self.method.kind}'", self.method.kind not in AVERAGED_METHODS),
         ):
             if wrong:
-                yield place, f"model = 'averaged' does not go with {what}, expected a name of a candidate", "averaged"
+                yield place, f"model = '{said}' does not go with {what}, expected a name of a candidate", said
                 return
         try:
             _ = self.parts
         except ValidationError as error:
             for line in lines(error):
-                yield place, f"of a candidate, {line}", "averaged"
+                yield place, f"of a candidate, {line}", said
         except ValueError as error:
-            yield place, str(error), "averaged"
+            yield place, str(error), said
 
 
 AVERAGED_METHODS = ("monte-carlo", "sensitivity-monte-carlo", "quasi-monte-carlo", "chaos")

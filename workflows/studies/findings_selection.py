@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DRAWS = 1000  # of a posterior, to see whether it is at an end of a range
 SUSPICIOUS = 0.01  # posterior predictive probability below which a model is in conflict with the data
+MIXED = 0.1  # weight of the others in the best mixture that is said
 AGAINST = "against it: what was believed before the data decides"
 GRADES = ((1.0, "not worth more than a bare mention"), (3.0, "positive"), (5.0, "strong"))
 
@@ -93,6 +94,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
     predicts = ranking(dataset["score"])[0]
     if predicts != best:
         said.append(Finding("warning", f"Left-out data are predicted best by {predicts}."))
+    said += _stacked(dataset, order)
     if "held_out_score" in dataset:
         predicts = ranking(dataset["held_out_score"].sum("left_out"))[0]
         if predicts != best:
@@ -252,6 +254,19 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     mended = dataset["mesh_corrected"] & ~decides(shift, dataset["mesh_left"].max("parameter"))
     known = mended | (~dataset["mesh_corrected"] & certain(dataset["mesh_log_evidence"], shift))
     return dataset.assign(trusted=dataset["trusted"] & known)
+
+
+def _stacked(dataset: xr.Dataset, order: list[str]) -> list[Finding]:
+    """Say that left-out data are predicted better by a mixture of candidates than by the most probable one."""
+    weights = dataset["stacking"].sel(model=order)
+    others = 1 - float(weights[0])
+    if others < MIXED + 2 * float(dataset["stacking_error"].sel(model=order[0])):
+        return []
+    parts = ", ".join(
+        f"{name} {100 * float(weights.sel(model=name)):.2g} %" for name in ranking(weights) if weights.sel(model=name)
+    )
+    text = f"Left-out data are predicted best by a mixture (stacking): {parts}. Probabilities say which candidate is"
+    return [Finding("note", f'{text} true, if one is; model = "stacked" of `from` predicts with the mixture.')]
 
 
 def bayes_factor(dataset: xr.Dataset, one: str, other: str) -> tuple[float, float]:

@@ -191,8 +191,8 @@ class NamedCandidate(NamedTuple):
     material: dict[str, Any]
 
 
-def candidates(file: str) -> list[NamedCandidate]:
-    """Return the candidates of a comparison, the most probable first.
+def candidates(file: str, by: str) -> list[NamedCandidate]:
+    """Return the candidates of a comparison, the most probable first, or that of the largest weight ("stacking").
 
     Raises
     ------
@@ -202,10 +202,13 @@ def candidates(file: str) -> list[NamedCandidate]:
     path = _directory(file)
     kind = _summary(path).get("method")
     if kind != "select":
-        message = f"{path}: is a study of kind '{kind}', expected 'select' for model = 'averaged'"
+        message = f"{path}: is a study of kind '{kind}', expected 'select' for model = 'averaged' or 'stacked'"
         raise ValueError(message)
     found = variables((path / "results.nc").read_bytes())[0]
-    shares = zip(found["model"].values, found["probability"].values, found["probability_error"].values, strict=True)
+    if by not in found:
+        message = f"{path}: has no weights of stacking, as it was made by an earlier version: run it again"
+        raise ValueError(message)
+    shares = zip(found["model"].values, found[by].values, found[f"{by}_error"].values, strict=True)
     every = [NamedCandidate(str(m), float(p), float(e), material(file, str(m))) for m, p, e in shares]
     without = [one.name for one in every if "kind" not in one.material]
     if without:

@@ -29,7 +29,7 @@ from workflows.config.priors import (
     ranges,
 )
 from workflows.config.report import Report
-from workflows.config.source import AVERAGED, KEPT, READER, Sourced
+from workflows.config.source import AVERAGED, KEPT, READER, STACKED, Sourced
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Study(Sourced, StudyKind):
         """Check the blocks of a study, or of one that is averaged over the candidates of a comparison."""
         parameters = blocks.get("parameters")
         source = parameters.get("from") if isinstance(parameters, Mapping) else None
-        if isinstance(source, Mapping) and source.get("model") == AVERAGED:
+        if isinstance(source, Mapping) and source.get("model") in (AVERAGED, STACKED):
             of_all: type[Study] = named("workflows.studies.averaged:AveragedStudy")
             return of_all.model_validate(blocks)
         return cls.model_validate(blocks)
@@ -280,7 +280,7 @@ class Study(Sourced, StudyKind):
     @property
     def beside(self) -> Mapping[str, bytes]:
         """The draws, as they were read."""
-        if self.source is None or self.source.model == AVERAGED:
+        if self.source is None or self.source.model in (AVERAGED, STACKED):
             return {}
         return {KEPT: named(f"{READER}:to_file")(self.source.drawn)}
 

@@ -499,7 +499,7 @@ def test_a_study_from_the_command_line(small):
     summary = json.loads((small.parent / "one" / "summary.json").read_text())
     assert set(summary["models"]) == {"neo-hookean", "mooney-rivlin"}
     for found in summary["models"].values():
-        assert set(found) == {"log_evidence", "log_evidence_error", "probability", "trusted"}
+        assert set(found) == {"log_evidence", "log_evidence_error", "probability", "stacking", "trusted"}
     assert sum(found["probability"] for found in summary["models"].values()) == pytest.approx(1)
     done = run(2, TISSUQ, "run", small, "--out", small.parent / "two", "--no-report")
     assert done.returncode == 0, done.stderr

@@ -593,6 +593,20 @@ def test_predictions_are_averaged_over_candidates(selected, tmp_path):
     assert "Averaged over candidates" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_stacking_gives_other_weights(selected):
+    """Those of the comparison, without candidates that have none."""
+    folder, _ = selected
+    source = {"file": str(folder / "results"), "group": "one", "model": "stacked"}
+    study = parse(BODY | {"parameters": {"from": source}, "method": {"kind": "monte-carlo", "samples": 8}})
+    assert parse(document(study)) == study
+    with xr.open_dataset(folder / "results" / "results.nc") as compared:
+        weights = compared["stacking"].to_series()
+    kept = {one.name: one.probability for one in study.candidates}
+    assert kept == pytest.approx(weights[weights > 0].to_dict())
+    summary = json.loads((folder / "results" / "summary.json").read_text())
+    assert {name: one["stacking"] for name, one in summary["models"].items()} == pytest.approx(weights.to_dict())
+
+
 def test_errors_of_averages_are_those_of_repeats():
     """Two models with Gaussian estimates of their moments, and of their probabilities."""
     rng = np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SHOWN = 12  # outputs that have bars
+
+
+def within_and_between(predictions: Mapping[str, xr.Dataset], ax: Axes | None = None) -> Axes:
+    """Draw a bar for each averaged prediction: the shares of its variance within the models and between them."""
+    names = list(predictions)[:SHOWN]
+    ax = ax or axes(height=1.3 + 0.35 * len(names), width=7.0)
+    parts = [
+        np.array([float(predictions[name][f"average_{part}"]) for name in names]) for part in ("within", "between")
+    ]
+    left, places, whole = np.zeros(len(names)), np.arange(len(names))[::-1], sum(parts)
+    for part, colour, label in zip(parts, (COLOURS[0], DARK), ("within the models", "between them"), strict=True):
+        share = np.divide(part, whole, out=np.zeros(len(names)), where=whole > 0)
+        ax.barh(places, share, left=left, height=0.7, color=colour, label=label)
+        left = left + share
+    ax.set_yticks(places, [text_of(name) for name in names])
+    ax.set_xlim(0, 1)
+    ax.set_xlabel("share of the variance")
+    ax.legend(fontsize=7, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    return ax
 
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.words import number, with_unit
-from workflows.report.blocks import Block, Heading, Table, Text
+from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text
+from workflows.report.plots.averaged import within_and_between
 from workflows.report.section import Results, Section
 
 if TYPE_CHECKING:
@@ -31,24 +32,34 @@ class Averages(Section):
             "At the end of each test, or where the largest displacement was measured, without measurement errors."
         )
         yield averages(results.dataset)
+        caption = "Parts of the variance: within the models, and between them: what it matters which of them is right."
+        yield Pictures([Picture.drawn(within_and_between(last_of_tests(results.dataset)), caption)])
+
+
+def last_of_tests(dataset: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the last datum of each test, or the largest displacement, by group and test."""
+    found = {}
+    tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
+    for group, test in dict.fromkeys(tests):
+        members = [i for i, pair in enumerate(tests) if pair == (group, test)]
+        at = dataset["output_at"].values[members]
+        # Displacement data have only numbers: take the largest displacement.
+        stress = dataset.attrs["quantity"] == "stress"
+        far = np.abs(at - at[0]) if stress else np.abs(dataset["measured"].values[members])
+        found[f"{group}, {test}"] = dataset.isel(output=members[int(np.argmax(far))])
+    return found
 
 
 def averages(dataset: xr.Dataset) -> Table:
     """Predictions averaged over the models at the end of each test, with both parts of their variance."""
     rows = []
     quantity = str(dataset.attrs["quantity"])
-    tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
-    for group, test in dict.fromkeys(tests):
-        members = [i for i, pair in enumerate(tests) if pair == (group, test)]
-        at = dataset["output_at"].values[members]
-        # Displacement data have only numbers: take the largest displacement.
-        far = np.abs(at - at[0]) if quantity == "stress" else np.abs(dataset["measured"].values[members])
-        one = dataset.isel(output=members[int(np.argmax(far))])
+    for one in last_of_tests(dataset).values():
         stds = (np.sqrt(float(one[name])) for name in ("average_within", "average_between"))
         rows.append(
             (
-                str(group),
-                str(test),
+                str(one["output_group"].item()),
+                str(one["output_test"].item()),
                 number(float(one["output_at"])),
                 with_unit(number(float(one["measured"])), UNITS[quantity]),
                 with_unit(number(float(one["average_mean"])), UNITS[quantity]),

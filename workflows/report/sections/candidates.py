@@ -21,8 +21,10 @@ class AveragedCandidates(Section):
         """The tables, then the bars."""
         of = results.dataset
         yield Heading("Averaged over candidates")
+        stacked = of.attrs.get("weights") == "stacked"
+        what = "weight in the mixture that predicts left-out data best" if stacked else "probability"
         yield Text(
-            "Each candidate predicts with its own posterior, and counts by its probability. The variance is that "
+            f"Each candidate predicts with its own posterior, and counts by its {what}. The variance is that "
             "within the candidates, and that between their means: what it matters which of them is right."
         )
         for output in results.drawn:
@@ -34,8 +36,8 @@ class AveragedCandidates(Section):
                 rows.append((name, share, *(with_unit(cell, unit) for cell in cells)))
             rows.append(("all", "100 %", *(results.estimate(output, m) for m in MOMENTS)))
             yield Heading(output, level=3)
-            yield Table(("candidate", "probability", "mean", "standard deviation"), rows)
-        caption = "Parts of the variance: within each candidate, by its probability, and between candidates."
+            yield Table(("candidate", "weight" if stacked else "probability", "mean", "standard deviation"), rows)
+        caption = "Parts of the variance: within each candidate, by what it counts, and between candidates."
         yield Pictures([Picture.drawn(plots.parts_of_variance(of), caption)])
 
 

@@ -32,7 +32,8 @@ class Evidences(Section):
         yield Heading("Evidences and probabilities")
         yield Text(
             "± is one standard error. Laplace's formula is shown beside the corrected evidence; the words for Bayes "
-            "factors are those of Kass and Raftery."
+            "factors are those of Kass and Raftery. Probabilities say which candidate is true, if one is; the weights "
+            "of stacking are those with which their mixture predicts left-out data best, whether or not one is true."
         )
         yield evidences(dataset)
         captions = (
@@ -49,7 +50,7 @@ class Evidences(Section):
 def evidences(dataset: xr.Dataset) -> Table:
     """Evidence, Bayes factor and probability of each model, nested sampling beside it."""
     order = ranking(dataset["log_evidence"])
-    nested = "nested_log_evidence" in dataset
+    nested, stacked = "nested_log_evidence" in dataset, "stacking" in dataset
     rows = []
     for model in order:
         of_model = dataset.sel(model=model)
@@ -63,6 +64,9 @@ def evidences(dataset: xr.Dataset) -> Table:
             f"{number(100 * float(of_model['prior_probability']), 3)} %",
             f"{number(100 * float(of_model['probability']), 4)} %",
         ]
+        if stacked:
+            share, error = (100 * float(of_model[name]) for name in ("stacking", "stacking_error"))
+            row.append(f"{number(share, 3)} ± {number(error, 2)} %")
         if nested:
             value = float(of_model["nested_log_evidence"].sum())
             row.append(with_error(value, float(np.sqrt((of_model["nested_log_evidence_error"] ** 2).sum()))))
@@ -75,6 +79,7 @@ def evidences(dataset: xr.Dataset) -> Table:
         "which is",
         "before",
         "P(model | data)",
+        *(["stacking"] if stacked else []),
     ]
     return Table([*head, *(["ln Z by nested sampling"] if nested else [])], rows, text=frozenset({0, 4}))
 

@@ -23,7 +23,7 @@ class Predictions(Section):
 
     def applies(self, results: Results) -> bool:
         """Whether anything is."""
-        return "prediction_mean" in results.dataset
+        return "prediction_share" in results.dataset
 
     def content(self, results: Results) -> Iterator[Block]:
         """A table and a picture for each data set."""
