@@ -18,7 +18,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.table import DataError, Table
+from inverse.data.table import DataError, Table, needed
 from inverse.data.units import factor, split_head
 
 CLOSE = 1e-6  # of the largest number: rows this near to a step are at it
@@ -159,9 +159,9 @@ def _step(
     told = []
     for column, head in where.items():
         try:
-            value = float(row[head]) * scales[head]
-        except ValueError:
-            return f"{label}: {column} is {row[head]!r}, expected a number"
+            value = needed(row[head], column) * scales[head]
+        except ValueError as error:
+            return f"{label}: {error}"
         values = places[column][1]
         near &= np.abs(values - value) <= CLOSE * np.abs(values).max()
         told.append(f"{column} = {value:g}")

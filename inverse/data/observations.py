@@ -28,7 +28,7 @@ from forward.settings import nearest
 from inverse.data.approximation_error import Places
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.data.readings import Readings, Units, split
-from inverse.data.table import DataError, Table, others, read_table
+from inverse.data.table import DataError, Table, needed, numeric, others, read_table
 from inverse.data.units import factor, split_head
 
 TABLES = (".csv", ".txt")
@@ -436,13 +436,14 @@ def of_table(path: Path, known: Mapping[str, Units], unit: float | None = None) 
     for column in (*POSITION, *MOTION, "sigma", *ERRORS):
         if column not in columns:
             continue
-        values = [_number(row[column]) for row in rows]
-        needed = column in POSITION
-        bad = [i for i, v in enumerate(values) if v is None or math.isinf(v) or (needed and math.isnan(v))]
-        if bad:
-            given = rows[bad[0]][column]
-            mistakes.append(f"{labels[bad[0]]}: {column} is {given!r}, expected a number{others(len(bad) - 1)}")
-        numbers[column] = unit * np.array([math.nan if v is None else v for v in values])
+        values, bad = np.full(len(rows), math.nan), []
+        for i, row in enumerate(rows):
+            try:
+                values[i] = _number(row[column], column)
+            except ValueError as error:
+                bad.append(f"{labels[i]}: {error}")
+        mistakes += [f"{line}{others(len(bad) - 1)}" for line in bad[:1]]
+        numbers[column] = unit * values
     given_cases = [row["case"] if "case" in columns else cases[0] for row in rows]
     strange = [i for i, case in enumerate(given_cases) if case not in cases]
     if strange:
@@ -494,12 +495,11 @@ def _without_units(table: Table, name: str, unit: float | None) -> tuple[Table, 
     return replace(table, columns=tuple(names), rows=rows), scale
 
 
-def _number(text: str) -> float | None:
-    """A number, NaN for an empty cell, None where it is neither."""
-    try:
-        return float(text) if text else math.nan
-    except ValueError:
-        return None
+def _number(text: str, column: str) -> float:
+    """Return a number; where none has to be, an empty cell or NaN is one that was not measured."""
+    if column in POSITION:
+        return needed(text, column)
+    return numeric("" if text.lower() == "nan" else text, column, positive=column not in MOTION)
 
 
 def _assignment(line: str) -> tuple[str, str]:

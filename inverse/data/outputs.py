@@ -22,7 +22,7 @@ from inverse.data.approximation_error import Places
 from inverse.data.curves import Steps, as_rows
 from inverse.data.neighbours import Neighbours, neighbours
 from inverse.data.observations import TRUTH
-from inverse.data.table import DataError, read_table
+from inverse.data.table import DataError, needed, numeric, read_table
 
 COLUMNS = ("output", "value", "sigma")
 
@@ -155,26 +155,27 @@ def read_outputs(path: Path, outputs: Sequence[str], steps: Steps | None = None)
         raise DataError(*wrong)
     names = tuple(row["output"] for row in table.rows)
     labels = tuple(f"{name}: line {line}" for line in table.lines)
-    numbers = {
-        column: [_number(row[column]) for row in table.rows] for column in COLUMNS[1:] if column in table.columns
-    }
     for label, one in zip(labels, names, strict=True):
         if one not in outputs:
             wrong.append(f"{label}: the model has no output '{one}'; {nearest(one, tuple(outputs))}")
-    for column, values in numbers.items():
-        empty = column == "sigma"
-        for label, value, row in zip(labels, values, table.rows, strict=True):
-            fits = math.isfinite(value) and (value > 0 or column == "value")
-            if not fits and not (empty and not row[column]):
-                expected = "a number" if column == "value" else "a number more than 0"
-                wrong.append(f"{label}: {column} is {row[column]!r}, expected {expected}")
+    numbers: dict[str, list[float]] = {}
+    for column in (one for one in COLUMNS[1:] if one in table.columns):
+        for label, row in zip(labels, table.rows, strict=True):
+            try:
+                value = (
+                    needed(row[column], column) if column == "value" else numeric(row[column], column, positive=True)
+                )
+            except ValueError as error:
+                wrong.append(f"{label}: {error}")
+            else:
+                numbers.setdefault(column, []).append(value)
     truth = {}
     for line in (line for line in table.remarks if line.startswith(TRUTH)):
         path_of, _, text = line.removeprefix(TRUTH).partition("=")
-        value = _number(text.strip())
-        if not math.isfinite(value):
-            wrong.append(f"{name}: truth.{path_of.strip()} is {text.strip()!r}, expected a number")
-        truth[path_of.strip()] = value
+        try:
+            truth[path_of.strip()] = needed(text.strip(), f"truth.{path_of.strip()}")
+        except ValueError as error:
+            wrong.append(f"{name}: {error}")
     if wrong:
         raise DataError(*wrong)
     source = tuple(line for line in table.remarks if not line.startswith(TRUTH))
@@ -192,11 +193,3 @@ def stated(values: Mapping[str, float | Sequence[float]]) -> OutputData:
     names = tuple(name for name, _ in pairs)
     labels = tuple(f"data.outputs.{name}" for name in names)
     return OutputData(names, np.array([value for _, value in pairs]), np.full(len(pairs), math.nan), labels)
-
-
-def _number(text: str) -> float:
-    """A number; NaN if a text is not a number."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

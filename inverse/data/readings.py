@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.table import DataError, Table, others
+from inverse.data.table import DataError, Table, numeric, others
 from inverse.data.units import factor, split_head
 
 DISPLACED = ("x", "y", "z", "ux", "uy", "uz")  # columns of displacements
@@ -156,16 +156,7 @@ class _Row:
             if column == COMMON:
                 message += f", in a column {ERROR}"
             raise ValueError(message) from None
-        if not text:
-            return math.nan
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            message = f"{column} is {text!r}, expected a number"
-            raise ValueError(message)
-        return number * scale
+        return scale * numeric(text, column, positive=column in (ERROR, COMMON))
 
 
 @dataclass(frozen=True)
@@ -204,9 +195,6 @@ def _reading(row: _Row, cases: Mapping[str, Units], wrong: list[str]) -> _Readin
         return None
     if math.isnan(value):
         wrong.append(f"{row.label}: no {VALUE} of '{name}', expected a number")
-        return None
-    if sigma <= 0:
-        wrong.append(f"{row.label}: {column} = {sigma:g}, expected more than 0")
         return None
     return _Reading(name, names.index(case), list(units).index(name), value, sigma)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,6 +79,43 @@ def read_table(path: Path) -> Table:
         more = others(len(odd) - 1)
         raise DataError(f"{name}: line {n}: {count} cells, expected {len(head)}, one for each column{more}")
     return Table(remarks, tuple(head), [dict(zip(head, row, strict=True)) for _, row in rest], [n for n, _ in rest])
+
+
+def numeric(text: str, name: str, *, positive: bool = False) -> float:
+    """Return the number in a cell; NaN for an empty one.
+
+    Parameters
+    ----------
+    text
+        The cell.
+    name
+        Of its column, for the message.
+    positive
+        Whether only numbers above 0 are allowed.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or not finite.
+    """
+    if not text:
+        return math.nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (positive and value <= 0):
+        expected = "a number more than 0" if positive else "a number"
+        raise ValueError(f"{name} is {text!r}, expected {expected}")
+    return value
+
+
+def needed(text: str, name: str, *, positive: bool = False) -> float:
+    """Return the number in a cell that must not be empty; otherwise as `numeric`."""
+    value = numeric(text, name, positive=positive)
+    if math.isnan(value):
+        raise ValueError(f"{name} is {text!r}, expected {'a number more than 0' if positive else 'a number'}")
+    return value
 
 
 def others(count: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
-from inverse.data.table import DataError, Table, read_table
+from inverse.data.table import DataError, Table, needed, read_table
 from workflows.config.mistakes import StudyError, lines
 
 COMPONENTS: tuple[Component, ...] = ("P1", "P2", "P1-P2")
@@ -117,7 +116,7 @@ class DataFile(Settings):
             mode = self.modes.get(word, word)
             sheared = mode == "simple-shear"
             place = f"{path}, line {line}"
-            at = _stretch(row[self.at], f"{place}, {self.at}", positive=not sheared)
+            at = _stretch(row[self.at], place, self.at, positive=not sheared)
             if self.between is not None and not self.between[0] <= at <= self.between[1]:
                 continue
             if mode not in MODES:
@@ -125,17 +124,17 @@ class DataFile(Settings):
                 raise StudyError(message)
             across = None
             if self.across is not None and mode == "biaxial":
-                across = _stretch(row[self.across], f"{place}, {self.across}", positive=True)
+                across = _stretch(row[self.across], place, self.across, positive=True)
             held = mode in HELD
             for component, (measured, sigma) in self._in_row(row, place, held=held).items():
                 test = tests.setdefault((row[self.group] if self.group else WHOLE, word, component), {})
                 test.setdefault("at", []).append(at)
                 if across is not None:
                     test.setdefault("across", []).append(across)
-                value = _number(row[measured], f"{place}, {measured}")
+                value = _number(row[measured], place, measured)
                 test.setdefault("measured", []).append(self.unit * value)
                 if sigma is not None:
-                    width = _number(row[sigma], f"{place}, {sigma}", positive=True)
+                    width = _number(row[sigma], place, sigma, positive=True)
                     test.setdefault("sigma", []).append(self.unit * width)
         if not tests:
             message = f"data: {path}: no row is left; data.where and data.between say which ones are kept"
@@ -245,23 +244,17 @@ def _refuse_repeats(table: Table, path: Path) -> None:
             raise StudyError(message)
 
 
-def _stretch(text: str, place: str, *, positive: bool) -> float:
-    value = _number(text, place, positive=positive)
+def _stretch(text: str, place: str, column: str, *, positive: bool) -> float:
+    value = _number(text, place, column, positive=positive)
     if abs(value) > LARGEST_STRETCH:
-        message = f"data: {place}: {value:g}, expected a stretch (1 is undeformed), or an amount of shear"
+        message = f"data: {place}: {column} is {text!r}, expected a stretch (1 is undeformed), or an amount of shear"
         raise StudyError(message)
     return value
 
 
-def _number(text: str, place: str, *, positive: bool = False) -> float:
+def _number(text: str, place: str, column: str, *, positive: bool = False) -> float:
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        message = f"data: {place}: {text!r}, expected a number"
-        raise StudyError(message)
-    if positive and value <= 0:
-        message = f"data: {place}: {value:g}, expected more than 0"
-        raise StudyError(message)
-    return value
+        return needed(text, column, positive=positive)
+    except ValueError as error:
+        message = f"data: {place}: {error}"
+        raise StudyError(message) from None

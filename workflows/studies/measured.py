@@ -22,7 +22,7 @@ from inverse.data.observations import SCANS, Observations, Placed
 from inverse.data.readings import Units
 from inverse.data.registration import Registered, ToSurface, UncertainMotion, register
 from inverse.data.scans import Reading, Scan, read
-from inverse.data.table import DataError
+from inverse.data.table import DataError, needed
 from workflows.config.mistakes import lines
 
 if TYPE_CHECKING:
@@ -270,10 +270,9 @@ def read_measurement(path: Path, model: Specimen, data: DataFiles) -> Measuremen
 
 def _known(name: str, text: str, path: Path) -> float:
     try:
-        return float(text)
-    except ValueError:
-        message = f"{path.name}: truth.{name} is '{text}', expected a number"
-        raise DataError(message) from None
+        return needed(text, f"truth.{name}")
+    except ValueError as error:
+        raise DataError(f"{path.name}: {error}") from None
 
 
 def _true_inclusions(text: str, path: Path) -> tuple[Any, ...]:

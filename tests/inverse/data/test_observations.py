@@ -95,7 +95,7 @@ def test_a_table_is_read_component_by_component(table):
         ("0, 0.5, 0.5, 0.1", "nan, 0.5, 0.5, 0.1", "line 4: x is 'nan', expected a number"),
         ("0.1, ,", "much, ,", "line 4: ux is 'much', expected a number"),
         ("0.3, 0.4", "inf, 0.4", "line 6: ux is 'inf', expected a number"),
-        ("0.02", "-0.02", "line 5: sigma = -0.02, expected more than 0"),
+        ("0.02", "-0.02", "line 5: sigma is '-0.02', expected a number more than 0"),
         ("0.01, extension", "0.01, shear", "line 6: the point of line 4 again in load case 'shear'"),
         ("0.01, extension", "0.01, shear", "no data in load case 'extension'"),
         ("0.3, 0.4", ", nan", "no data in load case 'extension'"),

@@ -350,8 +350,8 @@ def test_rows_of_outputs_stand_among_displacements_or_alone(tmp_path):
     [
         (TABLE.replace("pull,grip", "pull,force"), "line 3: no output 'force' is measured in load case 'pull'; .*grip"),
         (TABLE.replace("press,force", "lift,force"), "line 4: unknown load case 'lift'"),
-        (TABLE.replace("0.01,pull", "-0.01,pull"), "line 3: sigma = -0.01, expected more than 0"),
-        (TABLE.replace("0.01,pull", "0,pull"), "line 3: sigma = 0, expected more than 0"),
+        (TABLE.replace("0.01,pull", "-0.01,pull"), "line 3: sigma is '-0.01', expected a number more than 0"),
+        (TABLE.replace("0.01,pull", "0,pull"), "line 3: sigma is '0', expected a number more than 0"),
         (TABLE.replace("grip,2", "grip,two"), "line 3: value is 'two', expected a number"),
         (TABLE.replace("grip,2", "grip,inf"), "line 3: value is 'inf', expected a number"),
         (TABLE.replace("grip,2", "grip,"), "line 3: no value of 'grip'"),

@@ -309,12 +309,12 @@ def test_one_line_for_a_mistake(small, old, new, told):
     ("row", "told"),
     [
         ("torsion,1.1,2", "line 6: unknown mode 'torsion'"),
-        ("uniaxial,1.1,much", "line 6, stress: 'much', expected a number"),
+        ("uniaxial,1.1,much", "line 6: stress is 'much', expected a number"),
         ("uniaxial,1.1", "table.csv: line 6: 2 cells, expected 3"),
         ("uniaxial,1.1,2,3", "table.csv: line 6: 4 cells, expected 3"),
-        ("uniaxial,nan,1", "line 6, stretch: 'nan', expected a number"),
-        ("uniaxial,-1,1", "line 6, stretch: -1, expected more than 0"),
-        ("uniaxial,150,1", "line 6, stretch: 150, expected a stretch"),
+        ("uniaxial,nan,1", "line 6: stretch is 'nan', expected a number"),
+        ("uniaxial,-1,1", "line 6: stretch is '-1', expected a number more than 0"),
+        ("uniaxial,150,1", "line 6: stretch is '150', expected a stretch"),
         ("uniaxial,1.1,2\nuniaxial,1.1,2", "lines 6 and 7 are the same, expected each measurement once"),
     ],
 )
@@ -333,7 +333,7 @@ def test_second_stretches_and_errors_in_a_table(small):
     tests = load(small, columns).data.tests
     assert [test.across for test in tests] == [None, (1.2,)]
     (small.parent / "table.csv").write_text("\n".join([*rows, "biaxial,1.2,1.2,0.4,0"]))
-    with pytest.raises(StudyError, match="line 4, error: 0, expected more than 0"):
+    with pytest.raises(StudyError, match="line 4: error is '0', expected a number more than 0"):
         load(small, columns)
 
 
@@ -358,7 +358,7 @@ def test_both_stresses_in_a_table(small):
     for row, told in (
         ("uniaxial,1.1,,0.3,0.2", "line 5, s2: a stress across, expected an empty cell"),
         ("biaxial,1.1,1.2,,", "line 5: no stress, expected one in s1 or s2"),
-        ("biaxial,1.1,1.2,x,", "line 5, s1: 'x', expected a number"),
+        ("biaxial,1.1,1.2,x,", "line 5: s1 is 'x', expected a number"),
     ):
         table.write_text("\n".join([*wide, row]))
         with pytest.raises(StudyError, match=told):
