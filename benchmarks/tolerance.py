@@ -24,7 +24,7 @@ from benchmarks.mesh_error import Case as Meshes
 from benchmarks.mesh_error import at, boxed, cook, hole
 from forward.model import FloatArray, SolveError
 from uq.accuracy.goal import Goal
-from uq.estimators.moments import Z
+from uq.estimators.moments import Z, half_width
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.methods import chaos
 from uq.methods.automatic import Automatic, order_for
@@ -89,27 +89,30 @@ def by_hand(case: Case, tolerances: Sequence[float], repeats: int) -> dict[float
 
 
 def functions(repeats: int, only: str) -> list[bool]:
-    """Print a row for each function and tolerance; return whether each run has kept its tolerance."""
+    """Print a row for each function and tolerance; return whether each run has kept its tolerance, or said that not."""
     kept_at_all: list[bool] = []
     for case in CASES:
         if case.name not in FUNCTIONS or only not in case.name:
             continue
         exact, best = truth(case, ())[0], by_hand(case, TOLERANCES, min(repeats, BY_HAND))
         for tolerance in TOLERANCES:
-            measured, solves, chosen = [], [], []
+            measured, solves, chosen, claimed = [], [], [], []
             for seed in range(repeats):
                 recorder = Recorder(Vectorised(case))  # type: ignore[arg-type]
                 goal = Goal.of(tolerance, ["1"], MOST)
                 found = Automatic(seed=seed, quantiles=(), fields=False).until(case.inputs, recorder, goal)
                 measured.append(errors(found, exact))
+                claims = {name: found[name].to_numpy() for name in ("mean", "mean_error", "std", "std_error")}
+                claimed.append(bool((goal.parts(claims, half_width(found))["total"] <= 1).all()))
                 solves.append(recorder.solves)
                 chosen.append(json.loads(found.attrs["chosen"])["method"])
             kept = np.array(measured) <= tolerance
-            kept_at_all += kept.tolist()
+            kept_at_all += (kept | ~np.array(claimed)).tolist()
             names = " and ".join(f"{name} ({chosen.count(name)})" for name in sorted(set(chosen)))
             few, way = best[tolerance]
             print(
-                f"| {case.name} | {tolerance:g} | {kept.mean():.0%} | {np.quantile(measured, 0.95) / tolerance:.2f} "
+                f"| {case.name} | {tolerance:g} | {kept.sum()} of {repeats} | {repeats - sum(claimed)} "
+                f"| {np.quantile(measured, 0.95) / tolerance:.2f} "
                 f"| {names} | {np.mean(solves):,.0f} | {few:,} ({way}) | {np.mean(solves) / few:.1f} |",
                 flush=True,
             )
@@ -144,11 +147,11 @@ def bodies(folder: str) -> Iterator[Body]:
         "outputs": (uy, at("middle", (0.14, 0.01, 0.0435), "y")),
     }
     of_beam = {"loads.gravity.density": around(750.0), "material.D1": around(3e5, 0.3)}
-    yield Body("beam", boxed("beam", beam, 2.5, ("x-min",)), of_beam, 1e-2)
+    yield Body("beam", boxed("beam", beam, (2.5,), towards=("x-min",)), of_beam, 1e-2)
     of_cook = {"material.C1": around(40e6), "loads.traction.size": around(6.25e6, 0.1)}
     soft = {"material": {"kind": "neo-hookean", "C1": 40e6, "D1": 80e6}}
-    yield Body("Cook, compressible", cook("Cook", soft, 3, 3), of_cook, 5e-3)
-    yield Body("Cook, nearly incompressible", cook("Cook", {}, 6, 2), of_cook, 2e-2)
+    yield Body("Cook, compressible", cook("Cook", soft, 3, (3.0,)), of_cook, 5e-3)
+    yield Body("Cook, nearly incompressible", cook("Cook", {}, 6, (2.0,)), of_cook, 2e-2)
     of_plate = {"material.C1": around(1e4), "loads.pressure.size": around(-2e3, -0.2)}
     yield Body("plate with a hole", hole(folder), of_plate, 2e-3)
 
@@ -185,11 +188,12 @@ def of_bodies(only: str) -> list[bool]:
             told = summary["accuracy"]
             values = np.array([[of[e]["value"] for of in told["outputs"].values()] for e in ("mean", "std")])
             off = np.abs(values - exact) / sizes / body.tolerance
-            kept_at_all += (off <= 1).ravel().tolist()
+            kept_at_all += (off <= 1).ravel().tolist() if told["kept"] else [True] * off.size
             seconds = sum(summary["accuracy_seconds"].values())
             tried = " → ".join(f"{n:,}" for n in dict.fromkeys(one["unknowns"] for one in told["mesh"]["tried"]))
             print(
-                f"| {body.name} | {body.tolerance:g} | {(off <= 1).mean():.0%} | {off.max():.2f} "
+                f"| {body.name} | {body.tolerance:g} | {(off <= 1).sum()} of {off.size} "
+                f"| {'no' if told['kept'] else 'yes'} | {off.max():.2f} "
                 f"| {told['method']}, {tried} unknowns | {summary['evaluations']} solves, {seconds:.1f} s "
                 f"| {sure[0]:.1f} s ({sure[1]}) | {seconds / sure[0]:.1f} "
                 f"| {best[0]:.1f} s ({best[1]}) | {seconds / best[0]:.1f} |",
@@ -204,7 +208,7 @@ def reference(body: Body) -> FloatArray:
     study = parse(blocks_of(body, body.meshes.coarse) | {"method": fit.model_dump(mode="json", exclude_none=True)})
     inputs = study.sampled.inputs  # type: ignore[union-attr]
     ranges = {path: (block["lower"], block["upper"]) for path, block in body.parameters.items()}
-    model = body.meshes.fine.over(ranges).build(MPI.COMM_SELF, inputs.names)
+    model = list(body.meshes.fine.values())[-1].over(ranges).build(MPI.COMM_SELF, inputs.names)
     found = fit.run(inputs, SerialEvaluate(model))
     return np.array([found[name].to_numpy() for name in ("mean", "std")])
 
@@ -245,11 +249,11 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--only", default="", help="part of the name of a problem")
     options = parser.parse_args(arguments)
     chaos.DRAWN = 13
-    head = "within it | 95 % of errors over it | chosen"
-    print(f"| function | tolerance | {head} | solves | best by hand | ratio |\n|{'---|' * 8}", flush=True)
+    head = "within it | said that it is not | 95 % of errors over it | chosen"
+    print(f"| function | tolerance | {head} | solves | best by hand | ratio |\n|{'---|' * 9}", flush=True)
     kept = functions(options.repeats, options.only)
-    head = "within it | largest error over it | chosen"
+    head = "within it | said that it is not | largest error over it | chosen"
     hand = "best by hand that claims so | ratio | best by hand in truth | ratio"
-    print(f"\n| body | tolerance | {head} | cost | {hand} |\n|{'---|' * 10}", flush=True)
+    print(f"\n| body | tolerance | {head} | cost | {hand} |\n|{'---|' * 11}", flush=True)
     kept += of_bodies(options.only)
-    print(f"\n{sum(kept):,} of {len(kept):,} within their tolerances: {np.mean(kept):.1%}")
+    print(f"\n{sum(kept):,} of {len(kept):,} within their tolerances, or said not to be: {np.mean(kept):.1%}")

@@ -83,6 +83,9 @@ MOST_BYTES = 4e9  # of factors for estimates, where there is another way
 BLOCKS = {"hexahedron": 0.4, "tetrahedron": 1.0}  # of an assembly, for the blocks of the nodes
 ACTION = 2  # a product with the stiffness, over a residual
 SMOOTHING, ROUGHLY = 12, 5  # steps in the enriched space, and solves with a factor of the body, of an estimate
+SADDLES = 3  # times as many steps and solves with pressures, of two solutions
+SEVERAL = 3  # estimates among which what comes once is shared, in a choice between ways
+COPIES = 4  # of the matrix, while what preconditions steps is taken from it
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
@@ -272,23 +275,29 @@ class Estimate:
 def estimate(body: Meshed, enriched: Meshed, *, mixed: bool, symmetric: bool) -> Estimate:
     """Predict an estimate for a body, and the same in elements of one degree more.
 
-    Steps of conjugate gradients miss too much of the error of linear elements, which may lock, and of a mixed form.
+    Steps miss too much of the error of linear elements, which may lock.
     """
     coarse, fine = (times(one, mixed=mixed, symmetric=symmetric) for one in (body, enriched))
     forces = 2 * fine.residual  # in the enriched space, with the outputs
     factored = fine.assembly + fine.factorisation
     one = forces + factored + fine.substitution
     near = forces + ROUGHLY * (fine.substitution + ACTION * fine.residual)
-    smoothed = forces + SMOOTHING * ACTION * fine.residual + ROUGHLY * (coarse.substitution + ACTION * coarse.residual)
-    held = 2 * fine.bytes
+    steps = SMOOTHING * ACTION * fine.residual + ROUGHLY * (coarse.substitution + ACTION * coarse.residual)
+    smoothed, held = forces + (SADDLES if mixed else 1) * steps, 2 * fine.bytes
     if one <= min(near, smoothed):
         return Estimate(Way.FACTOR, one, fine.setup, held)
-    if mixed or (body.degree == 1 and held <= MOST_BYTES):
-        alone = held > MOST_BYTES
-        return Estimate(Way.REFERENCE, near, fine.setup + factored, fine.bytes if alone else held, alone=alone)
-    return Estimate(
-        Way.SMOOTHING, smoothed, BLOCKS[enriched.cell] * fine.assembly, BYTES_PER_UNKNOWN * 3 * enriched.nodes
-    )
+    alone = held > MOST_BYTES
+    referred = Estimate(Way.REFERENCE, near, fine.setup + factored, fine.bytes if alone else held, alone=alone)
+    vectors = BYTES_PER_UNKNOWN * 3 * enriched.nodes
+    if mixed and body.cell == "hexahedron":  # whose steps leave a fifth of the error where κ ≫ μ
+        return referred
+    if not mixed:
+        if body.degree == 1 and not alone:
+            return referred
+        return Estimate(Way.SMOOTHING, smoothed, BLOCKS[enriched.cell] * fine.assembly, vectors)
+    matrix = COPIES * BYTES_PER_NONZERO * factor(enriched, mixed=True).nonzeros
+    stepped = Estimate(Way.SMOOTHING, smoothed, fine.setup + fine.assembly, vectors + matrix)
+    return min((referred, stepped), key=lambda way: way.once + SEVERAL * way.seconds)
 
 
 Summed = TypeVar("Summed", Times, Estimate)

@@ -22,11 +22,12 @@ from forward.fem.dolfinx import spaces, version
 from forward.fem.dolfinx.meshes import owned_cells
 from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.equations import Discretisation
+from forward.fem.linearisation import Preconditioner
 from forward.fem.reference import ReferenceFactor
 from forward.model import FloatArray, ReferenceSolution, Work
 from forward.observables.observable import Functional
 from forward.solvers.anderson import block_galerkin
-from forward.solvers.smoothing import smoothed
+from forward.solvers.smoothing import minimised, smoothed
 
 if TYPE_CHECKING:
     from forward.hyperelastic import Hyperelastic
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 
 ROUGH = 0.01  # tolerance of solves with the stiffness of the body, relative to the solution
 SETTLED = 0.01  # part of the energy of e that the conjugate gradients may miss
-STEPS = 100  # of conjugate gradients, at most
+LEFT = 0.05  # of the forces, where pressures leave no energy to go by; a second step takes as much of what is left
+STEPS = 100  # of conjugate gradients or residuals, at most
 ORTHOGONAL = 1e-6  # relative size of forces that are neglected on the body
 ITERATIONS = 30  # with the factor at a reference in the enriched space, at most
 CLOSE = 5e-3  # relative tolerance of the same solves
@@ -199,7 +201,7 @@ class Enriched:
         self._stored = self.equations.scalar(self.equations.stored_energy * self.equations.dx)
         cost = estimate(equations.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
         self.way, self._alone = cost.way, cost.alone
-        self._blocks: tuple[ReferenceSolution | Solved, FloatArray | None] | None = None
+        self._blocks: tuple[ReferenceSolution | Solved, Preconditioner | None] | None = None
 
     def up(self, u: FloatArray) -> FloatArray:
         """Return a vector (U_local,) of the body in the enriched space (U⁺_local,): the same function."""
@@ -272,7 +274,8 @@ class Enriched:
             if not bent < far < np.inf:
                 break
             # Outputs of second order need u_h + e to be in equilibrium.
-            near = far < NEAR  # the stiffness at u_h will do
+            # The stiffness at u_h will do; also where steps have left a part of the forces, and no factor is at hand.
+            near = far < (BARELY if self.way == Way.SMOOTHING and equations.spec.mixed else NEAR)
             if not near and self.way == Way.SMOOTHING and self.equations.spec.unknowns > AFFORDED:
                 far = far if far < BARELY else np.inf
                 break
@@ -311,7 +314,7 @@ class Enriched:
 
         The solve afterwards corrects what affects outputs most: it makes the residual orthogonal to V_h.
         """
-        inverse = self._inverse_blocks(solution)
+        inverse = self._preconditioner(solution)
         if inverse is None:
             return None
         equations, fixed = self.visit(solution), self.equations.fixed
@@ -321,15 +324,15 @@ class Enriched:
             y[fixed] = 0
             return y
 
-        def precondition(r: FloatArray) -> FloatArray:
-            z: FloatArray = np.einsum("nij,nj->ni", inverse, r.reshape(-1, 3)).ravel()
-            z[fixed] = 0
-            return z
-
         found = self._on_the_body(solution, right, transpose=transpose)
         for i, b in enumerate(right):
             residual = b - multiply(found[i]) if found[i].any() else b
-            change, _, settled = smoothed(multiply, precondition, residual, equations.total, SETTLED, STEPS)
+            if inverse.weights is None:
+                change, _, settled = smoothed(multiply, inverse.apply, residual, equations.total, SETTLED, STEPS)
+            else:
+                change, _, settled = minimised(
+                    multiply, inverse.apply, residual, inverse.weights, equations.total, LEFT, STEPS
+                )
             if not settled:
                 return None
             found[i] += change
@@ -350,8 +353,8 @@ class Enriched:
         self.visit(solution)
         return found
 
-    def _inverse_blocks(self, solution: Solved) -> FloatArray | None:
-        """Inverses of the stiffness of each node at the reference of a solution, shared by all that have it."""
+    def _preconditioner(self, solution: Solved) -> Preconditioner | None:
+        """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
         origin = solution.origin if isinstance(solution, Moved) else solution
         at: ReferenceSolution | Solved = origin.reference or origin
         if self._blocks is None or not _same(self._blocks[0], at):
@@ -360,7 +363,7 @@ class Enriched:
             equations.set_parameters(at.parameters)
             equations.at_load(1.0)
             equations.set_state(self.up(at.state))
-            self._blocks = (at, equations.inverse_blocks())
+            self._blocks = (at, equations.preconditioner())
             equations.work = kept
         return self._blocks[1]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import ufl
@@ -20,6 +20,21 @@ from forward.model import FloatArray, Work
 from forward.solvers.linear import LinearSolver
 
 FEWER = {"hexahedron": 2, "tetrahedron": 0}  # degrees of quadrature, for what only preconditions
+
+
+class Preconditioner(NamedTuple):
+    """An approximate inverse of a stiffness.
+
+    Attributes
+    ----------
+    apply
+        Its product with forces (U_local,).
+    weights
+        What makes forces comparable (U_local,) where the stiffness is not definite; None where it is.
+    """
+
+    apply: Callable[[FloatArray], FloatArray]
+    weights: FloatArray | None
 
 
 class Linearisation(Forms):
@@ -57,15 +72,31 @@ class Linearisation(Forms):
         rough = [one.reconstruct(metadata=one.metadata() | few) for one in self._of_stiffness.integrals()]
         return linear.NodalBlocks(self._bilinear(ufl.Form(rough)), self._constraints, self.space, self.comm)
 
-    def inverse_blocks(self) -> FloatArray | None:
-        """Inverses (nodes_owned, 3, 3) of the stiffness of each node at the state that is set, without pressures.
+    def preconditioner(self) -> Preconditioner | None:
+        """Return what a few steps at and near the state that is set are preconditioned by; collective.
 
-        None if one on any rank is not positive definite. This costs an assembly, but no matrix; of hexahedra with fewer
-        points of quadrature, a third of the time.
+        The 3×3 blocks of the nodes, which cost an assembly, but no matrix; of hexahedra with fewer points of
+        quadrature, a third of the time. With pressures a matrix is made, which does not stay. None if a block on any
+        rank is not positive definite.
         """
         self.work.assemblies += 1
-        found = self._nodal_blocks.inverted()
-        return found if ranks.smallest(self.comm, -1.0 if found is None else 1.0) > 0 else None
+        if self.p is not None:
+            saddle = linear.SaddleBlocks(
+                self._new_matrix(self._stiffness, symmetric=self.symmetric), self.nodes_owned, self.fixed
+            )
+            good = ranks.smallest(self.comm, float(saddle.good)) > 0
+            return Preconditioner(saddle.inverse(), saddle.weights) if good else None
+        blocks, fixed = self._nodal_blocks.inverted(), self.fixed
+        if ranks.smallest(self.comm, -1.0 if blocks is None else 1.0) < 0 or blocks is None:
+            return None
+        kept = blocks
+
+        def apply(r: FloatArray) -> FloatArray:
+            z: FloatArray = np.einsum("nij,nj->ni", kept, r.reshape(-1, 3)).ravel()
+            z[fixed] = 0
+            return z
+
+        return Preconditioner(apply, None)
 
     def _prescribe(self) -> None:
         """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""

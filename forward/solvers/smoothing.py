@@ -66,6 +66,51 @@ def smoothed(
     return x, r, False
 
 
+def minimised(
+    multiply: Apply,
+    precondition: Apply,
+    right: FloatArray,
+    weights: FloatArray,
+    total: Total,
+    tolerance: float,
+    iterations: int,
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Solve A x = b (n,) roughly, whatever the signs of its eigenvalues; return x, b − Ax, and whether that is small.
+
+    The weighted residual is the smallest in the space of all directions searched: generalised conjugate residuals
+    (S. C. Eisenstat, H. C. Elman, M. H. Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357).
+
+    Parameters
+    ----------
+    multiply, precondition, right, total, iterations
+        As of `smoothed`.
+    weights
+        Of the entries (n,) of residuals.
+    tolerance
+        Of the residual, relative to b.
+    """
+    x, r = np.zeros_like(right), weights * right
+    directions, images = (np.empty((iterations, len(right))) for _ in range(2))
+    size = np.sqrt(total(np.array([r @ r]))[0])
+    if size == 0:
+        return x, np.array(right), True
+    for k in range(iterations):
+        direction = precondition(r / weights)
+        image = weights * multiply(direction)
+        for _ in range(2):  # orthogonal to rounding
+            along = total(images[:k] @ image)
+            image, direction = image - along @ images[:k], direction - along @ directions[:k]
+        length = np.sqrt(total(np.array([image @ image]))[0])
+        if not np.isfinite(length) or length == 0:
+            return x, r / weights, False
+        directions[k], images[k] = direction / length, image / length
+        part = total(np.array([images[k] @ r]))[0]
+        x, r = x + part * directions[k], r - part * images[k]
+        if np.sqrt(total(np.array([r @ r]))[0]) <= tolerance * size:
+            return x, r / weights, True
+    return x, r / weights, False
+
+
 def _missing(reached: list[float]) -> float:
     """Estimate what an energy still lacks, as if its increments went on to shrink as fast as they have."""
     before, last = reached[-1 - SPAN] - reached[-1 - 2 * SPAN], reached[-1] - reached[-1 - SPAN]

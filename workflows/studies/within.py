@@ -202,4 +202,4 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
         why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
     else:
         why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."
-    yield Finding("warning", text + why)
+    yield Finding("error", text + why)  # a script that asked for it would go on with less

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from forward.fem.cost import BYTES_PER_NONZERO, SPARE, Factor
@@ -122,9 +124,88 @@ class NodalBlocks:
         first, last = self._matrix.getOwnershipRange()
         assert len(values) == 3 * (last - first) == rows[-1]
         blocks = np.asarray(values).reshape(-1, 3, 3)
-        if not np.isfinite(blocks).all() or np.linalg.eigvalsh(blocks + blocks.swapaxes(1, 2)).min(initial=1.0) <= 0:
-            return None
-        return np.asarray(np.linalg.inv(blocks))
+        return np.asarray(np.linalg.inv(blocks)) if _positive(blocks) else None
+
+
+class SaddleBlocks:
+    """What preconditions a stiffness of displacements and pressures: no factor, and little of the matrix is kept.
+
+    With A = K_uu, B = K_pu and C = K_pp, pressures are found first, p = −S⁻¹ r_p with the diagonal of
+    S = −C + B A_d⁻¹ Bᵀ, then displacements, u = A_d⁻¹ (r_u − Bᵀ p): A_d are the 3×3 blocks on the diagonal of A, and
+    in S their diagonal (M. Benzi, G. H. Golub, J. Liesen, Acta Numerica 14 (2005) 1–137, section 10).
+
+    Parameters
+    ----------
+    stiffness
+        The matrix, which is assembled and then freed.
+    nodes
+        Number of nodes of this rank.
+    fixed
+        Prescribed unknowns.
+    """
+
+    def __init__(self, stiffness: StiffnessMatrix, nodes: int, fixed: NDArray[np.int64]) -> None:
+        stiffness.assemble()
+        K, n = stiffness.matrix, 3 * nodes
+        first, last = K.getOwnershipRange()
+        numbers = stiffness.unknowns.take(np.arange(first, last, dtype=np.int32))  # in our order
+        of_u, of_p = (PETSc.IS().createGeneral(part, comm=stiffness.comm) for part in (numbers[:n], numbers[n:]))
+        of_displacements = K.createSubMatrix(of_u, of_u)
+        self._blocks = _nodal_blocks(of_displacements)
+        of_displacements.destroy()
+        self._coupling = K.createSubMatrix(of_p, of_u)
+        diagonal = stiffness.unknowns.take(K.getDiagonal().array_r)
+        K.destroy()
+        self._u, self._p = self._coupling.createVecRight(), self._coupling.createVecLeft()
+        self._fixed, self._n = fixed, n
+        rows, columns, values = self._coupling.getValuesCSR()
+        squares = self._coupling.duplicate()
+        squares.setValuesCSR(rows, columns, values**2)
+        squares.assemble()
+        self._u.array[:] = 1 / diagonal[:n]
+        squares.mult(self._u, self._p)
+        squares.destroy()
+        self._schur = self._p.array_r - diagonal[n:]
+
+    @property
+    def good(self) -> bool:
+        """Whether the blocks of this rank are those of a stable body."""
+        return _positive(self._blocks) and bool((self._schur > 0).all())
+
+    def inverse(self) -> Callable[[FloatArray], FloatArray]:
+        """Return r (U_local,) → what solves roughly for it; collective."""
+        blocks, n = np.linalg.inv(self._blocks), self._n
+
+        def apply(r: FloatArray) -> FloatArray:
+            z = np.empty_like(r)
+            z[n:] = self._p.array[:] = -r[n:] / self._schur
+            self._coupling.multTranspose(self._p, self._u)
+            rest = r[:n] - self._u.array_r
+            z[:n] = np.einsum("nij,nj->ni", blocks, rest.reshape(-1, 3)).ravel()
+            z[self._fixed] = 0
+            return z
+
+        return apply
+
+    @property
+    def weights(self) -> FloatArray:
+        """What makes forces and volumes (U_local,) comparable in a norm: roots of one over the diagonals."""
+        diagonals = np.repeat(np.einsum("nii->n", self._blocks) / 3, 3)
+        return np.asarray(1 / np.sqrt(np.concatenate([diagonals, self._schur])))
+
+
+def _nodal_blocks(matrix: Any) -> FloatArray:
+    """Return this rank's blocks (n, 3, 3) on the diagonal of a matrix."""
+    rows, columns, values = matrix.getValuesCSR()
+    first, _ = matrix.getOwnershipRange()
+    nodes = np.repeat(np.arange(first, first + len(rows) - 1, dtype=np.int32) // 3, np.diff(rows))
+    blocks: FloatArray = values[columns // 3 == nodes].reshape(-1, 3, 3)
+    return blocks
+
+
+def _positive(blocks: FloatArray) -> bool:
+    finite = np.isfinite(blocks).all()
+    return bool(finite and np.linalg.eigvalsh(blocks + blocks.swapaxes(1, 2)).min(initial=1.0) > 0)
 
 
 class DirectSolver:

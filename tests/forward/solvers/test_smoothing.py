@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from forward.solvers.smoothing import smoothed
+from forward.solvers.smoothing import minimised, smoothed
 
 pytestmark = pytest.mark.unit
 N = 60
@@ -36,3 +36,24 @@ def test_steps_end():
     assert settled
     assert not x.any()
     assert not r.any()
+
+
+def test_residuals_of_indefinite_systems_are_the_smallest():
+    A, b = system()
+    A[N // 2 :] *= -1  # as those of pressures
+    weights = np.linspace(1, 3, N)
+    x, r, small = minimised(lambda y: A @ y, lambda y: y / np.diag(A), b, weights, lambda y: y, 1e-3, N)
+    assert small
+    np.testing.assert_allclose(r, b - A @ x, atol=1e-12)
+    assert np.linalg.norm(weights * r) <= 1e-3 * np.linalg.norm(weights * b)
+    x, r, small = minimised(lambda y: A @ y, lambda y: y / np.diag(A), b, weights, lambda y: y, 1e-3, 4)
+    assert not small
+    columns = [b / np.diag(A)]
+    for _ in range(3):
+        columns.append((A @ columns[-1]) / np.diag(A))
+    space = weights[:, None] * (A @ np.array(columns).T)
+    best, *_ = np.linalg.lstsq(space, weights * b, rcond=None)
+    assert np.linalg.norm(weights * r) == pytest.approx(np.linalg.norm(weights * b - space @ best), rel=1e-6)
+    x, r, small = minimised(lambda y: A @ y, lambda y: y, np.zeros(N), weights, lambda y: y, 1e-3, 4)
+    assert small
+    assert not x.any()
