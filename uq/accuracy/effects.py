@@ -90,7 +90,7 @@ def with_mesh_errors(
     """
     drawn = sketch(dataset, inputs, centre)
     effects = [_Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])]
-    unknown = _unknown(found)
+    unknown = unknown_of(found)
     variables = _of_outputs(dataset, inputs, centre, drawn, effects, unknown)
     variables |= {
         "mesh_error_points": (("estimate", "parameter"), found.evaluations.points),
@@ -120,7 +120,7 @@ def with_mesh_errors(
     return dataset
 
 
-def _unknown(found: MeshErrors) -> FloatArray:
+def unknown_of(found: MeshErrors) -> FloatArray:
     """What is not known of each calibrated error (m,), relative to it."""
     usual = np.where(np.isfinite(found.saturation) & found.measured, DOUBT, UNCALIBRATED)
     if not len(found.points):

@@ -403,6 +403,22 @@ def test_a_study_of_the_server_gives_the_moments_of_the_study_served(beam):
         np.testing.assert_allclose(results[1][name], results[0][name], rtol=1e-6)
 
 
+def test_a_tolerance_for_a_model_behind_a_server(function, tmp_path):
+    laws = {name: {"kind": "uniform", "lower": 0.8, "upper": 1.2} for name in ("a", "b")}
+    blocks = {"kind": "um-bridge", "url": function, "parameters": {"a": 1.0, "b": 1.0}, "outputs": ["u", "v"]}
+    study = parse({"model": blocks, "parameters": laws, "accuracy": {"tolerance": 1e-2}})
+    found = study.run(tmp_path / "out")
+    told = json.loads(found.attrs["accuracy"])
+    assert told["kept"]
+    assert told["mesh"] is None
+    places, weights = np.polynomial.legendre.leggauss(4)
+    model = umbridge.HTTPModel(function, "forward")
+    values = np.array([[model([[1 + 0.2 * x, 1 + 0.2 * y]])[0] for y in places] for x in places])
+    mean, square = (np.einsum("xyo,x,y->o", of, weights, weights) / 4 for of in (values, values**2))
+    np.testing.assert_allclose(found["mean"], mean, rtol=1e-2)
+    np.testing.assert_allclose(found["std"], np.sqrt(square - mean**2), rtol=1e-2)
+
+
 @pytest.mark.fem
 def test_outputs_measured_at_a_server_are_inverted(beam, tmp_path):
     """The most probable parameters explain what was measured; there is no mesh to look at."""
