@@ -31,7 +31,7 @@ def test_predicted_times_grow_with_the_body(cell, form):
 
 
 def test_estimates_that_take_too_much_memory_are_left_out_and_it_is_said():
-    study = load(CONFIGS / "organ.toml", ["accuracy.memory=2000"])
+    study = load(CONFIGS / "organ.toml", ["accuracy.memory=500"])
     assert study.estimates == 0
     assert not any(line.startswith("mesh error") for line in plan(study, 1))
     (found,) = (one for one in study.findings if "accuracy.memory" in one.text)
