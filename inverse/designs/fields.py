@@ -2,7 +2,8 @@
 
 All candidates together tell AᵀA ≈ UΛUᵀ (`inverse.fields.low_rank`); the row of a candidate in the coordinates U is a
 column of AU, which the search for the pairs has formed anyway. A set S of candidates has A_SᵀA_S ≤ AᵀA, so that what is
-left out adds at most ½ Σ ln(1 + λ) over the pairs that were neglected. No row of A itself is needed.
+left out of a row, a⊥, adds at most ½ ln(1 + |a⊥|²) to what S tells; its square is found by a few random probes. No row
+of A itself is needed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from forward.model import ForwardModel
+
+PROBES = 16
 
 
 def of_field(
@@ -61,7 +64,7 @@ def of_field(
     xarray.Dataset
         `output` (m,), `sigma`, `row` (m, r), zero for goals; `field_goal` (r, r), what the directions add to the mean
         variance of the field, over that of the prior; `goal_row` (q, r) of goals over their prior standard deviation;
-        and `neglected`, the first λ that was.
+        and `beyond` (m,), what of the squares of the rows is left out, from `PROBES` random directions.
     """
     import xarray as xr
 
@@ -74,6 +77,8 @@ def of_field(
     slopes = prior.root_transposed(solution.adjoint(units)) if len(units) else np.zeros((0, posterior.size))
     sizes = np.linalg.norm(slopes, axis=1, keepdims=True)
     rows = np.divide(slopes, sizes, out=np.zeros_like(slopes), where=sizes > 0) @ spectrum.vectors.T
+    probes = np.random.default_rng([seed, 3]).standard_normal((PROBES, posterior.size))
+    probes -= probes @ spectrum.vectors.T @ spectrum.vectors
     return xr.Dataset(
         {
             "output": ("value", np.array(solution.outputs)),
@@ -81,6 +86,6 @@ def of_field(
             "row": (("value", "direction"), spectrum.images.T),
             "field_goal": (("direction", "other"), (directions * mass) @ directions.T / (mass @ prior.variance)),
             "goal_row": (("goal", "direction"), rows),
-            "neglected": spectrum.neglected,
+            "beyond": ("value", (point.jvp(probes) ** 2).mean(axis=0)),
         }
     )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -13,8 +12,18 @@ from pydantic import Field, model_validator
 from forward.model import Finding, FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.designs.candidates import Candidates, Each, Values
-from inverse.designs.criteria import Criterion, Information, Variance, along, grouped, told_along
+from inverse.designs.criteria import (
+    Criterion,
+    Information,
+    IntArray,
+    Variance,
+    along,
+    grouped,
+    told_along,
+)
+from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.greedy import Choice, choose
+from inverse.designs.linearised import Linearised, scaled
 from inverse.methods.synthesize import SyntheticNoise
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.findings import add
@@ -24,9 +33,11 @@ from uq.inputs.sampling import sobol_points
 if TYPE_CHECKING:
     import xarray as xr
 
+LEAST = 4  # draws of a model whose predictions have moments
 LITTLE = 0.02  # of what all chosen ones tell: then the next ones repeat what is known
 FARTHER = 6  # times as many random observations as chosen ones
 ALIKE = 0.8  # of what is best for a draw alone, that observations for all draws should tell
+MISSED = 0.05  # of what chosen ones tell: what may be left out without a word
 BAND = (0.05, 0.5, 0.95)
 QUANTILES = ("lower", "median", "upper")
 
@@ -48,7 +59,8 @@ class Design(Settings):
         all that is measured in a load case or at a step of a path; or an output, at all steps of a path.
     criterion
         What they should tell: as much as possible on all unknowns together (D-optimal, nat); the parameters, or
-        predictions, as the sum of their variances over the prior ones (A-optimal).
+        predictions, as the sum of their variances over the prior ones (A-optimal); or which of several models is true
+        (`candidates` of the study), by the expected ln Bayes factor against the others.
     goals
         Names of values that are not measured but predicted, such as ``"surgery.force"``; * stands for any letters.
     noise
@@ -72,14 +84,14 @@ class Design(Settings):
     number: Annotated[int, Field(ge=1)] | None = None
     budget: Annotated[float, Field(gt=0)] | None = None
     each: Each = "point"
-    criterion: Literal["information", "parameters", "predictions"] = "information"
+    criterion: Literal["information", "parameters", "predictions", "models"] = "information"
     goals: tuple[str, ...] = ()
     noise: SyntheticNoise
     noises: dict[str, SyntheticNoise] = Field(default={})
     costs: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
     draws: Annotated[int, Field(ge=1)] = 16
     random: Annotated[int, Field(ge=2)] = 64
-    rank: Annotated[int, Field(ge=1)] = 400
+    rank: Annotated[int, Field(ge=1)] = 200
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -91,6 +103,13 @@ class Design(Settings):
             message = f"criterion = '{self.criterion}' with goals = {list(self.goals)}, expected {wanted}"
             raise ValueError(message)
         return self
+
+    @property
+    def wanted(self) -> str:
+        """How much is chosen, in words."""
+        limits = [f"{self.number} observations"] if self.number is not None else []
+        limits += [f"a budget of {self.budget:g}"] if self.budget is not None else []
+        return f"{', '.join(limits)}; one is a {self.each}"
 
     def run(self, inputs: Inputs, evaluate: Evaluate, values: Values) -> xr.Dataset:
         """Linearise the model at draws, and choose.
@@ -123,11 +142,11 @@ class Design(Settings):
         whitened = found.tangents[ok] @ slopes[ok]  # (draws, m, d)
         told = Linearised(
             [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened],
-            _scaled(whitened[:, goals] if goals.any() else slopes[ok]),
+            scaled(whitened[:, goals] if goals.any() else slopes[ok]),
         )
         result = self.chosen(told, candidates, costs)
         spread = np.linalg.norm(slopes[ok], axis=2)  # prior standard deviations (draws, d)
-        pairs = zip(slopes[ok], told.roots(result), strict=True)
+        pairs = zip(slopes[ok], told.roots(result["chosen"].to_numpy().tolist()), strict=True)
         left = [np.linalg.norm(slope @ root, axis=1) for slope, root in pairs]
         result = result.assign(
             prior_std=("parameter", spread.mean(axis=0)),
@@ -154,12 +173,15 @@ class Design(Settings):
         result = self.chosen(told, candidates, costs)
         taken = Variance(told.rows, [one["field_goal"].to_numpy() for one in draws])
         share = list(along(taken, result["chosen"].to_numpy().tolist()))
-        neglected = max(float(one["neglected"]) for one in draws)
-        result = result.assign(field_variance_told=("choice", share), neglected=neglected)
-        if neglected > 1:
+        chosen = np.isin(candidates.which, result["chosen"].to_numpy())
+        beyond = np.array([one["beyond"].to_numpy() * (one["sigma"].to_numpy() / sigma) ** 2 for one in draws])
+        left_out = float(np.log1p(beyond[:, chosen]).sum(axis=1).mean() / 2)
+        result = result.assign(field_variance_told=("choice", share), left_out=left_out)
+        known = float(result["information"][-1])
+        if left_out > MISSED * known:
             text = (
-                f"All candidates together tell more than the {self.rank} directions that are kept: of the next one the "
-                f"data would be {np.sqrt(neglected):.2g} times as exact as the prior. Take a larger method.rank."
+                f"The chosen observations tell up to {left_out:.2g} nat in directions beyond the {self.rank} that are "
+                f"kept, of {known:.3g}. Take a larger method.rank."
             )
             add(result, Finding("warning", text))
         return self.with_values(result, values, sigma, candidates)
@@ -225,40 +247,126 @@ class Design(Settings):
             raise ModelError(message)
         return found
 
+    def run_models(
+        self,
+        inputs: Mapping[str, Inputs],
+        weights: Mapping[str, float],
+        models: Mapping[str, Evaluate],
+        values: Values,
+    ) -> xr.Dataset:
+        """Choose the observations that tell models apart.
+
+        Parameters
+        ----------
+        inputs
+            The unknowns of each model, by its name.
+        weights
+            Their probabilities before the observations, up to a common factor.
+        models
+            The models, by their names.
+        values
+            What the outputs of all of them are.
+
+        Raises
+        ------
+        ModelError, SolveError
+            As `run`.
+        """
+        candidates, _, costs = self.candidates(values)
+        outputs, lost = {}, []
+        for name, one in inputs.items():
+            uniforms = sobol_points(self.seed, 0, 0, self.draws, len(one.names))
+            found = models[name](Request(one.points(uniforms)))
+            if found.ok.sum() < LEAST:
+                reason = f": {found.failures[0].reason}" if found.failures else ""
+                message = f"{name} has an answer at {found.ok.sum()} of {self.draws} draws, expected {LEAST}{reason}"
+                raise SolveError(message)
+            lost += [f"{len(found.failures)} of {name}"] if found.failures else []
+            outputs[name] = found.outputs[found.ok]
+        sigma = self.sigma(values, np.concatenate(list(outputs.values())))
+        means, roots = zip(*(predicted(one, sigma) for one in outputs.values()), strict=True)
+        parts = (means, roots, [weights[name] for name in inputs], candidates.which, len(candidates.names))
+        choice, result = self._compared(lambda: Discrimination(*parts), candidates, costs)
+        after = Discrimination(*parts)
+        for number in choice.order:
+            after.take(number)
+        result = result.assign(
+            gain=("choice", np.array(choice.gains)),
+            information=result["worth"],
+            candidate_information=("candidate", Discrimination(*parts).gains(np.arange(len(costs)))),
+            log_bayes_factor=(("model", "other"), after.pairs()),
+        ).assign_coords(model=list(inputs), other=list(inputs))
+        if lost:
+            text = f"There is no answer at some of {self.draws} draws, which are left out: {', '.join(lost)}."
+            add(result, Finding("warning", text))
+        few = [name for name, one in inputs.items() if len(outputs[name]) < 4 * (len(one.names) + 1)]
+        if few:
+            text = (
+                f"What {', '.join(few)} predict is known by few draws for so many unknowns: take more method.draws, at "
+                f"least {4 * (max(len(inputs[name].names) for name in few) + 1)}."
+            )
+            add(result, Finding("warning", text))
+        return self.with_values(result, values, sigma, candidates)
+
     def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
         """Choose among candidates (c,) with costs (c,), and compare with random choices."""
+        along_random = None
+        if self.criterion == "information":
+
+            def along_random(order: IntArray) -> FloatArray:
+                return np.asarray(np.mean([told_along(rows[order]) for rows in told.rows], axis=0))
+
+        choice, found = self._compared(lambda: self._criterion(told), candidates, costs, along_random)
+        known = np.array([told_along(rows[list(choice.order)]) for rows in told.rows])  # (draws, n)
+        alone = Information(told.rows).of_draws(np.arange(len(costs))).mean(axis=0)
+        found = found.assign(
+            gain=("choice", np.diff(np.concatenate([[0.0], known.mean(axis=0)]))),
+            information=("choice", known.mean(axis=0)),
+            information_of_draw=(("draw_number", "choice"), known),
+            candidate_information=("candidate", alone),
+        )
+        add(found, *self._doubts(told, choice, found))
+        return found
+
+    def _compared(
+        self,
+        make: Callable[[], Criterion],
+        candidates: Candidates,
+        costs: FloatArray,
+        worth_along: Callable[[IntArray], FloatArray] | None = None,
+    ) -> tuple[Choice, xr.Dataset]:
+        """Choose by a criterion, and say what random candidates are worth.
+
+        Parameters
+        ----------
+        worth_along
+            What the first, the first two, … of candidates in an order (n,) are worth (n,), if there is a shorter way.
+        """
         import xarray as xr
 
-        choice = choose(lambda: self._criterion(told), costs, number=self.number, budget=self.budget)
-        order = np.array(choice.order)
-        known = np.array([told_along(rows[order]) for rows in told.rows])  # (draws, n)
-        gain = np.diff(np.concatenate([[0.0], known.mean(axis=0)]))
-        worth = np.cumsum(choice.gains)
-        random = self._random(told, len(order))
-        alone = Information(told.rows).of_draws(np.arange(len(costs))).mean(axis=0)
-        at_random = np.quantile(random, BAND, axis=0)
+        choice = choose(make, costs, number=self.number, budget=self.budget)
+        order, worth = np.array(choice.order), np.cumsum(choice.gains)
+        rng = np.random.default_rng([self.seed, 2])
+        most = min(len(costs), FARTHER * len(order))
+        orders = [rng.permutation(len(costs))[:most] for _ in range(self.random)]
+        short = worth_along or (lambda one: np.array(list(along(make(), one.tolist()))))
+        at_random = np.quantile([short(one) for one in orders], BAND, axis=0)
         counts = np.flatnonzero(at_random[1] >= worth[-1])
-        found = xr.Dataset(
+        return choice, xr.Dataset(
             {
                 "chosen": ("choice", order),
-                "gain": ("choice", gain),
-                "information": ("choice", known.mean(axis=0)),
-                "information_of_draw": (("draw_number", "choice"), known),
                 "worth": ("choice", worth),
                 "cost": ("choice", np.cumsum(costs[order])),
                 **{f"random_{name}": ("random_number", line) for name, line in zip(QUANTILES, at_random, strict=True)},
                 "random_equal": float(counts[0] + 1) if len(counts) else np.nan,
-                "candidate_information": ("candidate", alone),
                 "candidate_cost": ("candidate", costs),
                 "candidate_place": (("candidate", "axis"), candidates.places),
                 "candidate_case": ("candidate", list(candidates.cases)),
                 "candidate_part": ("candidate", list(candidates.parts)),
                 "looks": choice.looks,
             },
-            {"candidate": list(candidates.names), "random_number": np.arange(1, at_random.shape[1] + 1)},
+            {"candidate": list(candidates.names), "random_number": np.arange(1, most + 1)},
         )
-        add(found, *self._doubts(told, choice, found))
-        return found
 
     def _best(self, rows: FloatArray, costs: FloatArray) -> float:
         """What those observations tell that are best at one draw."""
@@ -266,16 +374,6 @@ class Design(Settings):
 
     def _criterion(self, told: Linearised) -> Criterion:
         return Information(told.rows) if self.criterion == "information" else Variance(told.rows, told.goals)
-
-    def _random(self, told: Linearised, n: int) -> FloatArray:
-        """What random candidates are worth (random, most), the first, the first two, …, up to `FARTHER` times n."""
-        count = len(told.rows[0])
-        most = min(count, FARTHER * n)
-        rng = np.random.default_rng([self.seed, 2])
-        orders = [rng.permutation(count)[:most] for _ in range(self.random)]
-        if self.criterion == "information":
-            return np.array([np.mean([told_along(rows[order]) for rows in told.rows], axis=0) for order in orders])
-        return np.array([list(along(self._criterion(told), order.tolist())) for order in orders])
 
     def with_values(self, found: xr.Dataset, values: Values, sigma: FloatArray, candidates: Candidates) -> xr.Dataset:
         """Add what the values of the candidates are."""
@@ -316,33 +414,3 @@ class Design(Settings):
                 )
                 doubts.append(Finding("warning", text))
         return doubts
-
-
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Candidates and goals at draws.
-
-    Attributes
-    ----------
-    rows
-        (c, k, r) of each draw, over the standard deviations of the errors.
-    goals
-        GᵀG (r, r) of each draw, with prior variances that add up to one.
-    """
-
-    rows: Sequence[FloatArray]
-    goals: Sequence[FloatArray]
-
-    def roots(self, found: xr.Dataset) -> list[FloatArray]:
-        """Return roots (r, r) of the covariances once all chosen observations were made, of each draw."""
-        criterion = Information(self.rows)
-        for one in found["chosen"].to_numpy():
-            criterion.take(int(one))
-        return criterion.roots
-
-
-def _scaled(goals: FloatArray) -> list[FloatArray]:
-    """Return GᵀG of goals (draws, q, d), each over its prior standard deviation and √q; constants count nothing."""
-    size = np.linalg.norm(goals, axis=2, keepdims=True)
-    scaled = np.divide(goals, size, out=np.zeros_like(goals), where=size > 0) / np.sqrt(goals.shape[1])
-    return [one.T @ one for one in scaled]

@@ -123,21 +123,33 @@ class DesignStudy(Sourced, StudyKind):
         found = (*self.model.findings_over(ranges(self.given)), *findings_of_materials(self.inputs))
         return found if self.source is None else (*found, *named(f"{READER}:findings")(self, self.source))
 
+    @classmethod
+    def forms(cls) -> Iterator[type[StudyKind]]:
+        """One model, and several to be told apart."""
+        yield DesignStudy
+        yield named("workflows.studies.design_of_models:DesignOfModels")
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> StudyKind:  # type: ignore[override]
+        """Check the blocks of a design for one model, or for telling several apart."""
+        if "candidates" in blocks:
+            of_models: type[StudyKind] = named("workflows.studies.design_of_models:DesignOfModels")
+            return of_models.model_validate(blocks)
+        return cls.model_validate(blocks)
+
     def plan(self, rank_groups: int) -> list[str]:
         """Say what can be chosen, and how long that will take."""
         method, cost, d = self.method, self.spec.cost(), len(self.inputs.names)
         unknown = f"{d}: {', '.join(self.inputs.names[:12])}{', …' if d > 12 else ''}"
         if self.field:
             unknown = f"{len(self.model.coefficients):,} values of ln stiffness"
-        limits = [f"{method.number} observations" if method.number is not None else ""]
-        limits += [f"a budget of {method.budget:g}" if method.budget is not None else ""]
         derivatives = 0.0 if cost is None else PRODUCTS * PRODUCT * cost.textbook if self.field else cost.tangents(d)
         seconds = 0.0 if cost is None else method.draws * (cost.textbook + derivatives)
         return [
             f"method      {method.kind}, criterion {method.criterion}",
             *(f"{what:10}  {found}" for what, found in self.model.described(ranges(self.given))),
             f"unknown     {unknown}",
-            f"chosen      {', '.join(filter(None, limits))}; one is a {method.each}",
+            f"chosen      {method.wanted}",
             f"solves      {self.planned}, each with its derivatives",
             *([] if cost is None else [f"time        about {duration(seconds)} on 1 core (rough)"]),
         ]
@@ -170,6 +182,8 @@ class DesignStudy(Sourced, StudyKind):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
+        if self.method.criterion == "models":
+            yield ("method", "criterion"), "one model, expected several as candidates", "models"
         if self.source is not None:
             if self.source.model == AVERAGED:
                 yield ("parameters", "from", "model"), "one model is linearised, expected one of them", AVERAGED

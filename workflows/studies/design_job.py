@@ -6,12 +6,13 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from forward.bodies.geometry import AXES
-from forward.model import SolveError
+from forward.model import ModelError, SolveError
 from forward.specimen import Specimen
 from inverse.designs.candidates import NEAR, Values
 from inverse.designs.fields import of_field
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from uq.evaluation.evaluate import Evaluate, Evaluations
     from uq.evaluation.tasks import Outcome
     from workflows.studies.design import DesignStudy
+    from workflows.studies.design_of_models import DesignOfModels
     from workflows.studies.job import Job
 
 
@@ -48,6 +50,34 @@ def job(study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint) -> Job:
         return study.method.run(study.inputs, recorders["/"], values)
 
     return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(study, found))
+
+
+def job_of_models(study: DesignOfModels, ensemble: Ensemble) -> MethodJob:
+    """Make the models, which are all observed at the places of the first one; collective over the group."""
+    specs, inputs = study.of_candidates, study.inputs
+    first, *others = specs
+    model = specs[first].build(ensemble.group, inputs[first].names)
+    values = values_of(specs[first], model)
+    recorders: dict[str, Recorder] = {}
+
+    def made(name: str) -> ForwardModel:
+        other = specs[name].build(ensemble.group, inputs[name].names)
+        if isinstance(specs[name], Specimen) and isinstance(specs[first], Specimen):
+            of = cast("SpecimenModel", model)
+            return cast("SpecimenModel", other).observing(of.places, of.axes.tolist(), of.cases.tolist())
+        if other.outputs != model.outputs:
+            message = f"{name} gives {', '.join(other.outputs[:3])}, …, expected the outputs of {first}"
+            raise ModelError(message)
+        return other
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        for name in specs:
+            recorders[name] = Recorder(evaluate if name == first else evaluate.on(name))
+        weights = {name: one.weight for name, one in study.candidates.items()}
+        return study.method.run_models(inputs, weights, recorders, values)
+
+    makers = {name: partial(made, name) for name in others}
+    return MethodJob(model, makers, task, recorders, lambda found: found, texts=lambda found: files(study, found))
 
 
 def _of_field(
@@ -117,10 +147,10 @@ def _of_specimen(spec: Specimen, model: SpecimenModel) -> Values:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def files(study: DesignStudy, found: xr.Dataset) -> dict[str, str]:
+def files(study: DesignStudy | DesignOfModels, found: xr.Dataset) -> dict[str, str]:
     """Return a table of the chosen observations, and of a specimen what other studies take, by their names."""
     texts = {"design.csv": _table(found)}
-    if isinstance(study.model, Specimen):
+    if isinstance(study.specs[0], Specimen):
         lines = "".join(f"    {_inline(block)},\n" for block in observed(found))
         texts["observed.toml"] = f"# What was chosen, for the block [model] of a specimen.\nobserved = [\n{lines}]\n"
         texts["observed.csv"] = _form(found)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from mpi4py import MPI
+from scipy.stats import multivariate_normal
 
 from tests.launch import TISSUQ, assert_same_bits
 from tests.launch import run as on_ranks
@@ -211,6 +212,114 @@ def test_whole_load_cases_are_observations(folder):
         load(cube(folder, "number = 400")).run()
 
 
+CURVES = """
+import numpy as np
+
+X = np.linspace(0.2, 2, 10)
+
+def straight(p):
+    return (p[0] * X).tolist()
+
+def bent(p):
+    return (p[0] * X + p[1] * X**2).tolist()
+"""
+TWO = """
+[model]
+kind = "python"
+outputs = [{outputs}]
+[candidates.straight]
+model = {{ function = "curves.straight", parameters = {{ a = 1.0 }} }}
+parameters.a = {{ kind = "normal", mean = 1, std = 0.5 }}
+[candidates.bent]
+model = {{ function = "curves.bent", parameters = {{ a = 1.0, b = 0.1 }} }}
+parameters.a = {{ kind = "normal", mean = 1, std = 0.5 }}
+parameters.b = {{ kind = "normal", mean = 0.3, std = 0.1 }}
+weight = 3
+[method]
+kind = "design"
+criterion = "models"
+each = "value"
+noise = {{ absolute = 0.05 }}
+draws = 256
+number = 3
+"""
+
+
+def test_models_are_told_apart_as_in_monte_carlo(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "curves", raising=False)
+    (tmp_path / "curves.py").write_text(CURVES)
+    outputs = ", ".join(f'{{ name = "y{i}" }}' for i in range(10))
+    (tmp_path / "two.toml").write_text(TWO.format(outputs=outputs))
+    study = load(tmp_path / "two.toml")
+    assert parse(document(study)) == study
+    for ranks in (None, 2):
+        done = on_ranks(ranks, TISSUQ, "run", tmp_path / "two.toml", "--out", tmp_path / f"out-{ranks}", "--quiet")
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "out-None", tmp_path / "out-2")
+    assert "Expected ln Bayes factor" in (tmp_path / "out-2" / "report.html").read_text()
+    found = xr.load_dataset(tmp_path / "out-2" / "results.nc")
+    X = np.linspace(0.2, 2, 10)[found["chosen"].to_numpy()]
+    roots = [0.5 * X[:, None], np.column_stack([0.5 * X, 0.1 * X**2])]
+    models = [
+        multivariate_normal(mean, root @ root.T + 0.0025 * np.eye(3))
+        for mean, root in zip((X, X + 0.3 * X**2), roots, strict=True)
+    ]
+    for k, other in ((0, 1), (1, 0)):
+        y = models[k].rvs(20_000, random_state=k)
+        factors = models[k].logpdf(y) - models[other].logpdf(y)
+        error = 4 * factors.std() / np.sqrt(len(y)) + 0.02 * factors.mean()  # and that of the moments of 256 draws
+        assert float(found["log_bayes_factor"][k, other]) == pytest.approx(factors.mean(), abs=error)
+    told = 0.25 * float(found["log_bayes_factor"][0, 1]) + 0.75 * float(found["log_bayes_factor"][1, 0])
+    assert float(found["worth"][-1]) == pytest.approx(told, rel=1e-9)
+
+
+@pytest.mark.fem
+def test_materials_are_told_apart_by_displacements(tmp_path):
+    case = CUBE.format(more="").replace('material = { kind = "neo-hookean-coupled", mu = 1e3, lmbda = 2e3 }\n', "")
+    one, two = "mooney-rivlin", "neo-hookean"
+    text = (
+        case
+        + f"""
+[candidates.{one}]
+model.material = {{ kind = "{one}", C1 = 100, C2 = 400, D1 = 1e3 }}
+parameters."material.C1" = {{ kind = "normal", mean = 100, std = 20 }}
+[candidates.{two}]
+model.material = {{ kind = "{two}", C1 = 500, D1 = 1e3 }}
+parameters."material.C1" = {{ kind = "normal", mean = 500, std = 20 }}
+[method]
+kind = "design"
+criterion = "models"
+noise = {{ relative = 0.001 }}
+draws = 8
+number = 3
+"""
+    )
+    (tmp_path / "cube.toml").write_text(text)
+    assert run(load(tmp_path / "cube.toml"), "cube", tmp_path / "out", quiet=True) == 0
+    assert (tmp_path / "out" / "observed.toml").exists()
+    found = xr.load_dataset(tmp_path / "out" / "results.nc")
+    assert (np.diff(found["worth"]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('criterion = "models"\n', ""), "method.criterion: there are candidates, expected 'models'"),
+        (("parameters.b", "parameters.c"), "candidates.bent.parameters: not a number of the model"),
+    ],
+)
+def test_candidates_that_cannot_be_told_apart(tmp_path, monkeypatch, change, said):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "curves.py").write_text(CURVES)
+    outputs = ", ".join(f'{{ name = "y{i}" }}' for i in range(10))
+    (tmp_path / "two.toml").write_text(TWO.format(outputs=outputs).replace(*change))
+    with pytest.raises(StudyError) as error:
+        load(tmp_path / "two.toml")
+    assert len(error.value.args) == 1, error.value.args
+    assert said in error.value.args[0]
+
+
 FIELD = """
 [model]
 kind = "specimen"
@@ -268,7 +377,7 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
         return 1 - (weights * np.diag(C)).sum() / (weights * (goal**2).sum(axis=1)).sum()
 
     chosen = found["chosen"].to_numpy()
-    # Directions with λ < 0.1 are left out.
+    assert 0 <= float(found["left_out"]) < 0.05  # directions with λ < 0.1
     for n in range(3):
         assert float(found["worth"][n]) == pytest.approx(worth(chosen[: n + 1]), rel=5e-3)
     every = range(found.sizes["candidate"])
@@ -276,6 +385,19 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
     left = root @ np.linalg.inv(after(chosen)) @ root.T
     share = 1 - (mass * np.diag(left)).sum() / (mass * np.diag(root @ root.T)).sum()
     assert float(found["field_variance_told"][-1]) == pytest.approx(share, rel=5e-3)
+
+
+@pytest.mark.fem
+def test_directions_that_are_left_out_are_a_finding(tmp_path):
+    (tmp_path / "field.toml").write_text(FIELD + "number = 3\ndraws = 1\nrank = 4\n")
+    study = load(tmp_path / "field.toml")
+    found = study.run()
+    slopes, _, _, sigma = dense(study, found)
+    rows = np.isin(found["value_candidate"], found["chosen"])
+    A = (slopes / sigma[:, None])[rows]
+    missed = np.linalg.slogdet(np.eye(A.shape[1]) + A.T @ A)[1] / 2 - float(found["information"][-1])
+    assert 0 < missed < 1.5 * float(found["left_out"])
+    assert "directions beyond the 4 that are kept" in found.attrs["findings"]
 
 
 @pytest.mark.fem
@@ -304,6 +426,7 @@ def test_a_field_is_unknown_alone(tmp_path):
         ("", "expected number, how many observations, or budget, what they may cost"),
         ("number = 1\ncriterion = 'predictions'", "expected the names of values that are predicted"),
         ("number = 1\ngoals = ['y1']", "expected criterion = 'predictions'"),
+        ("number = 1\ncriterion = 'models'", "method.criterion: one model, expected several as candidates"),
         ("number = 1\neach = 'pont'", "method.each: input should be 'value', 'point'"),
     ],
 )

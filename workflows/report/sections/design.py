@@ -16,6 +16,7 @@ WORTH = {
     "information": "What they tell (nat)",
     "parameters": "Share of the parameters' variances that they take away",
     "predictions": "Share of the predictions' variances that they take away",
+    "models": "Expected ln Bayes factor of the true model (nat)",
 }
 
 
@@ -31,20 +32,30 @@ class ChosenObservations(Section):
         found, design = results.dataset, results.summary["design"]
         n, worth = found.sizes["choice"], _worth(design)
         yield Heading("Which observations tell most")
+        method, known = results.study.method, number(float(found["information"][-1]))
+        tell = (
+            f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
+            if method.criterion == "models"
+            else f"Together they tell {known} nat on average over the draws of what is not known"
+        )
         yield Text(
-            f"{n} chosen of {design['candidates']:,} candidates are worth {worth}. Together they tell "
-            f"{number(float(found['information'][-1]))} nat on average over {found.sizes['draw_number']} draws of what "
-            "is not known. They are in design.csv in their order.",
+            f"{n} chosen of {design['candidates']:,} candidates are worth {worth}. {tell}. They are in design.csv in "
+            "their order.",
             "lead",
         )
-        method = results.study.method
         ax = plots.against_number(found, WORTH[method.criterion])
         drawn = [Picture.drawn(ax, "Chosen observations, and the band of 90 % of random ones.")]
         if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
-            bounds = results.study.model.body.bounds
+            bounds = results.study.specs[0].body.bounds
             drawn.append(Picture.drawn(plots.on_body(found, bounds), "Candidates and chosen points, in their order."))
         yield Pictures(drawn)
         yield _table(results)
+        if "log_bayes_factor" in found:
+            names = [str(name) for name in found["model"].values]
+            cells = found["log_bayes_factor"].to_numpy()
+            rows = [(name, *(number(float(x)) for x in row)) for name, row in zip(names, cells, strict=True)]
+            yield Text("Expected ln Bayes factor (nat) of a model that is true against each other one:")
+            yield Table(("true", *names), rows)
         if "field_variance_told" in found:
             share = number(100 * float(found["field_variance_told"][-1]), 3)
             yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
