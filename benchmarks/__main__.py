@@ -14,6 +14,7 @@ from benchmarks import (
     calibration,
     chaos,
     coverage,
+    designs,
     estimates,
     fields,
     held_out,
@@ -54,6 +55,7 @@ ALL = {
     "calibration": calibration.main,
     "selection": selection.main,
     "population": population.main,
+    "designs": designs.main,
     "streaming": streaming.main,
     "tails": tails.main,
     "stability": stability.main,
@@ -77,6 +79,7 @@ ALL = {
     "indentation": indentation.main,
 }
 WITH_OPTIONS = {
+    "designs": designs.main,
     "calibration": calibration.main,
     "indentation": indentation.main,
     "chaos": chaos.main,

@@ -2,8 +2,8 @@
 
 All candidates together tell AᵀA ≈ UΛUᵀ (`inverse.fields.low_rank`); the row of a candidate in the coordinates U is a
 column of AU, which the search for the pairs has formed anyway. A set S of candidates has A_SᵀA_S ≤ AᵀA, so that what is
-left out of a row, a⊥, adds at most ½ ln(1 + |a⊥|²) to what S tells; its square is found by a few random probes. No row
-of A itself is needed.
+left out of the rows, A⊥, adds at most ½ tr((I + AAᵀ)⁻¹A⊥A⊥ᵀ) to what S tells, which a few random probes z estimate by
+A⊥z (M. F. Hutchinson, Comm. Statist. Simulation Comput. 19 (1990) 433–450). No row of A itself is needed.
 """
 
 from __future__ import annotations
@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from forward.model import ForwardModel
 
 PROBES = 16
+
+
+def left_out(rows: FloatArray, beyond: FloatArray) -> float:
+    """Return what observations tell at most (nat) beyond their rows (n, r), given A⊥z (probes, n) of random z."""
+    inside = np.eye(len(rows)) + rows @ rows.T
+    return float((beyond.T * np.linalg.solve(inside, beyond.T)).sum(axis=0).mean() / 2)
 
 
 def of_field(
@@ -64,7 +70,7 @@ def of_field(
     xarray.Dataset
         `output` (m,), `sigma`, `row` (m, r), zero for goals; `field_goal` (r, r), what the directions add to the mean
         variance of the field, over that of the prior; `goal_row` (q, r) of goals over their prior standard deviation;
-        and `beyond` (m,), what of the squares of the rows is left out, from `PROBES` random directions.
+        and `beyond` (`PROBES`, m), what is left out of the rows along random directions.
     """
     import xarray as xr
 
@@ -86,6 +92,6 @@ def of_field(
             "row": (("value", "direction"), spectrum.images.T),
             "field_goal": (("direction", "other"), (directions * mass) @ directions.T / (mass @ prior.variance)),
             "goal_row": (("goal", "direction"), rows),
-            "beyond": ("value", (point.jvp(probes) ** 2).mean(axis=0)),
+            "beyond": (("probe", "value"), point.jvp(probes)),
         }
     )

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from forward.model import Finding, FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.designs.candidates import Candidates, Each, Values
+from inverse.designs.compared import compared, with_values
 from inverse.designs.criteria import (
     Criterion,
     Information,
@@ -22,6 +23,7 @@ from inverse.designs.criteria import (
     told_along,
 )
 from inverse.designs.discrimination import Discrimination, predicted
+from inverse.designs.fields import left_out
 from inverse.designs.greedy import Choice, choose
 from inverse.designs.linearised import Linearised, scaled
 from inverse.methods.synthesize import SyntheticNoise
@@ -35,11 +37,8 @@ if TYPE_CHECKING:
 
 LEAST = 4  # draws of a model whose predictions have moments
 LITTLE = 0.02  # of what all chosen ones tell: then the next ones repeat what is known
-FARTHER = 6  # times as many random observations as chosen ones
 ALIKE = 0.8  # of what is best for a draw alone, that observations for all draws should tell
 MISSED = 0.05  # of what chosen ones tell: what may be left out without a word
-BAND = (0.05, 0.5, 0.95)
-QUANTILES = ("lower", "median", "upper")
 
 
 class Design(Settings):
@@ -153,7 +152,7 @@ class Design(Settings):
             posterior_std=("parameter", np.mean(left, axis=0)),
             draw=(("draw_number", "parameter"), points[ok]),
         ).assign_coords(parameter=list(inputs.names))
-        return self.with_values(result, values, sigma, candidates)
+        return with_values(result, values, sigma, candidates)
 
     def of_fields(self, draws: Sequence[xr.Dataset], values: Values) -> xr.Dataset:
         """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
@@ -174,17 +173,18 @@ class Design(Settings):
         taken = Variance(told.rows, [one["field_goal"].to_numpy() for one in draws])
         share = list(along(taken, result["chosen"].to_numpy().tolist()))
         chosen = np.isin(candidates.which, result["chosen"].to_numpy())
-        beyond = np.array([one["beyond"].to_numpy() * (one["sigma"].to_numpy() / sigma) ** 2 for one in draws])
-        left_out = float(np.log1p(beyond[:, chosen]).sum(axis=1).mean() / 2)
-        result = result.assign(field_variance_told=("choice", share), left_out=left_out)
+        scale = [one["sigma"].to_numpy()[chosen] / sigma[chosen] for one in draws]
+        beyond = [one["beyond"].to_numpy()[:, chosen] * factor for one, factor in zip(draws, scale, strict=True)]
+        missed = float(np.mean([left_out(row[chosen], more) for row, more in zip(rows, beyond, strict=True)]))
+        result = result.assign(field_variance_told=("choice", share), left_out=missed)
         known = float(result["information"][-1])
-        if left_out > MISSED * known:
+        if missed > MISSED * known:
             text = (
-                f"The chosen observations tell up to {left_out:.2g} nat in directions beyond the {self.rank} that are "
+                f"The chosen observations tell up to {missed:.2g} nat in directions beyond the {self.rank} that are "
                 f"kept, of {known:.3g}. Take a larger method.rank."
             )
             add(result, Finding("warning", text))
-        return self.with_values(result, values, sigma, candidates)
+        return with_values(result, values, sigma, candidates)
 
     def whitened(self, number: int, size: int) -> FloatArray:
         """Draw `number` (size,) of standard normal numbers, for a field; a single one is at the median."""
@@ -306,7 +306,7 @@ class Design(Settings):
                 f"least {4 * (max(len(inputs[name].names) for name in few) + 1)}."
             )
             add(result, Finding("warning", text))
-        return self.with_values(result, values, sigma, candidates)
+        return with_values(result, values, sigma, candidates)
 
     def chosen(self, told: Linearised, candidates: Candidates, costs: FloatArray) -> xr.Dataset:
         """Choose among candidates (c,) with costs (c,), and compare with random choices."""
@@ -335,38 +335,10 @@ class Design(Settings):
         costs: FloatArray,
         worth_along: Callable[[IntArray], FloatArray] | None = None,
     ) -> tuple[Choice, xr.Dataset]:
-        """Choose by a criterion, and say what random candidates are worth.
-
-        Parameters
-        ----------
-        worth_along
-            What the first, the first two, … of candidates in an order (n,) are worth (n,), if there is a shorter way.
-        """
-        import xarray as xr
-
+        """Choose by a criterion, and compare with random choices as `inverse.designs.compared` does."""
         choice = choose(make, costs, number=self.number, budget=self.budget)
-        order, worth = np.array(choice.order), np.cumsum(choice.gains)
-        rng = np.random.default_rng([self.seed, 2])
-        most = min(len(costs), FARTHER * len(order))
-        orders = [rng.permutation(len(costs))[:most] for _ in range(self.random)]
-        short = worth_along or (lambda one: np.array(list(along(make(), one.tolist()))))
-        at_random = np.quantile([short(one) for one in orders], BAND, axis=0)
-        counts = np.flatnonzero(at_random[1] >= worth[-1])
-        return choice, xr.Dataset(
-            {
-                "chosen": ("choice", order),
-                "worth": ("choice", worth),
-                "cost": ("choice", np.cumsum(costs[order])),
-                **{f"random_{name}": ("random_number", line) for name, line in zip(QUANTILES, at_random, strict=True)},
-                "random_equal": float(counts[0] + 1) if len(counts) else np.nan,
-                "candidate_cost": ("candidate", costs),
-                "candidate_place": (("candidate", "axis"), candidates.places),
-                "candidate_case": ("candidate", list(candidates.cases)),
-                "candidate_part": ("candidate", list(candidates.parts)),
-                "looks": choice.looks,
-            },
-            {"candidate": list(candidates.names), "random_number": np.arange(1, most + 1)},
-        )
+        short = worth_along or (lambda order: np.array(list(along(make(), order.tolist()))))
+        return choice, compared(choice, candidates, costs, short, self.random, self.seed)
 
     def _best(self, rows: FloatArray, costs: FloatArray) -> float:
         """What those observations tell that are best at one draw."""
@@ -374,16 +346,6 @@ class Design(Settings):
 
     def _criterion(self, told: Linearised) -> Criterion:
         return Information(told.rows) if self.criterion == "information" else Variance(told.rows, told.goals)
-
-    def with_values(self, found: xr.Dataset, values: Values, sigma: FloatArray, candidates: Candidates) -> xr.Dataset:
-        """Add what the values of the candidates are."""
-        return found.assign(
-            value_candidate=("value", candidates.which),
-            value_sigma=("value", sigma),
-            value_place=(("value", "axis"), values.places),
-            value_case=("value", list(values.case)),
-            value_part=("value", list(values.part)),
-        ).assign_coords(value=list(values.names))
 
     def _doubts(self, told: Linearised, choice: Choice, found: xr.Dataset) -> list[Finding]:
         """Say where draws disagree, and where observations add little."""
