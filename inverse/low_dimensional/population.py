@@ -15,6 +15,9 @@ as wide as π_0, around its mean; standard deviations of the population have hal
 and those of π_0 as scale; correlations have density ∝ det R (Lewandowski, Kurowicka and Joe's with η = 2). m, the
 logarithms of standard deviations and the angles of R are sampled by an ensemble of walkers (J. Goodman, J. Weare,
 Commun. Appl. Math. Comput. Sci. 5 (2010) 65–80).
+
+With covariates x_i of the specimens (grade, region), less their means, the mean of specimen i is m + B x_i. The prior
+of each number of B is normal, of mean 0 and as wide as that of m for a change of x by its standard deviation.
 """
 
 from __future__ import annotations
@@ -116,22 +119,32 @@ class Fit:
         Number of independent draws that they are worth.
     specimens
         What it was fitted to.
+    slopes
+        B (A, d, q), by covariates; None where there are none.
+    covariates
+        x (n, q) of the specimens, less their means; None where there are none.
     """
 
     mean: FloatArray
     covariance: FloatArray
     effective: float
     specimens: tuple[Specimen, ...]
+    slopes: FloatArray | None = None
+    covariates: FloatArray | None = None
 
     @cached_property
     def std(self) -> FloatArray:
         """Standard deviations (A, d)."""
         return np.asarray(np.sqrt(np.einsum("aii->ai", self.covariance)))
 
-    def predictive(self, seed: int) -> FloatArray:
-        """Return a draw (A, d) of a new specimen for each draw of the population."""
+    def at(self, x: FloatArray | None) -> FloatArray:
+        """Return the mean m + B x (A, d) of specimens with covariates x (q,), less the means; m for None."""
+        return self.mean if x is None or self.slopes is None else self.mean + self.slopes @ x
+
+    def predictive(self, seed: int, x: FloatArray | None = None) -> FloatArray:
+        """Return a draw (A, d) of a new specimen, with covariates x (q,), for each draw of the population."""
         normals = np.random.default_rng([seed, 1]).standard_normal(self.mean.shape)
-        return np.asarray(self.mean + np.einsum("aij,aj->ai", np.linalg.cholesky(self.covariance), normals))
+        return np.asarray(self.at(x) + np.einsum("aij,aj->ai", np.linalg.cholesky(self.covariance), normals))
 
     def estimates(self, number: int, seed: int) -> tuple[FloatArray, float]:
         """Return draws (A, d) of a specimen under the population, and the effective size of its weights.
@@ -140,14 +153,15 @@ class Fit:
         """
         one, rng = self.specimens[number], np.random.default_rng([seed, 2, number])
         kernel = one.width**2 * one.covariance
-        logs = _log_kernels(one, self.mean, self.covariance)
+        mean = self.at(None if self.covariates is None else self.covariates[number])
+        logs = _log_kernels(one, mean, self.covariance)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
         weights /= weights.sum(axis=1, keepdims=True)
         chosen = (weights.cumsum(axis=1) < rng.random((len(weights), 1))).sum(axis=1).clip(max=weights.shape[1] - 1)
         kernels = np.broadcast_to(kernel, self.covariance.shape)
         gain = np.swapaxes(np.linalg.solve(self.covariance + kernel, kernels), 1, 2)
         at = one.shrunken[chosen]
-        middle = at + np.einsum("aij,aj->ai", gain, self.mean - at)
+        middle = at + np.einsum("aij,aj->ai", gain, mean - at)
         left = kernel - gain @ kernel
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
         normals = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(values.shape)
@@ -164,7 +178,14 @@ def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> F
     return np.asarray(one.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
 
 
-def fitted(specimens: Sequence[Specimen], prior: Hyperprior, draws: int, seed: int, steps: int = 600) -> Fit:
+def fitted(
+    specimens: Sequence[Specimen],
+    prior: Hyperprior,
+    draws: int,
+    seed: int,
+    steps: int = 600,
+    covariates: FloatArray | None = None,
+) -> Fit:
     """Sample the distribution of a population.
 
     Parameters
@@ -179,29 +200,41 @@ def fitted(specimens: Sequence[Specimen], prior: Hyperprior, draws: int, seed: i
         Of the walkers.
     steps
         Of each walker; the first third is left out.
+    covariates
+        x (n, q) of the specimens, less their means.
     """
     few = tuple(thinned(one, seed) for one in specimens)
     d = len(prior.mean)
     means = np.array([one.mean for one in few])
+    x = np.zeros((len(few), 0)) if covariates is None else covariates
+    lines = np.linalg.lstsq(x, means - means.mean(axis=0), rcond=None)[0]
+    means = means - x @ lines
     spread = np.maximum(means.std(axis=0), np.sqrt(np.mean([np.diag(one.covariance) for one in few], axis=0)) / 4)
-    start = np.concatenate([means.mean(axis=0), np.log(spread), np.zeros(d * (d - 1) // 2)])
-    widths = np.concatenate([spread / 2, np.full(start.size - d, 0.3)])
+    widths = np.concatenate([spread / 2, np.full(d * (d + 1) // 2, 0.3), np.outer(spread / 2, 1 / _sizes(x)).ravel()])
+    start = np.concatenate([means.mean(axis=0), np.log(spread), np.zeros(d * (d - 1) // 2), lines.T.ravel()])
     rng = np.random.default_rng([seed, 0])
     walkers = start + widths * rng.standard_normal((max(32, 4 * start.size), start.size))
-    chain = _walked(walkers, lambda x: _log_posterior(x, few, prior), steps, rng)[steps // 3 :]
+    chain = _walked(walkers, lambda at: _log_posterior(at, few, prior, x), steps, rng)[steps // 3 :]
     worth = min(
         effective(chain[:, :, j].T.ravel(), np.repeat(np.arange(chain.shape[1]), len(chain))) for j in range(start.size)
     )
     flat = chain.reshape(-1, start.size)
     chosen = flat[rng.permutation(len(flat))[:draws]]
-    mean, covariance = _population(chosen, d)
-    return Fit(mean, covariance, min(worth, float(len(chosen))), tuple(specimens))
+    mean, covariance, slopes = _population(chosen, d)
+    known = (None, None) if covariates is None else (slopes, covariates)
+    return Fit(mean, covariance, min(worth, float(len(chosen))), tuple(specimens), *known)
 
 
-def _population(x: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance from the coordinates (A, d + d + d(d − 1)/2) of walkers."""
-    roots = np.exp(x[:, d : 2 * d, None]) * _roots(x[:, 2 * d :], d)[0]
-    return x[:, :d], roots @ np.swapaxes(roots, 1, 2)
+def _sizes(x: FloatArray) -> FloatArray:
+    """Standard deviations (q,) of covariates (n, q)."""
+    return np.asarray(np.sqrt((x**2).mean(axis=0)))
+
+
+def _population(x: FloatArray, d: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean, covariance and slopes from the coordinates (A, d + d + d(d − 1)/2 + d q) of walkers."""
+    ends = d * (d + 3) // 2
+    roots = np.exp(x[:, d : 2 * d, None]) * _roots(x[:, 2 * d : ends], d)[0]
+    return x[:, :d], roots @ np.swapaxes(roots, 1, 2), x[:, ends:].reshape(len(x), d, -1)
 
 
 def _roots(y: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
@@ -226,19 +259,23 @@ def _roots(y: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
     return root, logs
 
 
-def _log_posterior(x: FloatArray, specimens: Sequence[Specimen], prior: Hyperprior) -> FloatArray:
-    """Ln of the density (A,) at coordinates (A, …) of walkers."""
+def _log_posterior(
+    x: FloatArray, specimens: Sequence[Specimen], prior: Hyperprior, covariates: FloatArray
+) -> FloatArray:
+    """Ln of the density (A,) at coordinates (A, …) of walkers, for covariates (n, q)."""
     d = len(prior.mean)
-    mean, covariance = _population(x, d)
-    logs = x[:, d : 2 * d]
+    mean, covariance, slopes = _population(x, d)
+    logs, angles = x[:, d : 2 * d], x[:, 2 * d : d * (d + 3) // 2]
     found = -(((mean - prior.mean) / (WIDER * prior.std)) ** 2).sum(axis=1) / 2
     ratio = np.exp(np.clip(logs - np.log(prior.std), -50, 50))
-    found += (logs - (FREEDOM + 1) / 2 * np.log1p(ratio**2 / FREEDOM)).sum(axis=1) + _roots(x[:, 2 * d :], d)[1]
+    found += (logs - (FREEDOM + 1) / 2 * np.log1p(ratio**2 / FREEDOM)).sum(axis=1) + _roots(angles, d)[1]
+    found -= ((slopes * _sizes(covariates) / (WIDER * prior.std[:, None])) ** 2).sum(axis=(1, 2)) / 2
     possible = np.isfinite(found) & (np.abs(logs - np.log(prior.std)) < 15).all(axis=1)
-    possible &= (np.abs(x[:, 2 * d :]) < 8).all(axis=1)
+    possible &= (np.abs(angles) < 8).all(axis=1)
     found[~possible] = -np.inf
-    for one in specimens:
-        kernels = _log_kernels(one, mean[possible], covariance[possible])
+    for one, row in zip(specimens, covariates, strict=True):
+        there = mean[possible] if not row.size else mean[possible] + slopes[possible] @ row
+        kernels = _log_kernels(one, there, covariance[possible])
         top = kernels.max(axis=1)
         found[possible] += top + np.log(np.exp(kernels - top[:, None]).sum(axis=1))
     return np.asarray(found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from forward.model import Finding, FloatArray
-from forward.settings import Settings
+from forward.settings import Settings, nearest
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, fitted
 from uq.findings import add
 from uq.inputs.draws import Draws
@@ -38,6 +38,11 @@ class Population(Settings):
         The candidate of ``select``: its name, or "best".
     distribution
         "log-normal" (parameters of one sign; of negative ones their size) or "normal", with covariance.
+    covariates
+        What specimens differ in that may move their means, linearly: for each, the numbers of all specimens, or words,
+        by their names: ``grade = { one = 1, two = 3 }``, ``region = { one = "cortex", two = "thalamus" }``.
+    new
+        Covariates of the new specimen; those that are not given are as on average.
     draws
         Draws of the population, of each specimen and of new ones that are kept.
     seed
@@ -50,6 +55,8 @@ class Population(Settings):
     source: str = Field(min_length=1)
     model: str | None = None
     distribution: Literal["normal", "log-normal"] = "log-normal"
+    covariates: dict[str, dict[str, float | str]] = Field(default={})
+    new: dict[str, float | str] = Field(default={})
     draws: Annotated[int, Field(ge=100, le=100_000)] = 1000
     seed: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
@@ -78,9 +85,11 @@ class Population(Settings):
 
         scale = Scale.of(self.distribution, posteriors)
         specimens, hyperprior = scale.specimens(posteriors, prior)
-        fit = fitted(specimens, hyperprior, self.draws, self.seed)
+        columns = Columns.of(self.covariates, list(posteriors))
+        x, at = (columns.values, columns.row(self.new)) if self.covariates else (None, None)
+        fit = fitted(specimens, hyperprior, self.draws, self.seed, covariates=x)
         estimates = [fit.estimates(i, self.seed) for i in range(len(specimens))]
-        new = scale.back(fit.predictive(self.seed))
+        new = scale.back(fit.predictive(self.seed, at))
         own = np.array([np.array(_moments(one)) for one in posteriors.values()])
         together = np.array([scale.back(z) for z, _ in estimates])
         by, each = ("parameter",), ("specimen", "parameter")
@@ -95,7 +104,7 @@ class Population(Settings):
                 "location_std": (by, fit.mean.std(axis=0)),
                 "scale_quantiles": (("quantile", *by), np.quantile(fit.std, QUANTILES, axis=0)),
                 "correlation_quantiles": (("quantile", *pair), np.quantile(correlations, QUANTILES, axis=0)),
-                "typical_quantiles": (("quantile", *by), np.quantile(scale.back(fit.mean), QUANTILES, axis=0)),
+                "typical_quantiles": (("quantile", *by), np.quantile(scale.back(fit.at(at)), QUANTILES, axis=0)),
                 "new_quantiles": (("quantile", *by), np.quantile(new, QUANTILES, axis=0)),
                 "population_draw": (("draw_number", *by), new),
                 "population_effective": ((), fit.effective),
@@ -116,8 +125,99 @@ class Population(Settings):
                 "quantile": list(QUANTILES),
             },
         )
+        if fit.slopes is not None:
+            by_covariate = ("covariate", "parameter")
+            slopes = np.swapaxes(fit.slopes, 1, 2)
+            found = found.assign(
+                slope=(("draw_number", *by_covariate), slopes),
+                slope_quantiles=(("quantile", *by_covariate), np.quantile(slopes, QUANTILES, axis=0)),
+                covariate_value=(("specimen", "covariate"), columns.values + columns.means),
+            ).assign_coords(covariate=list(columns.names))
         add(found, *_findings(fit, list(posteriors), [size for _, size in estimates]))
         return found
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Covariates as numbers: one column for each, or for each word but the first in the alphabet.
+
+    Attributes
+    ----------
+    names
+        Of the columns (q): ``grade``, or ``region = thalamus``.
+    values
+        Numbers (n, q) of the specimens, less their means.
+    means
+        (q,).
+    words
+        For each column the covariate, and the word that is 1 there; None for numbers.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    means: FloatArray
+    words: tuple[tuple[str, str | None], ...]
+
+    @classmethod
+    def of(cls, covariates: Mapping[str, Mapping[str, float | str]], specimens: Sequence[str]) -> Columns:
+        """Return those of specimens.
+
+        Raises
+        ------
+        ValueError
+            If a specimen has none, one is unknown, a covariate mixes numbers and words or is the same for all, or there
+            are too many of them.
+        """
+        words: list[tuple[str, str | None]] = []
+        columns: list[list[float]] = []
+        for name, given in covariates.items():
+            for one in given:
+                if one not in specimens:
+                    message = f"covariates.{name}: '{one}' is not a specimen; {nearest(one, list(specimens))}"
+                    raise ValueError(message)
+            missing = [one for one in specimens if one not in given]
+            if missing:
+                message = f"covariates.{name}: nothing is said of {', '.join(missing)}, expected all specimens"
+                raise ValueError(message)
+            values = [given[one] for one in specimens]
+            texts = {value for value in values if isinstance(value, str)}
+            if texts and len(texts) < len(set(values)):
+                message = f"covariates.{name}: numbers and words, expected either"
+                raise ValueError(message)
+            if len(set(values)) == 1:
+                message = f"covariates.{name}: the same for all specimens, which says nothing on them"
+                raise ValueError(message)
+            for word in sorted(texts)[1:] if texts else [None]:
+                words.append((name, word))
+                columns.append([float(value if word is None else value == word) for value in values])
+        q = len(columns)
+        if q > len(specimens) - 2:
+            message = (
+                f"covariates: {q} numbers to find for each parameter from {len(specimens)} specimens, expected fewer"
+            )
+            raise ValueError(message)
+        table = np.array(columns).reshape(q, len(specimens)).T
+        names = tuple(name if word is None else f"{name} = {word}" for name, word in words)
+        return cls(names, table - table.mean(axis=0), table.mean(axis=0), tuple(words))
+
+    def row(self, given: Mapping[str, float | str]) -> FloatArray:
+        """Return covariates (q,) less the means; errors as in `of`."""
+        known = {name for name, _ in self.words}
+        for name in given:
+            if name not in known:
+                message = f"new: '{name}' is not a covariate; {nearest(name, sorted(known))}"
+                raise ValueError(message)
+        row = np.zeros(len(self.names))
+        for k, (name, word) in enumerate(self.words):
+            if name not in given:
+                continue
+            value = given[name]
+            if isinstance(value, str) == (word is None):
+                wanted = "a number" if word is None else "a word"
+                message = f"new: {name} is {value!r}, expected {wanted}, as of the specimens"
+                raise ValueError(message)
+            row[k] = (float(value) if word is None else float(value == word)) - self.means[k]
+        return row
 
 
 def prior_names(posteriors: Mapping[str, Draws]) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import model_validator
 
 from forward.model import Finding
-from inverse.methods.population import Population, Scale, prior_names
+from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.of_draws import findings_of_few
 from uq.inputs.draws import Draws
 from workflows.config.blocks import Parallel
@@ -108,6 +108,7 @@ class PopulationStudy(StudyKind):
         try:
             posteriors = self.posteriors
             Scale.of(self.method.distribution, posteriors)
+            Columns.of(self.method.covariates, list(posteriors)).row(self.method.new)
             found = sha256((source / "results.nc").read_bytes()).hexdigest()[:LETTERS]
         except (ValueError, StudyError) as error:
             refused("Population", [(place, str(error), self.method.source)])

@@ -1,9 +1,12 @@
 """Populations: closed forms of normal specimens, coverage, and correlation matrices."""
 
+import re
+
 import numpy as np
 import pytest
 
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, _roots, fitted
+from inverse.methods.population import Columns
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 
@@ -33,6 +36,52 @@ def test_the_mean_of_a_population_of_known_specimens_is_theirs():
     assert fit.mean.mean() == pytest.approx(truth.mean(), abs=0.01)
     assert fit.mean.std() == pytest.approx(truth.std() / np.sqrt(40), rel=0.15)
     assert fit.std.mean() == pytest.approx(truth.std(ddof=1), rel=0.1)
+
+
+def test_covariates_move_the_mean_as_a_regression_says():
+    """Known specimens around a line in a grade: slope, its error, what is left, and a new specimen of a grade."""
+    rng = np.random.default_rng(4)
+    grade = np.repeat([1.0, 2.0, 3.0, 4.0], 10)
+    truth = 1 + 0.5 * grade + rng.normal(0, 0.2, 40)
+    specimens = []
+    for one in truth:
+        z = one + 1e-3 * rng.standard_normal((50, 1))
+        specimens.append(Specimen(z, np.full(50, 0.02), np.zeros(50), 50.0))
+    x = (grade - grade.mean())[:, None]
+    fit = fitted(specimens, Hyperprior(np.zeros(1), np.full(1, 2.0)), 1000, 0, steps=300, covariates=x)
+    line = np.polyfit(grade, truth, 1)
+    left = float(np.std(truth - np.polyval(line, grade), ddof=2))
+    assert fit.slopes.mean() == pytest.approx(line[0], abs=0.01)
+    assert fit.slopes.std() == pytest.approx(left / np.linalg.norm(x), rel=0.2)
+    assert fit.std.mean() == pytest.approx(left, rel=0.1)
+    new = fit.predictive(0, np.array([5.0 - grade.mean()]))
+    assert new.mean() == pytest.approx(np.polyval(line, 5.0), abs=0.05)
+    without = fitted(specimens, Hyperprior(np.zeros(1), np.full(1, 2.0)), 1000, 0, steps=300)
+    assert without.std.mean() > 2.5 * left  # the grade is then a part of how specimens vary
+
+
+def test_covariates_are_numbers_or_words():
+    names = ["one", "two", "three", "four"]
+    region = dict(zip(names, ("cortex", "thalamus", "cortex", "corona"), strict=True))
+    found = Columns.of({"region": region}, names)
+    assert found.names == ("region = cortex", "region = thalamus")
+    assert (found.values + found.means).tolist() == [[1, 0], [0, 1], [1, 0], [0, 0]]
+    assert (found.row({"region": "thalamus"}) + found.means).tolist() == [0, 1]
+    assert found.row({}).tolist() == [0, 0]
+    grade = Columns.of({"grade": {"one": 1.0, "two": 2.0, "three": 3.0, "four": 2.0}}, names)
+    assert grade.row({"grade": 4.0}).tolist() == [2.0]
+    for wrong, said in (
+        ({"grade": {"one": 1.0, "tow": 2.0}}, "'tow' is not a specimen; did you mean 'two'?"),
+        ({"grade": {"one": 1.0, "two": 2.0}}, "nothing is said of three, four"),
+        ({"grade": dict.fromkeys(names, 1.0)}, "the same for all specimens"),
+        ({"grade": region | {"one": 1.0}}, "numbers and words"),
+        ({"a": region, "b": region}, "4 numbers to find for each parameter from 4 specimens"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(said)):
+            Columns.of(wrong, names)
+    for new, said in (({"graed": 1.0}, "did you mean 'grade'?"), ({"grade": "high"}, "expected a number")):
+        with pytest.raises(ValueError, match=re.escape(said)):
+            grade.row(new)
 
 
 def test_intervals_hold_what_they_claim():

@@ -39,6 +39,15 @@ class PopulationOfSpecimens(Section):
             correlations = of["correlation_quantiles"]
             cells = [(a, b, _interval(correlations.sel(parameter=a, partner=b))) for a, b in pairs]
             yield Table(("parameter", "with", "correlation"), cells, text=frozenset({0, 1}))
+        if "slope_quantiles" in of:
+            yield Text("How means change with what specimens differ in, by one unit of it:")
+            slopes = of["slope_quantiles"]
+            changes = [
+                (str(by), name, _interval(slopes.sel(covariate=by, parameter=name)))
+                for by in of["covariate"].values
+                for name in results.parameters
+            ]
+            yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
         yield Heading("Its specimens")
         yield Text(
             "By its own data alone, and with what the others say on what specimens are like. The effective number is "
