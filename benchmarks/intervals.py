@@ -71,9 +71,11 @@ files = ["data"]
 
 [predict]
 model = {{ function = "demiray.predicted", jacobian = "demiray.predicted_slopes", outputs = {list(GOALS)} }}
+samples = 12
 
 [method]
 kind = "invert"
+samples = 128
 starts = 1
 """
 

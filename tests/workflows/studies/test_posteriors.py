@@ -531,6 +531,43 @@ def test_a_population_is_an_input_too(selected, tmp_path, monkeypatch):
     assert files[0] == files[1]
 
 
+def test_a_batch_of_inversions_is_a_population(tmp_path, monkeypatch):
+    """Five specimens, whose grade moves one of their numbers; mistakes in covariates are one line each."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "drawn_model", raising=False)
+    (tmp_path / "drawn_model.py").write_text(
+        "def value(p):\n    return [p[0] + 2 * p[1], p[0] / 2 - p[1]]\n"
+        "def slopes(p):\n    return [[1.0, 2.0], [0.5, -1.0]]\n"
+    )
+    (tmp_path / "data").mkdir()
+    truth = {f"s{k}": (1 + 0.2 * k, -1.0 + 0.01 * k) for k in range(5)}
+    for name, (a, b) in truth.items():
+        text = f"output,value,sigma\nu,{a + 2 * b},0.02\nv,{a / 2 - b},0.02\n"
+        (tmp_path / "data" / f"{name}.csv").write_text(text)
+    stated = "outputs = { u = 0.4, v = 0.3 }\nnoise = { absolute = 0.3 }"
+    (tmp_path / "invert.toml").write_text(INVERT.replace(stated, 'files = ["data"]'))
+    assert run(load(tmp_path / "invert.toml"), "invert", tmp_path / "batch", quiet=True, report=False) == 0
+    grades = ", ".join(f"s{k} = {k + 1}" for k in range(5))
+    more = f'distribution = "normal"\ncovariates.grade = {{ {grades} }}\nnew = {{ grade = 7 }}'
+    study = load(population(tmp_path, tmp_path / "batch", more))
+    assert parse(document(study)) == study
+    assert run(study, "population", tmp_path / "population", quiet=True) == 0
+    found = xr.load_dataset(tmp_path / "population" / "results.nc")
+    assert found["specimen"].values.tolist() == list(truth)
+    np.testing.assert_allclose(found["own_mean"], list(truth.values()), atol=0.02)
+    slope = found["slope"].sel(covariate="grade", parameter="a").to_numpy()
+    assert slope.mean() == pytest.approx(0.2, abs=0.03)
+    assert float(found["typical_quantiles"].sel(parameter="a")[1]) == pytest.approx(2.2, abs=0.15)
+    assert "How means change" in (tmp_path / "population" / "report.html").read_text()
+    for wrong, said in (
+        ("covariates.grade = { s0 = 1 }", "nothing is said of s1, s2, s3, s4"),
+        (f"covariates.grade = {{ {grades}, s7 = 1 }}", "'s7' is not a specimen"),
+        ("new = { grade = 1 }", "'grade' is not a covariate"),
+    ):
+        line = mistake(population(tmp_path, tmp_path / "batch", f'distribution = "normal"\n{wrong}'))
+        assert said in line
+
+
 @pytest.mark.parametrize(
     ("source", "more", "said"),
     [
