@@ -133,7 +133,7 @@ def _sphere_by_default(value: Any) -> Any:
 Inclusion = Annotated[Sphere | Ellipsoid, Field(discriminator="kind"), BeforeValidator(_sphere_by_default)]
 INDICATORS: dict[str, Callable[..., Any]] = {"sphere": _sphere, "ellipsoid": _ellipsoid}
 RADII = {"sphere": ("radius", "radius", "radius"), "ellipsoid": ("a", "b", "c")}
-_OPS = SimpleNamespace(ln=np.log, exp=np.exp, sqrt=np.sqrt, tanh=np.tanh, sin=np.sin, cos=np.cos)
+OPS = SimpleNamespace(ln=np.log, exp=np.exp, sqrt=np.sqrt, tanh=np.tanh, sin=np.sin, cos=np.cos)
 
 
 def stiffness_factor(ops: Any, X: Any, kind: str, *, contrast: Any, **shape: Any) -> Any:
@@ -182,7 +182,7 @@ def derived(
         )
         found[f"{path}.volume"] = np.asarray(volume[:, 0])
         if places is not None:
-            factor = factor * stiffness_factor(_OPS, places.T, inclusion.kind, **numbers)
+            factor = factor * stiffness_factor(OPS, places.T, inclusion.kind, **numbers)
     if places is not None:
         columns = np.broadcast_to(factor, (len(points), len(places))).T
         found |= {f"stiffness.{i}": np.array(column) for i, column in enumerate(columns)}

@@ -139,6 +139,27 @@ class Card(Block):
 
 
 @dataclass(frozen=True)
+class Viewer(Block):
+    """A body that turns.
+
+    Attributes
+    ----------
+    label
+        What it is, for those who cannot see it.
+    told, data
+        A scene, as `scene.packed` writes it.
+    stills
+        Pictures for paper, and for browsers that cannot turn it.
+    """
+
+    macro = "viewer"
+    label: str
+    told: str
+    data: str
+    stills: Pictures
+
+
+@dataclass(frozen=True)
 class Code(Block):
     """Text as it is in a file."""
 

@@ -7,7 +7,6 @@ import os
 import pickle
 import subprocess
 import sys
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.model import FloatArray
+from workflows.report.scene.scene import up_of
 from workflows.results.directory import body_grid, mesh_grid
 from workflows.results.tools import surface as tool_surface
 from workflows.results.tools import tools_of
@@ -129,8 +129,8 @@ def body(dataset: xr.Dataset, shown: str = "mean", skin: Skin | None = None) -> 
     plotter.add_mesh(edges, color=DARK, line_width=1.5)
     for tool in () if undeformed else tools_of(dataset):
         plotter.add_mesh(tool_surface(tool, still), color=TOOL, opacity=0.45, smooth_shading=True)
-    _show_lengths(plotter, np.concatenate([still, moved]), _up(dataset))
-    _look(plotter, _up(dataset))
+    _show_lengths(plotter, np.concatenate([still, moved]), up_of(dataset))
+    _look(plotter, up_of(dataset))
     plotter.subplot(1, 0)
     if shown == "dominating":
         _name_colours(plotter, [(i, names[i]) for i in np.unique(dataset["dominating"].astype(int)) if i >= 0])
@@ -157,7 +157,7 @@ def mesh(dataset: xr.Dataset, shown: str = "mesh") -> Any:
     """
     import pyvista
 
-    grid, up = mesh_grid(dataset).pyvista(), _up(dataset)
+    grid, up = mesh_grid(dataset).pyvista(), up_of(dataset)
     density = grid.cell_data["indicator by volume"] * grid.volume
     grid.cell_data["colour"] = np.log10(np.maximum(density, 1e-3 * density.max()))
     plotter: Any = pyvista.Plotter(
@@ -215,20 +215,6 @@ def _moved(mesh: Any, motion: str) -> Any:
     found = mesh.copy()
     found.points = mesh.points + mesh.point_data[motion]
     return found
-
-
-def _up(dataset: xr.Dataset) -> FloatArray:
-    """Return the axis (3,) that points up: against gravity, otherwise z (y if the body is a sheet across z)."""
-    points = dataset["node_position" if "node_position" in dataset else "mesh_vertex_position"].to_numpy()
-    extents = np.ptp(points, axis=0)
-    up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
-    model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
-    for load in model.get("loads", ()):
-        if load["kind"] == "gravity":
-            down = np.array(load["direction"])
-            axis = int(np.argmax(np.abs(down)))
-            up = -np.sign(down[axis]) * np.eye(3)[axis]
-    return up
 
 
 def _sides(up: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -14,11 +14,12 @@ from workflows.config.mistakes import StudyError, lines
 from workflows.config.report import Report, located
 from workflows.config.study import parse
 from workflows.report import comparison
-from workflows.report.blocks import Block, Folded, Heading, Html, Text
+from workflows.report.blocks import Block, Folded, Heading, Html, Text, Viewer
 from workflows.report.section import SECTIONS, Results, Section, sections
 from workflows.results.directory import read_dataset, read_summary, write_text
 from workflows.run import own_code
 
+HERE = Path(__file__).parent
 TOP = ("answer", "findings", "body")  # sections of the first screen
 Parts = list[tuple[str, list[Block]]]  # sections by their names
 
@@ -107,18 +108,22 @@ def _read(directory: Path) -> Results:
 def render(title: str, parts: Parts) -> str:
     """Write sections as one page of HTML."""
     import jinja2
+    import markupsafe
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(HERE),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    markup = [block for _, blocks in parts for block in _inside(blocks) if isinstance(block, Html)]
+    blocks = [block for _, found in parts for block in _inside(found)]
+    markup = [block for block in blocks if isinstance(block, Html)]
     return environment.get_template("report.html.jinja").render(
         title=title,
         groups=_grouped(parts),
+        asset=lambda name: markupsafe.Markup((HERE / "assets" / name).read_text(encoding="utf-8")),
+        turning=any(isinstance(block, Viewer) for block in blocks),
         styles=dict.fromkeys(block.style for block in markup if block.style),
         scripts=dict.fromkeys(block.script for block in markup if block.script),
     )

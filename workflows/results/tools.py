@@ -52,12 +52,31 @@ def surface(tool: Indenter, points: FloatArray) -> Any:
     """
     import pyvista
 
+    if tool.shape == "plane":
+        centre, extent = middle(tool, points)
+        return pyvista.Plane(
+            center=[float(x) for x in centre], direction=tool.along, i_size=1.1 * extent, j_size=1.1 * extent
+        )
+    low, high = around(tool, points)
+    spacing = (high - low) / (POINTS - 1)
+    lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(low))
+    lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
+    return lattice.contour([0.0], scalars="gap")
+
+
+def middle(tool: Indenter, points: FloatArray) -> tuple[FloatArray, float]:
+    """Return where (3,) a plane at its depth is nearest to the middle of points (n, 3), and how far these reach (m)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    d = np.array(tool.along)
+    tip = np.array(tool.at) + tool.depth * d
+    return tip + (np.eye(3) - np.outer(d, d)) @ ((low + high) / 2 - tip), float((high - low).max())
+
+
+def around(tool: Indenter, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners (3,) of a box around the part of a tool, at its depth, that is drawn beside points (n, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent, d = float((high - low).max()), np.array(tool.along)
     tip = np.array(tool.at) + tool.depth * d
-    if tool.shape == "plane":
-        middle = tip + (np.eye(3) - np.outer(d, d)) @ ((low + high) / 2 - tip)
-        return pyvista.Plane(center=middle, direction=d, i_size=1.1 * extent, j_size=1.1 * extent)
     half = min(1.2 * (tool.radius or np.inf), SHOWN * extent)
     ahead = 0.05 * half
     lengths = np.full(3, half)
@@ -66,6 +85,7 @@ def surface(tool: Indenter, points: FloatArray) -> Any:
         lengths = np.maximum(lengths, along * (extent / 2 + 0.2 * half))
         tip = tip + np.outer(tool.axis, tool.axis) @ ((low + high) / 2 - tip) / np.dot(tool.axis, tool.axis)
     centre = tip - (half - ahead) * d
+<<<<<<< HEAD
     spacing = 2 * lengths / (POINTS - 1)
     lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(centre - lengths))
     lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
@@ -76,3 +96,6 @@ def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
     """Return the surface of a tool, in triangles."""
     triangles = surface(tool, points).triangulate()
     return Grid(np.asarray(triangles.points), triangles.regular_faces, TRIANGLE)
+=======
+    return centre - lengths, centre + lengths
+>>>>>>> 34a817b (Bodies turn in reports, and sliders move them, by a small viewer of our own; pictures for paper need no OpenGL)

@@ -166,15 +166,15 @@ def density(one: xr.Dataset, unit: str) -> tuple[Sequence[float], tuple[float, f
         if len(values) < LEAST or np.ptp(values) <= 1e-12 * np.abs(values).max():
             return (), (0.0, 1.0), ("", "")
         at, curve = smooth(values)
-    return _curve(at, curve, middle(one)[:2], unit)
+    return _curve(at, curve, middle(one)[:2], unit, float(one["mean"]))
 
 
 def _curve(
-    at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str
+    at: FloatArray, curve: FloatArray, inside: tuple[float, float], unit: str, value: float
 ) -> tuple[Sequence[float], tuple[float, float], tuple[str, str]]:
     low, high = float(at[0]), float(at[-1])
     a, b = (float(np.clip((x - low) / (high - low), 0, 1)) for x in inside)
-    words = interval(low, high, unit, max(abs(low), abs(high)))
+    words = interval(low, high, unit, value)
     cut = " to " if " to " in words else "–"
     left, _, right = words.partition(cut)
     return [float(y) for y in curve], (a, b), (left, right)
@@ -280,7 +280,7 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
         lines.append(f"truth {quantity(float(one['true']), std, unit)}, {inside}")
     if "draw" in one and one["draw"].ndim == 1:
         at, curve = smooth(one["draw"].to_numpy())
-        return Answer(spoken(name), quantity(mean, std, unit), lines, *_curve(at, curve, (lower, upper), unit))
+        return Answer(spoken(name), quantity(mean, std, unit), lines, *_curve(at, curve, (lower, upper), unit, mean))
     return Answer(spoken(name), quantity(mean, std, unit), lines)
 
 
@@ -345,7 +345,7 @@ def population(results: Results) -> Card:
             f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
             f"specimens differ by {spread_} (one standard deviation)",
         ]
-        shown = _curve(at, curve, (new[0], new[2]), unit)
+        shown = _curve(at, curve, (new[0], new[2]), unit, mid)
         answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, *shown))
     return Card(question, answers)
 

@@ -1,0 +1,416 @@
+"""What is shown of a body: its surface, quantities on it, what is inside and beside it, as data for viewer.js."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from forward.bodies.inclusions import INDICATORS, OPS
+from forward.model import FloatArray
+from workflows.report.readable import spoken
+from workflows.report.scene.pack import Packer
+from workflows.report.scene.skin import IntArray, Skin, level, skin, split, tetrahedra
+from workflows.report.scene.sliders import Sliders, sliders
+from workflows.results.points import has_points, measured_points
+from workflows.results.tools import around, middle, tools_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.terms.indenter import Indenter
+
+DERIVATIVES_SHOWN = 6  # parameters whose effect on the body is shown
+MAPS_SHOWN = 6  # parameters whose indices are
+SMALL = 20_000  # nodes of bodies that are sent whole, so that they can be cut
+DRAWS_SHOWN = 6  # posterior draws of an inclusion
+FINE, COARSE = 1e-6, 2e-5  # of an array's largest number: rounding, of small and large bodies
+COLOURS = {"inside": "#d1622b", "truth": "#2f8f4e", "draw": "#8e5bb5", "tool": "#6b7480"}
+
+
+class Quantity(NamedTuple):
+    """Numbers (n,) at the nodes, by which a body is coloured; between `low` and `high`, if these are given."""
+
+    name: str
+    values: FloatArray
+    unit: str = "1"
+    colours: str = "viridis"
+    low: float | None = None
+    high: float | None = None
+    still: bool = False
+    names: Sequence[str] = ()
+    std: bool = False
+
+
+class Inside(NamedTuple):
+    """A surface inside or beside the body: of nodes of its mesh, or at its own points (n, 3)."""
+
+    name: str
+    triangles: IntArray
+    points: FloatArray | None
+    kind: str
+    opacity: float = 1.0
+    shown: bool = True
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A body and what is to be seen of it.
+
+    Attributes
+    ----------
+    points, cells, kind
+        Its mesh (n, 3), (c, k), and the kind of cell of VTK.
+    up
+        The direction (3,) that points up.
+    motion
+        Displacements (n, 3) of the nodes (m); zero if the body is shown where it was.
+    quantities
+        The first one is shown first.
+    insides
+        Surfaces inside and beside the body.
+    arrows
+        Places (p, 3), vectors (p, 3) (m) and sizes (p,) of residuals by name.
+    sliders
+        What the body does when parameters are moved.
+    """
+
+    points: FloatArray
+    cells: IntArray
+    kind: int
+    up: FloatArray
+    motion: FloatArray
+    quantities: Sequence[Quantity]
+    insides: Sequence[Inside] = ()
+    arrows: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
+    sliders: Sliders | None = None
+    motion_name: str = ""
+
+    @property
+    def skin(self) -> Skin:
+        """Its surface."""
+        return skin(self.points, self.cells, self.kind)
+
+
+def forward_scene(dataset: xr.Dataset, study: Any = None) -> Scene:
+    """Return the scene of a body that was deformed by its loads."""
+    points, cells, kind = _mesh(dataset)
+    mean = "field_mean" if "field_mean" in dataset else "field_nominal"
+    return Scene(
+        points,
+        cells,
+        kind,
+        up_of(dataset),
+        dataset[mean].to_numpy(),
+        list(_quantities(dataset, mean)),
+        [*_regions(dataset, points, cells, kind), *_inclusions_of(dataset, study, points), *_tools(dataset, points)],
+        sliders=None if study is None else sliders(dataset, study),
+        motion_name="its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters",
+    )
+
+
+def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
+    """Return the scene of a specimen that was inverted: its stiffness, inclusions, and measured points."""
+    points, cells, kind = _mesh(one)
+    inclusions = getattr(study.model, "inclusions", ())
+    names = [str(name) for name in one["parameter"].values]
+    insides = []
+    box = points.min(axis=0), points.max(axis=0)
+    for inclusion in inclusions:
+        of = _numbers(inclusion, names, one["mean"].to_numpy())
+        insides.append(_ball(f"{inclusion.label}, posterior mean", inclusion, of, box, "inside"))
+        if np.isfinite(one["true"]).any():
+            values = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
+            truth = _numbers(inclusion, names, values)
+            insides.append(_ball(f"{inclusion.label}, truth", inclusion, truth, box, "truth", 0.45, shown=False))
+        if "draw" in one:
+            draws = one["draw"].to_numpy()
+            parts = [
+                _ball("", inclusion, _numbers(inclusion, names, draw), box, "draw")
+                for draw in draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]
+            ]
+            insides.append(_joined(f"{inclusion.label}, {len(parts)} posterior draws", parts, "draw", 0.2))
+    return Scene(
+        points,
+        cells,
+        kind,
+        up_of(one),
+        np.zeros_like(points),
+        list(_stiffness(one)),
+        [*_regions(one, points, cells, kind), *insides],
+        dict(_arrows(one)),
+    )
+
+
+def up_of(dataset: xr.Dataset) -> FloatArray:
+    """Return the axis (3,) that points up: against gravity, otherwise z (y if the body is a sheet across z)."""
+    points = dataset["node_position" if "node_position" in dataset else "mesh_vertex_position"].to_numpy()
+    extents = np.ptp(points, axis=0)
+    up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
+    model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
+    for load in model.get("loads", ()):
+        if load["kind"] == "gravity":
+            down = np.array(load["direction"])
+            axis = int(np.argmax(np.abs(down)))
+            up = -np.sign(down[axis]) * np.eye(3)[axis]
+    return up
+
+
+def outline(tool: Indenter, points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return points (n, 3) and triangles (t, 3) of the surface of a tool at its depth, beside points of a body."""
+    if tool.shape != "plane":
+        return level(tool.gaps, *around(tool, points), 40)
+    centre, extent = middle(tool, points)
+    d = np.array(tool.along)
+    one = np.cross(d, np.eye(3)[int(np.abs(d).argmin())])
+    one *= 0.55 * extent / np.linalg.norm(one)
+    other = np.cross(d, one) / np.linalg.norm(d)
+    corners = centre + np.array([one + other, other - one, -one - other, one - other])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _mesh(dataset: xr.Dataset) -> tuple[FloatArray, IntArray, int]:
+    cells = dataset["cell_nodes"]
+    return dataset["node_position"].to_numpy(), cells.to_numpy().astype(np.int64), int(cells.attrs["vtk_cell_type"])
+
+
+def _size(values: Any) -> FloatArray:
+    return np.asarray(np.linalg.norm(np.asarray(values), axis=-1))
+
+
+def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
+    name = "Mean displacement" if mean == "field_mean" else "Displacement at the mean parameters"
+    yield Quantity(name, _size(of[mean]), "m")
+    if "field_std" in of:
+        yield Quantity("Standard deviation of the displacement", _size(of["field_std"]), "m", "plasma", std=True)
+    if f"{mean}_mesh_error" in of:
+        yield Quantity("Error of the mesh in the displacement", _size(of[f"{mean}_mesh_error"]), "m", "plasma")
+    if "field_mean_error" in of:
+        yield Quantity("Sampling error of the mean displacement", _size(of["field_mean_error"]), "m", "plasma")
+    names = of["parameter"].to_numpy() if "parameter" in of.coords else np.zeros(0, dtype=str)
+    if "field_derivative" in of:
+        effects = of["field_derivative_rms"] * of["parameter_std"]
+        for parameter in names[np.argsort(-effects.to_numpy())][:DERIVATIVES_SHOWN]:
+            values = of["field_derivative"].sel(parameter=parameter) * float(
+                of["parameter_std"].sel(parameter=parameter)
+            )
+            yield Quantity(f"Displacement by one standard deviation of {parameter}, to first order", _size(values), "m")
+    if "dominating" in of:
+        strongest = names[np.argsort(-of["field_sobol_total"].to_numpy())][:MAPS_SHOWN]
+        for parameter in strongest:
+            for which, word in (("total", "Total"), ("first", "First-order")):
+                shares = of[f"node_sobol_{which}"].sel(parameter=parameter).to_numpy()
+                label = f"{word} index of the displacement for {parameter}"
+                yield Quantity(label, shares, colours="cividis", low=0.0, high=1.0)
+        label = "The parameter with the largest total index"
+        yield Quantity(label, of["dominating"].to_numpy().astype(float), names=[spoken(str(n)) for n in names])
+    if "factor" in of:
+        for which in of["random_field"].to_numpy():
+            factors = of["factor"].sel(random_field=which).to_numpy()
+            low, high = float(factors.min()), float(factors.max())
+            for i, realisation in enumerate(factors):
+                label = f"Realisation {i + 1} of the random factor '{which}'"
+                yield Quantity(label, realisation, colours="cividis", low=low, high=high, still=True)
+
+
+def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
+    if "stiffness_mean" not in one:
+        yield Quantity("The body", np.zeros(one.sizes["node"]))
+        return
+    mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
+    factors = np.exp(mean)
+    known = np.isfinite(one["stiffness_true"].to_numpy()).all() if "stiffness_true" in one else False
+    truth = np.exp(one["stiffness_true"].to_numpy()) if known else factors
+    low, high = (
+        float(f(factors.min(), truth.min()) if f is min else f(factors.max(), truth.max())) for f in (min, max)
+    )
+    yield Quantity("Stiffness factor, posterior mean", factors, low=low, high=high)
+    yield Quantity("± of ln stiffness, one posterior standard deviation", std, colours="plasma", low=0.0)
+    if "stiffness_prior_std" in one:
+        share = std / np.maximum(one["stiffness_prior_std"].to_numpy(), 1e-300)
+        yield Quantity("± after the data over ± before", share, colours="plasma", low=0.0, high=1.0)
+    if known:
+        yield Quantity("Stiffness factor, truth", truth, low=low, high=high)
+        off = np.where(std > 0, (mean - one["stiffness_true"].to_numpy()) / np.maximum(std, 1e-300), 0.0)
+        yield Quantity(
+            "Mean minus truth over the posterior standard deviation", off, colours="coolwarm", low=-3.0, high=3.0
+        )
+
+
+def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> Iterator[Inside]:
+    """Regions that are not the whole body; the largest is what the others are in."""
+    if "cell_region" not in of:
+        return
+    numbers = of["cell_region"].to_numpy()
+    counts = {k: int((numbers == k).sum()) for k in np.unique(numbers)}
+    largest = max(counts, key=lambda k: counts[k])
+    for k, count in counts.items():
+        if k != largest and count > 0:
+            name = str(of["region"].values[k]) if k >= 0 else "the rest"
+            yield Inside(f"region {name}", skin_triangles(points, cells[numbers == k], kind), None, "inside")
+
+
+def skin_triangles(points: FloatArray, cells: IntArray, kind: int) -> IntArray:
+    """Return the triangles (t, 3) between nodes of the surface of cells."""
+    found = skin(points, cells, kind)
+    return found.nodes[found.triangles]
+
+
+def _tools(of: xr.Dataset, points: FloatArray) -> Iterator[Inside]:
+    for tool in tools_of(of):
+        at, triangles = outline(tool, points)
+        yield Inside(f"tool {tool.label}", triangles, at, "tool", 0.5)
+
+
+def _inclusions_of(of: xr.Dataset, study: Any, points: FloatArray) -> Iterator[Inside]:
+    """Inclusions of a deformed body, with the means of what is random; where they were before it moved."""
+    if study is None or "parameter" not in of.coords:
+        return
+    names, means = [str(name) for name in of["parameter"].values], of["parameter_mean"].to_numpy()
+    box = points.min(axis=0), points.max(axis=0)
+    for inclusion in getattr(study.model, "inclusions", ()):
+        yield _ball(inclusion.label, inclusion, _numbers(inclusion, names, means), box, "inside")
+
+
+def _numbers(inclusion: Any, names: Sequence[str], values: FloatArray) -> dict[str, float]:
+    path = f"inclusions.{inclusion.label}"
+    own = inclusion.model_dump(exclude={"kind", "name", "contrast"})
+    return {
+        key: float(values[names.index(f"{path}.{key}")]) if f"{path}.{key}" in names else value
+        for key, value in own.items()
+    }
+
+
+def _ball(
+    name: str,
+    inclusion: Any,
+    numbers: Mapping[str, float],
+    box: tuple[FloatArray, FloatArray],
+    kind: str,
+    opacity: float = 1.0,
+    *,
+    shown: bool = True,
+) -> Inside:
+    """The surface where the indicator of an inclusion is ½, within the body."""
+    radii = [numbers[r] for r in ("radius",) if r in numbers] or [numbers[r] for r in "abc"]
+    centre, reach = np.array([numbers[axis] for axis in "xyz"]), 1.15 * max(radii)
+    low, high = np.maximum(centre - reach, box[0] - 0.1 * reach), np.minimum(centre + reach, box[1] + 0.1 * reach)
+    if (low >= high).any():
+        return Inside(name, np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), kind, opacity, shown)
+    indicator = INDICATORS[inclusion.kind]
+    at, triangles = level(lambda x: 0.5 - indicator(OPS, x.T, **numbers), low, high, 20)
+    return Inside(name, triangles, at, kind, opacity, shown)
+
+
+def _joined(name: str, parts: Sequence[Inside], kind: str, opacity: float) -> Inside:
+    triangles, points, first = [], [], 0
+    for part in parts:
+        assert part.points is not None
+        triangles.append(part.triangles + first)
+        points.append(part.points)
+        first += len(part.points)
+    return Inside(name, np.concatenate(triangles), np.concatenate(points), kind, opacity, shown=False)
+
+
+def _arrows(one: xr.Dataset) -> Iterator[tuple[str, tuple[FloatArray, FloatArray, FloatArray]]]:
+    if "place" not in one or not has_points(one):
+        return
+    for case in measured_points(one):
+        if len(case.places):
+            yield case.case, (case.places, case.residuals, case.over)
+
+
+def ends(quantity: Quantity) -> tuple[float, float]:
+    """Return the numbers at both ends of the colours of a quantity; lengths begin with zero."""
+    finite = quantity.values[np.isfinite(quantity.values)]
+    low = quantity.low
+    if low is None:
+        low = 0.0 if quantity.unit == "m" else float(finite.min(initial=np.inf))
+    high = quantity.high if quantity.high is not None else float(finite.max(initial=-np.inf))
+    return low, high if high > low else low + 1.0
+
+
+# --- as text ---------------------------------------------------------------------------------------------------------
+
+
+def packed(scene: Scene) -> tuple[str, str]:
+    """Return what viewer.js reads: a description as JSON, and the arrays as one text."""
+    pack, whole = Packer(), len(scene.points) <= SMALL
+    surface = scene.skin
+    meshed = [inside for inside in scene.insides if inside.points is None]
+    if whole:
+        kept = np.arange(len(scene.points))
+    else:
+        kept = np.unique(np.concatenate([surface.nodes, *(inside.triangles.ravel() for inside in meshed)]))
+    number = np.full(len(scene.points), -1)
+    number[kept] = np.arange(len(kept))
+    fine = FINE if len(kept) <= SMALL else COARSE
+    extent = float(np.ptp(scene.points, axis=0).max())
+
+    def triangles(of: Skin) -> dict[str, int]:
+        return {"triangles": pack.add(of.triangles), "nodes": pack.add(number[of.nodes])}
+
+    told: dict[str, Any] = {
+        "up": scene.up.tolist(),
+        "extent": extent,
+        "points": pack.add(scene.points[kept], fine * extent),
+        "skin": triangles(surface),
+        "edges": pack.add(number[surface.edges]) if len(surface.edges) else None,
+        "cells": pack.add(number[tetrahedra(scene.cells, scene.kind)]) if whole else None,
+        "motion": pack.field(scene.motion[kept], fine) if scene.motion.any() else None,
+        "quantities": [],
+        "insides": [],
+        "arrows": [],
+    }
+    for q in scene.quantities:
+        if not np.isfinite(q.values).any():
+            continue
+        low, high = ends(q)
+        told["quantities"].append(
+            {
+                "name": q.name,
+                "unit": q.unit,
+                "colours": q.colours,
+                "low": low,
+                "high": high,
+                "still": q.still,
+                "std": q.std,
+                "names": list(q.names),
+                "values": pack.add(q.values[kept]) if q.names else pack.field(q.values[kept], max(fine, 1e-5)),
+            }
+        )
+    for inside in scene.insides:
+        if not len(inside.triangles):
+            continue
+        mine = split(scene.points if inside.points is None else inside.points, inside.triangles)
+        entry = {
+            "name": inside.name,
+            "colour": COLOURS[inside.kind],
+            "opacity": inside.opacity,
+            "shown": inside.shown,
+            "outside": inside.kind == "tool",
+            "triangles": pack.add(mine.triangles),
+        }
+        if inside.points is None:
+            entry["nodes"] = pack.add(number[mine.nodes])
+        else:
+            entry["points"] = pack.add(inside.points[mine.nodes], 1e-5 * extent)
+        told["insides"].append(entry)
+    for name, (places, vectors, sizes) in scene.arrows.items():
+        told["arrows"].append(
+            {
+                "name": name,
+                "places": pack.add(places, 1e-5 * extent),
+                "vectors": pack.field(vectors, 1e-5),
+                "sizes": pack.field(sizes, 1e-4),
+            }
+        )
+    if scene.sliders is not None:
+        told["sliders"] = scene.sliders.packed(pack, kept)
+    told["arrays"] = pack.told
+    # A "<" could end the script that holds it.
+    return json.dumps(told, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"), pack.text()

@@ -1,0 +1,184 @@
+"""Surfaces of meshes as triangles between their nodes, and surfaces where a function is zero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from forward.model import FloatArray
+
+IntArray = NDArray[np.int64]
+HEXAHEDRA = (12, 29, 72)  # kinds of cells of VTK
+SHARP = np.cos(np.radians(40))  # of the angle between faces from which an edge is one
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+# The corners of each face, seen from outside against the clock.
+QUADRILATERALS = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (3, 7, 6, 2), (0, 4, 7, 3), (1, 2, 6, 5))
+TRIANGLES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+# Six tetrahedra around a diagonal of a hexahedron.
+SIX = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A surface of triangles whose vertices are nodes of a mesh.
+
+    Attributes
+    ----------
+    triangles
+        Vertices (t, 3), seen from outside against the clock.
+    nodes
+        The node (v,) of each vertex; a node on a sharp edge is several vertices, one for each smooth part.
+    edges
+        Nodes (e, 2) of the sharp edges.
+    """
+
+    triangles: IntArray
+    nodes: IntArray
+    edges: IntArray
+
+
+def skin(points: FloatArray, cells: IntArray, kind: int) -> Skin:
+    """Return the surface of cells (c, k) of a kind of VTK, with nodes (n, 3)."""
+    if not len(cells):
+        none = np.zeros((0, 3), dtype=np.int64)
+        return Skin(none, np.zeros(0, dtype=np.int64), none[:, :2])
+    return split(points, outer(cells, faces(points, cells, kind)))
+
+
+def faces(points: FloatArray, cells: IntArray, kind: int) -> list[tuple[IntArray, IntArray]]:
+    """Return for each face of a cell its corners, and its triangles (t, 3) between all its nodes; numbers in the cell.
+
+    Where the nodes of a cell of higher degree are on its edges and faces is found from their places in the first
+    cell: cells of a body have straight sides, and nodes at equal distances.
+    """
+    count, hexahedral = cells.shape[1], kind in HEXAHEDRA
+    degree = 1
+    while ((degree + 1) ** 3 if hexahedral else (degree + 1) * (degree + 2) * (degree + 3) // 6) < count:
+        degree += 1
+    at = points[cells[0]]
+    size = np.ptp(at, axis=0).max()
+
+    def number(weights: FloatArray) -> int:
+        distances = np.linalg.norm(at - weights @ at[: len(weights)], axis=1)
+        nearest = int(distances.argmin())
+        assert distances[nearest] < 0.2 * size / degree, "the nodes of a cell are not where they are expected"
+        return nearest
+
+    found = []
+    for corners in QUADRILATERALS if hexahedral else TRIANGLES:
+        numbers: dict[tuple[int, int], int] = {}
+        for i, j in product(range(degree + 1), repeat=2):
+            if not hexahedral and i + j > degree:
+                continue
+            x, y = i / degree, j / degree
+            weights = np.zeros(8 if hexahedral else 4)
+            own = [(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y] if hexahedral else [1 - x - y, x, y]
+            weights[list(corners)] = own
+            numbers[i, j] = number(weights)
+        triangles = []
+        for i, j in product(range(degree), repeat=2):
+            square = [numbers.get(at_) for at_ in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))]
+            if square[1] is None or square[3] is None:
+                continue
+            if square[2] is None:
+                triangles.append([square[0], square[1], square[3]])
+            elif hexahedral and (i + j) % 2 == 0:  # diagonals that meet in the middle
+                triangles += [[square[0], square[1], square[2]], [square[0], square[2], square[3]]]
+            else:
+                triangles += [[square[0], square[1], square[3]], [square[1], square[2], square[3]]]
+        found.append((np.array(corners), np.array(triangles)))
+    return found
+
+
+def outer(cells: IntArray, faces_: list[tuple[IntArray, IntArray]]) -> IntArray:
+    """Return the triangles (t, 3) of the faces that belong to one cell only."""
+    keys = np.concatenate([np.sort(cells[:, corners], axis=1) for corners, _ in faces_])
+    _, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    single = (counts[inverse.ravel()] == 1).reshape(len(faces_), len(cells))
+    parts = [cells[alone][:, triangles].reshape(-1, 3) for (_, triangles), alone in zip(faces_, single, strict=True)]
+    return np.concatenate(parts)
+
+
+def split(points: FloatArray, triangles: IntArray) -> Skin:
+    """Make vertices of the nodes of triangles (t, 3): shared where the surface is smooth."""
+    count = len(triangles)
+    normals = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    corner = (3 * np.arange(count)[:, None] + [0, 1, 1, 2, 2, 0]).reshape(-1, 2)
+    owner = np.repeat(np.arange(count), 3)
+    flipped = ends[:, 0] > ends[:, 1]
+    ends, corner = (np.where(flipped[:, None], x[:, ::-1], x) for x in (ends, corner))
+    order = np.lexsort(ends.T[::-1])
+    ends, corner, owner = ends[order], corner[order], owner[order]
+    first = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
+    smooth = (normals[owner[first]] * normals[owner[first + 1]]).sum(axis=1) > SHARP
+    joined = first[smooth]
+    a, b = corner[joined].ravel(), corner[joined + 1].ravel()
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(3 * count, 3 * count))
+    vertices, of_corner = connected_components(graph, directed=False)
+    nodes = np.zeros(vertices, dtype=np.int64)
+    nodes[of_corner] = triangles.ravel()
+    # Neighbours next to each other: their differences are small, and compress well.
+    rank = np.empty(vertices, dtype=np.int64)
+    ordered = np.argsort(nodes, kind="stable")
+    rank[ordered] = np.arange(vertices)
+    lonely = np.ones(len(ends), dtype=bool)
+    lonely[joined] = lonely[joined + 1] = False
+    return Skin(rank[of_corner].reshape(-1, 3), nodes[ordered], np.unique(ends[lonely], axis=0))
+
+
+def tetrahedra(cells: IntArray, kind: int) -> IntArray:
+    """Return tetrahedra (t, 4) between the corners of cells."""
+    return cells[:, SIX].reshape(-1, 4) if kind in HEXAHEDRA else cells[:, :4]
+
+
+def level(
+    distance: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray, count: int = 28
+) -> tuple[FloatArray, IntArray]:
+    """Return the points (n, 3) and triangles (t, 3) where a function of places (n, 3) is zero, within a box.
+
+    By marching tetrahedra on a lattice of `count` points along each axis; inside, the function is negative.
+    """
+    axes = [np.linspace(low[i], high[i], count) for i in range(3)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    values = np.asarray(distance(lattice), dtype=float)
+    values = np.where(values == 0, 1e-300, values)
+    numbers = np.arange(count**3).reshape(count, count, count)
+    starts = numbers[:-1, :-1, :-1].ravel()
+    corner_steps = np.array([numbers[tuple(corner)] for corner in CORNERS])
+    cells = starts[:, None] + corner_steps
+    signs = values[cells] < 0
+    cells = cells[signs.any(axis=1) & ~signs.all(axis=1)]
+    four = tetrahedra(cells, 12)
+    inside = values[four] < 0
+    counts = inside.sum(axis=1)
+    pairs: list[IntArray] = []
+    for how_many in (1, 3):
+        chosen = counts == how_many
+        odd = np.argsort(inside[chosen] != (how_many == 1), axis=1, kind="stable")  # the one that differs comes first
+        t = np.take_along_axis(four[chosen], odd, axis=1)
+        pairs.append(np.stack([t[:, [0, 1]], t[:, [0, 2]], t[:, [0, 3]]], axis=1))
+    chosen = counts == 2
+    t = np.take_along_axis(four[chosen], np.argsort(~inside[chosen], axis=1, kind="stable"), axis=1)
+    pairs.append(np.stack([t[:, [0, 2]], t[:, [0, 3]], t[:, [1, 3]]], axis=1))
+    pairs.append(np.stack([t[:, [0, 2]], t[:, [1, 3]], t[:, [1, 2]]], axis=1))
+    ends = np.sort(np.concatenate(pairs).reshape(-1, 2), axis=1)
+    unique, inverse = np.unique(ends, axis=0, return_inverse=True)
+    v = values[unique]
+    share = v[:, 0] / (v[:, 0] - v[:, 1])
+    points = lattice[unique[:, 0]] + share[:, None] * (lattice[unique[:, 1]] - lattice[unique[:, 0]])
+    triangles = inverse.reshape(-1, 3)
+    # Outward is where the function grows.
+    normal = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
+    middle, step = points[triangles].mean(axis=1), 1e-3 * float(np.linalg.norm(high - low))
+    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    ahead, behind = (np.asarray(distance(middle + s * step * normal / length)) for s in (1, -1))
+    triangles[ahead < behind] = triangles[ahead < behind][:, ::-1]
+    return points, triangles

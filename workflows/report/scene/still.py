@@ -1,0 +1,127 @@
+"""Pictures of bodies that need neither scripts nor a graphics library: for paper, and where no browser turns them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from forward.model import FloatArray
+from workflows.report.readable import scale
+from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
+from workflows.report.scene.skin import IntArray
+
+SIZE = (7.2, 4.8)  # inches
+DPI = 110
+LIGHT = np.array([0.25, 0.5, 0.83])  # from the viewer
+LEAST = 0.6  # brightness of a face that looks away from it
+CATEGORIES = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#bcbd22", "#17becf")
+STILL = "#c9ced4"  # of nodes without a number
+TRANSPARENT = 0.28
+
+
+def still(scene: Scene, quantity: Quantity) -> bytes:
+    """Draw a body, deformed and coloured, as a PNG: triangles from far to near."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=SIZE, layout="constrained")
+    FigureCanvasAgg(figure)
+    ax = figure.add_subplot()
+    view, skin = looking(scene.up), scene.skin
+    one, unit = scale(float(np.nanmax(np.abs(quantity.values), initial=0.0)), quantity.unit)
+    colours, norm = _colours(quantity, one)
+    moved = scene.points + (0 if quantity.still else scene.motion)
+    triangles = skin.nodes[skin.triangles]
+    with np.errstate(invalid="ignore"):
+        values = quantity.values[triangles] / one
+        of_faces = values[:, 0] if quantity.names else values.mean(axis=1)
+    rgb = np.where(np.isfinite(of_faces)[:, None], colours(norm(np.nan_to_num(of_faces)))[:, :3], _rgb(STILL))
+    inner = [inside for inside in scene.insides if inside.shown and len(inside.triangles)]
+    hidden = any(inside.kind == "inside" for inside in inner)
+    faces = [
+        _faces(
+            (moved if inside.points is None else inside.points) @ view.T,
+            inside.triangles,
+            np.tile(_rgb(COLOURS[inside.kind]), (len(inside.triangles), 1)),
+            inside.opacity,
+            culled=False,
+        )
+        for inside in inner
+    ]
+    faces.append(_faces(moved @ view.T, triangles, rgb, TRANSPARENT if hidden else 1.0, culled=True))
+    # From far to near; a transparent skin is in front of what is inside.
+    layers = [faces[:-1], faces[-1:]] if hidden else [faces]
+    corners, paints = (
+        np.concatenate([np.concatenate([one_[k] for one_ in layer])[_far_first(layer)] for layer in layers])
+        for k in (0, 1)
+    )
+    before = (scene.points @ view.T)[:, :2]
+    if scene.motion.any() and not quantity.still:
+        ax.add_collection(LineCollection(list(before[skin.edges]), colors="#9aa5b1", linewidths=0.8))
+    edges = "none" if hidden else paints
+    flat = corners[:, :, :2]
+    ax.add_collection(PolyCollection(flat, facecolors=paints, edgecolors=edges, linewidths=0.3))
+    places = np.concatenate([flat.reshape(-1, 2), before])
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = 0.03 * (high - low).max()
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
+    ax.axis("off")
+    bar = figure.colorbar(mpl.cm.ScalarMappable(norm, colours), ax=ax, shrink=0.7, pad=0.02)
+    bar.set_label((quantity.name + ("" if unit == "1" else f" ({unit})")).replace("$", r"\$"), fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    if quantity.names:
+        bar.set_ticks(range(-1, len(quantity.names)), labels=["–", *(n.replace("$", r"\$") for n in quantity.names)])
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DPI)
+    return file.getvalue()
+
+
+def _rgb(colour: str) -> FloatArray:
+    from matplotlib.colors import to_rgb
+
+    return np.array(to_rgb(colour))
+
+
+def _colours(quantity: Quantity, one: float) -> tuple[Any, Any]:
+    """Return the map of the colours of a quantity, and its ends, in units that are `one` in SI units."""
+    import matplotlib as mpl
+    from matplotlib.colors import ListedColormap, Normalize
+
+    count = len(quantity.names)
+    if count:
+        names = ListedColormap([STILL, *(CATEGORIES[i % len(CATEGORIES)] for i in range(count))])
+        return names, Normalize(-1.5, count - 0.5)
+    low, high = ends(quantity)
+    return mpl.colormaps[quantity.colours], Normalize(low / one, high / one)
+
+
+def _faces(
+    points: FloatArray, triangles: IntArray, rgb: FloatArray, alpha: float, *, culled: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return corners (t, 3, 3) and colours (t, 4) of triangles in the light; `culled`: of those seen from outside."""
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    seen = normals[:, 2] > 0 if culled else np.ones(len(corners), dtype=bool)
+    light = LEAST + (1 - LEAST) * np.abs(normals[seen] @ LIGHT)
+    paints = np.column_stack([rgb[seen] * light[:, None], np.full(int(seen.sum()), alpha)])
+    return corners[seen], np.clip(paints, 0, 1)
+
+
+def _far_first(layer: Sequence[tuple[FloatArray, FloatArray]]) -> IntArray:
+    return np.argsort(np.concatenate([corners[:, :, 2].mean(axis=1) for corners, _ in layer]), kind="stable")
+
+
+def looking(up: FloatArray) -> FloatArray:
+    """Return the directions (3, 3) to the right, up and towards the viewer, who is in front, to the right and above."""
+    right = np.eye(3)[1 if up[0] else 0]
+    towards = np.cross(right, up) + 0.6 * right + 0.4 * up
+    towards /= np.linalg.norm(towards)
+    side = np.cross(up, towards)
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(towards, side), towards])
