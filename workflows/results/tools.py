@@ -85,17 +85,10 @@ def around(tool: Indenter, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         lengths = np.maximum(lengths, along * (extent / 2 + 0.2 * half))
         tip = tip + np.outer(tool.axis, tool.axis) @ ((low + high) / 2 - tip) / np.dot(tool.axis, tool.axis)
     centre = tip - (half - ahead) * d
-<<<<<<< HEAD
-    spacing = 2 * lengths / (POINTS - 1)
-    lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(centre - lengths))
-    lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
-    return lattice.contour([0.0], scalars="gap")
+    return centre - lengths, centre + lengths
 
 
 def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
     """Return the surface of a tool, in triangles."""
     triangles = surface(tool, points).triangulate()
     return Grid(np.asarray(triangles.points), triangles.regular_faces, TRIANGLE)
-=======
-    return centre - lengths, centre + lengths
->>>>>>> 34a817b (Bodies turn in reports, and sliders move them, by a small viewer of our own; pictures for paper need no OpenGL)
