@@ -291,3 +291,48 @@ def test_meshes_do_not_matter():
         found = LowRankPosterior.at(mode.point, rank=100)
         rows.append([mode.solves, mode.products + found.spectrum.products, found.determined, found.spectrum.values[0]])
     np.testing.assert_allclose(*rows, rtol=0.2)
+
+
+# --- forces alone ----------------------------------------------------------------------------------------------------
+
+
+def test_a_field_is_felt_from_forces_alone():
+    """Palpation at four places: mode and variance are those of dense algebra, and the stiff side is found."""
+    ball = {"kind": "indenter", "shape": "sphere", "radius": 0.8, "on": "z-max", "direction": (0, 0, -1), "depth": 0.08}
+    at = [(x, y) for x in (0.25, 0.75) for y in (0.25, 0.75)]
+    cases = tuple(
+        {
+            "name": f"place-{number}",
+            "clamp": ("z-min",),
+            "loads": (ball | {"at": (x, y, 0.5)},),
+            "outputs": ({"kind": "force", "name": "force"},),
+        }
+        for number, (x, y) in enumerate(at)
+    )
+    field = {"of": "stiffness", "length": 0.5, "std": 0.5, "basis": "nodes"}
+    body = {"size": (1.0, 1.0, 0.5), "cells": (4, 4, 2), "degree": 1}
+    spec = small(body=body, cases=cases, observed=(), fields=(field,))
+    prior, names = spec.fields[0].prior(spec.body), spec.coefficients
+    model = spec.build(MPI.COMM_SELF, names)
+    places = model.vertices.coordinates
+    true = np.where(places[:, 0] > 0.5, 0.6, -0.3)
+    assert len(true) == len(names) == 75
+    data = model.solve(true).outputs
+    sigma = 0.03 * data
+    posterior = FieldPosterior(model, data * (1 + 0.03 * np.array([1, -1, 0.5, -0.5])), sigma, prior)
+    mode = find_mode(posterior)
+    found = LowRankPosterior.at(mode.point, cutoff=1e-8)
+    assert mode.converged
+    values = mode.point.values
+    J = model.solve(values).adjoint(np.eye(4))
+    root = prior.root(np.eye(75))  # rows L e_i
+    covariance = root.T @ root
+    gap = (posterior.data - mode.point.solution.outputs) / sigma**2
+    np.testing.assert_allclose(
+        values, covariance @ J.T @ gap, atol=2e-3 * np.abs(values).max()
+    )  # where the search ends
+    exact = np.linalg.inv(np.linalg.inv(covariance) + J.T @ np.diag(sigma**-2.0) @ J)
+    np.testing.assert_allclose(found.std, np.sqrt(np.diag(exact)), rtol=1e-4)
+    top = places[:, 2] > 0.4
+    stiff, soft = (values[top & side].mean() for side in (places[:, 0] > 0.6, places[:, 0] < 0.4))
+    assert stiff - soft > 0.4  # of 0.9: what four forces leave open is the prior's
