@@ -53,7 +53,8 @@ class Synthesize(Settings):
     missing
         Share of the components that are missing in addition.
     format
-        Of the files of displacements: tables, or clouds of points with a file in TOML that says what they are.
+        Of the files of displacements: tables, or clouds of points with a file in TOML that says what they are, or
+        surfaces before and after ("stl", of the vertices of boundaries that are observed).
     units
         Unit of their lengths.
     frame
@@ -66,7 +67,7 @@ class Synthesize(Settings):
     noise: SyntheticNoise
     fraction: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(default=(1.0,), min_length=1)
     missing: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    format: Literal["csv", "vtu", "vtk", "ply", "xdmf"] = "csv"
+    format: Literal["csv", "vtu", "vtk", "ply", "xdmf", "stl"] = "csv"
     units: str = "m"
     frame: Given | None = None
     seed: Annotated[int, Field(ge=0)] = 0

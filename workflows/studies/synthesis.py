@@ -33,6 +33,7 @@ from workflows.config.report import Report
 from workflows.studies.job import MethodJob
 from workflows.studies.predictions import duration, formulation, times_of
 from workflows.studies.study import StudyKind
+from workflows.studies.synthetic_surfaces import facets_among, surfaces
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -168,7 +169,20 @@ class Synthesis(SynthesisStudy):
         if self.method.format != "csv" and any(case.outputs for case in self.model.cases):
             message = "outputs of load cases are written to tables, expected 'csv'"
             yield ("method", "format"), message, self.method.format
+        if self.method.format == "stl":
+            yield from self._mistakes_of_surfaces()
         yield from super()._mistakes()
+
+    def _mistakes_of_surfaces(self) -> Iterator[Mistake]:
+        """Find what pairs of surfaces cannot hold."""
+        method = self.method
+        if not any(item.on is not None for item in self.model.observed):
+            yield ("model", "observed"), "surfaces are of boundaries, expected { on = ... }", ()
+        if method.missing > 0 or min(method.fraction) < 1:
+            yield ("method", "format"), "surfaces have all their points, expected fraction = 1 and missing = 0", "stl"
+        if method.noise.absolute is None:
+            message = "one standard deviation is stated of all surfaces, expected absolute errors"
+            yield ("method", "noise"), message, method.noise.model_dump(exclude_none=True)
 
 
 def head(study: SynthesisStudy) -> str:
@@ -242,15 +256,8 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
         values, sigma = one["values"].values / unit, one["sigma"].values / unit
         if method.format != "csv":
             arrays = _arrays(study, values, sigma, (points, cases, axes))
-            where = frame / unit
-            texts[f"{label}.{method.format}"] = _cloud(where[arrays.pop("number")], arrays, method.format)
-            texts[f"{label}.toml"] = tomli_w.dumps(
-                {
-                    "file": f"{label}.{method.format}",
-                    "units": method.units,
-                    "truth": {path: truth[path] for path in varies},
-                }
-            )
+            truths = {path: truth[path] for path in varies}
+            texts |= _described(study, label, (places, frame / unit), arrays, truths)
             continue
         said = "" if method.units == "m" else f" [{method.units}]"
         heads = [f"{head}{said}" for head in ("x", "y", "z", "ux", "uy", "uz", "sigma")]
@@ -273,6 +280,37 @@ def synthetic_files(study: Synthesis, name: str, found: xr.Dataset, model: Any) 
                 file.write(f"{empty}{case_name},{output},{value:.8g},{error:.4e}\n")
         texts[f"{label}.csv"] = file.getvalue()
     return texts
+
+
+def _described(
+    study: Synthesis,
+    label: str,
+    where: tuple[FloatArray, FloatArray],
+    arrays: dict[str, NDArray[Any]],
+    truth: Mapping[str, float],
+) -> dict[str, str]:
+    """Return the texts of a cloud, or of surfaces, and of the file in TOML that says what they are.
+
+    Parameters
+    ----------
+    label
+        With which names begin.
+    where
+        Places (m, 3) of all outputs on the body (m), and in the unit and the frame of the files.
+    arrays
+        As of `_arrays`, in the unit of the files.
+    truth
+        What is known, by path.
+    """
+    method, number = study.method, arrays.pop("number")
+    on_body, places = (one[number] for one in where)
+    if method.format == "stl":
+        motions = {case.name: arrays[f"displacement_{case.name}"] for case in study.model.cases}
+        more = {"units": method.units, "sigma": method.noise.absolute, "truth": truth}
+        return surfaces(label, places, motions, facets_among(study.specimen.body, on_body), more)
+    file = f"{label}.{method.format}"
+    said = tomli_w.dumps({"file": file, "units": method.units, "truth": truth})
+    return {file: _cloud(places, arrays, method.format), f"{label}.toml": said}
 
 
 def _arrays(

@@ -326,6 +326,31 @@ def test_synthetic_scans_are_read_again(tmp_path, form):
     np.testing.assert_allclose(rows.along[rows.axes == 0], [turned((0, 0, 5.0))[:, 0]] * (rows.axes == 0).sum())
 
 
+def test_synthetic_surfaces_are_read_again(tmp_path):
+    """Pairs of STL files in mm: differences of corners are the displacements that were made; mistakes in a line."""
+    changes = ["model.body.cells=[2,2,2]", "method.fraction=[1.0]", 'method.format="stl"', 'method.units="mm"']
+    changes += ["method.noise={absolute=1e-3}", "method.frame={rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}"]
+    (tmp_path / "made.toml").write_text(MADE)
+    assert run_study(load(tmp_path / "made.toml", changes), "made", tmp_path / "out", quiet=True, report=False) == 0
+    made = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
+    (tmp_path / "few.toml").write_text(FEW.replace('files = ["data"]', 'files = ["out/data"]'))
+    registration = 'data.registration={kind="given", rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}'
+    (measurement,) = load(tmp_path / "few.toml", [registration]).measurements
+    rows, values = measurement.observations.components(), made["values"].to_numpy()
+    assert len(np.unique(rows.places.round(6), axis=0)) == len(rows.values) / 3 / len(np.unique(rows.cases))
+    gaps = np.abs(rows.values[:, None] - values).min(axis=1)
+    assert gaps.max() < 1e-9  # m, of displacements of centimetres
+    np.testing.assert_array_equal(rows.sigma, 1e-3)
+    assert measurement.on_surface
+    for wrong, said in (
+        ("method.fraction=[0.5]", "surfaces have all their points"),
+        ("method.noise={relative=0.1}", "expected absolute errors"),
+        ("model.observed=[{at=[[1.0, 0.5, 0.5]]}]", "surfaces are of boundaries"),
+    ):
+        with pytest.raises(StudyError, match=said):
+            load(tmp_path / "made.toml", [*changes, wrong])
+
+
 def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
     """Turned by 5°, shifted by 10 mm, in mm, with a missing component; and a wider one if that is uncertain."""
     place = folder / "turned"

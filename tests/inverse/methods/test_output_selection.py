@@ -9,6 +9,7 @@ import xarray as xr
 from forward.conformance import check_derivatives
 from forward.model import FunctionModel
 from inverse.data.measured_model import MeasuredModel
+from tests.rubber import CONFIGS
 from workflows.__main__ import main
 from workflows.config.study import StudyError, document, load, parse
 
@@ -196,3 +197,21 @@ def test_bodies_are_looked_at_on_finer_meshes(tmp_path):
         assert found["mesh_checked"].to_numpy().all()
         assert np.isfinite(found["mesh_log_evidence"]).all()
         np.testing.assert_allclose(found["prediction_mean"], 0.03, rtol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.fem
+def test_a_shipped_curve_of_force_compares_materials(tmp_path):
+    """Two of the four: the error of their meshes is corrected, both explain the curve, and neither is ruled out."""
+    text = (CONFIGS / "indentation-material.toml").read_text(encoding="utf-8")
+    first, last = (text.index(f"[candidates.{name}]") for name in ("mooney-rivlin", "demiray"))
+    text = (text[:first] + text[last:]).replace("data/", f"{CONFIGS}/data/")
+    (tmp_path / "study.toml").write_text(text)
+    assert main(["run", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out"), "--quiet", "--no-report"]) == 0
+    found = xr.load_dataset(tmp_path / "out" / "results.nc")
+    assert found["trusted"].all()
+    assert found["mesh_corrected"].any()
+    assert (found["misfit_probability"] > 0.05).all()
+    assert abs(float(np.diff(found["log_evidence"])[0])) < 3
+    C1, a = (found["constant_mean"].sel(parameter=f"material.{name}").max() for name in ("C1", "a"))
+    assert [2 * float(C1), float(a)] == pytest.approx([1600, 1600], rel=0.08)  # stiffness at rest
