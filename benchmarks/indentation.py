@@ -1,8 +1,9 @@
 """Rigid tools: closed forms on a large block, large strains against another code, random indentations, and their cost.
 
-Options: ``--meshes 40,0.6,6 …`` for the closed forms, side and first edge over the radius in contact and cells along an
-edge (none leaves these tables out), ``--random 1000`` for the
-number of random indentations, ``--kept FILE`` for those that are finished: the same command goes on with them.
+Options: ``--tables closed-forms cost …`` for some of the tables (none leaves all out), ``--shapes sphere …`` and
+``--meshes 40,0.2,1.6 …`` for the closed forms (size and first edge over the radius in contact, growth),
+``--random 1000`` for the number of random indentations, ``--kept FILE`` for those that are finished: the same command
+goes on with them.
 """
 
 from __future__ import annotations
@@ -11,23 +12,20 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.integrate import trapezoid
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
 
 from benchmarks.axisymmetric import indented
+from benchmarks.half_spaces import C1, CONTACT, D1, DEPTH, MESHES, TOOLS, Mesh, closed_forms
 from benchmarks.indentations import random
+from benchmarks.organ_indentation import phases
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, ReferenceSolution
-from forward.terms.indenter import Indenter
 
-C1, D1 = 1e3, 2e3  # ν = 2/7
-CONTACT, DEPTH = 1e-3, 2e-6  # radius in contact and depth (m) of the closed forms
 SIDE = 20e-3
 PATHS = {
     "material": ("material.C1",),
@@ -63,84 +61,6 @@ def quarter(
         ],
     }
     return Hyperelastic.model_validate(blocks | more)
-
-
-def half_space(tool: Indenter, modulus: float) -> float:
-    """Force (N) on a half-space by a tool with its own profile f(r): L. A. Galin; I. N. Sneddon, 1965.
-
-    δ = ∫ f'(r) a/√(a² − r²) dr and F = 2E* ∫ f'(r) r²/√(a² − r²) dr over the radius a of the area in contact, so what
-    differs from Hertz's sphere, a punch and a cone (rounded edges and tips) is no error here.
-    """
-    end = min(0.999999 * (tool.radius or 1.0), 20 * CONTACT)
-    r = end * np.sin(np.linspace(0, np.pi / 2, 4001))
-    heights = np.array([_height(tool, one) for one in r])
-    slope = PchipInterpolator(r, heights).derivative()
-    angles = np.linspace(0, np.pi / 2, 20001)
-
-    def of(a: float) -> tuple[float, float]:
-        slopes = slope(a * np.sin(angles))
-        return a * trapezoid(slopes, angles), 2 * modulus * a**2 * trapezoid(slopes * np.sin(angles) ** 2, angles)
-
-    radius = brentq(lambda a: of(a)[0] - tool.depth, 1e-3 * CONTACT, end)
-    return float(of(radius)[1])
-
-
-def _height(tool: Indenter, r: float) -> float:
-    """How far (m) the surface of a tool lies behind its tip, at a distance r (m) from its axis."""
-    d = np.array(tool.along)
-    beside = np.array(tool.at) + tool.depth * d + np.array([r, 0.0, 0.0])
-    return float(brentq(lambda t: float(tool.gaps((beside - t * d)[None])[0]), -1e-6, 1e-1, xtol=1e-15))
-
-
-def closed_forms(meshes: list[str]) -> None:
-    """Forces over those on a half-space, on blocks of several sizes and meshes, and what they tend to."""
-    angle = math.atan(math.pi / 2 * CONTACT / DEPTH)
-    tools: dict[str, dict[str, Any]] = {
-        "sphere": {"radius": CONTACT**2 / DEPTH},
-        "flat": {"radius": CONTACT, "edge": CONTACT / 20},
-        "cone": {"angle": math.degrees(angle), "tip": CONTACT / 20},
-    }
-    sys.stdout.write(
-        "Force over that on a half-space; quarter of a block: side and first edge over the radius in contact, cells\n"
-    )
-    for shape, numbers in tools.items():
-        ratios = {}
-        for mesh in meshes:
-            side, first, n = (float(part) for part in mesh.split(","))
-            growth = brentq(lambda g: (g**n - 1) / (g - 1) - side / first, 1.01, 10.0)  # noqa: B023 - used at once
-            grading = growth ** (n - 1)
-            spec = quarter(side * CONTACT, (int(n),) * 3, grading, {"shape": shape, "depth": DEPTH, **numbers})
-            tool: Any = spec.loads[0]
-            model = spec.build(MPI.COMM_SELF, ())
-            start = time.process_time()
-            found = model.solve(np.zeros(0))
-            seconds = time.process_time() - start
-            ratios[side, first] = ratio = 4 * found.outputs[0] / half_space(tool, spec.contact_modulus)
-            into = model.equations.penetrations()["indenter"] / DEPTH
-            sys.stdout.write(
-                f"{shape:6s} side {side:3g}, first edge {first:4g}, {spec.unknowns:7,d} unknowns: {ratio:.4f}; "
-                f"penetration {into:.1e} of the depth; {found.work.factorisations} factors, {seconds:.1f} s\n"
-            )
-            sys.stdout.flush()
-        _tend_to(shape, ratios)
-
-
-def _tend_to(shape: str, ratios: dict[tuple[float, float], float]) -> None:
-    """Print what blocks and cells do: errors of blocks fall with 1/side, those of meshes with the first edge."""
-    pairs = [(p, q) for p in ratios for q in ratios if p[1] == q[1] and p[0] < q[0]]
-    smallest = min(side for side, _ in ratios)
-    meshes = sorted((edge, ratio) for (side, edge), ratio in ratios.items() if side == smallest)
-    if not pairs or len(meshes) < 2:
-        return
-    p, q = pairs[-1]
-    of_block = (ratios[p] - ratios[q]) / (1 / p[0] - 1 / q[0]) / smallest
-    (fine, there), (coarse, here) = meshes[:2]
-    limits = [there - (here - there) / ((coarse / fine) ** order - 1) - of_block for order in (2, 1)]
-    of_mesh = there - of_block - limits[0]
-    sys.stdout.write(
-        f"{shape:6s} the block of {smallest:g} adds {of_block:+.4f}, the finest mesh on it {of_mesh:+.4f}; "
-        f"without both {limits[0]:.4f} (errors of the mesh of order 2) or {limits[1]:.4f} (of order 1)\n"
-    )
 
 
 def rough(cells: int = 5) -> None:
@@ -205,16 +125,22 @@ def cost(draws: int = 8) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print all tables."""
+    """Print the tables that are asked for."""
+    tables: dict[str, Callable[[], None]] = {
+        "closed-forms": lambda: closed_forms(options.meshes, options.shapes),
+        "rough": rough,
+        "large-strains": large_strains,
+        "cost": cost,
+        "phases": phases,
+    }
     parser = argparse.ArgumentParser(prog="python -m benchmarks indentation")
-    parser.add_argument("--meshes", nargs="*", default=["40,0.6,6", "40,0.4,8", "40,0.27,10", "80,0.4,9"])
+    parser.add_argument("--tables", nargs="*", choices=tables, default=list(tables))
+    parser.add_argument("--shapes", nargs="*", choices=TOOLS, default=list(TOOLS))
+    parser.add_argument("--meshes", nargs="*", type=Mesh.read, default=MESHES)
     parser.add_argument("--random", type=int, default=1000)
     parser.add_argument("--kept", type=Path, default=Path("indentations.jsonl"))
     options = parser.parse_args(arguments or [])
-    if options.meshes:
-        closed_forms(options.meshes)
-        rough()
-        large_strains()
-    cost()
+    for name in options.tables:
+        tables[name]()
     if options.random:
         random(options.random, options.kept)

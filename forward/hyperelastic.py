@@ -18,7 +18,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from forward import adapt as adaptive
 from forward.adapt import Adapt
-from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_points
+from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_points, unit_vector
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
@@ -410,7 +410,12 @@ class Hyperelastic(ModelSpec):
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Findings before anything is solved, for values of parameters within ranges, by their paths."""
-        return (*dict.fromkeys((*self.findings, *too_far(self.body, ranges))), *self.locking(ranges))
+        of_loads: list[Finding] = []
+        for load in self.loads:
+            own = f"loads.{load.label}."
+            numbers = {path.removeprefix(own): ends for path, ends in ranges.items() if path.startswith(own)}
+            of_loads += load.findings_over(self.body, numbers) if numbers else ()
+        return (*dict.fromkeys((*self.findings, *of_loads, *too_far(self.body, ranges))), *self.locking(ranges))
 
     def textbook(self) -> Self:
         """Return the same problem solved by Newton's method from zero, with a new factor for every step."""
@@ -550,12 +555,21 @@ class Hyperelastic(ModelSpec):
             if getattr(load, "on", "") in self.body.boundaries:
                 for field, said, given in load.mistakes(self.body, alone=alone):
                     yield ("loads", i, field), said, given
+                if load.contact and not self._gives_way(load):
+                    message = "this boundary is held where the tool presses on it, expected one that can move"
+                    yield ("loads", i, "on"), message, getattr(load, "on", "")
         if free := self._free:
             message = f"nothing holds the body along {', '.join(free)}, expected a clamp or prescribed displacements"
             yield ("clamp",), message, ()
         elif not any_unknown and not self._held_against_turning():
             message = "nothing stops the body from turning, expected a clamp or more prescribed displacements"
             yield ("displacements",), message, ()
+
+    def _gives_way(self, tool: Any) -> bool:
+        """Whether the boundary that a tool may touch can move along its direction."""
+        held = {axis for item in self.displacements if item.on == tool.on for axis in item.components}
+        free = [d for d, axis in zip(unit_vector(tool.direction), "xyz", strict=True) if axis not in held]
+        return tool.on not in self.clamp and any(free)
 
     @property
     def _bounds(self) -> str:
@@ -568,7 +582,10 @@ class Hyperelastic(ModelSpec):
             on, at, tool = (getattr(output, name, None) for name in ("on", "at", "tool"))
             if tool is not None and tool not in tools:
                 hint = nearest(tool, tools) if tools else "no load is an indenter"
-                yield ("outputs", i, "tool"), f"unknown tool; {hint}", tool
+                if "tool" in output.model_fields_set:
+                    yield ("outputs", i, "tool"), f"unknown tool; {hint}", tool
+                else:
+                    yield ("outputs", i, "tool"), f"which tool? {hint}", {}
             if output.of_held and on in self.body.boundaries and on not in held:
                 yield ("outputs", i, "on"), "nothing holds this boundary, expected one that is clamped or moved", on
             if at is not None and not holds(self.body, at):

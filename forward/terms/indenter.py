@@ -10,6 +10,7 @@ where the body enters a tool further all the same, it is raised by steps of a fa
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -408,8 +409,7 @@ class Indenter(Term):
             )
             yield "at", message, list(self.at)
             return
-        behind = tip - np.outer([1e-3, 0.01, 0.05], extent * d)
-        if (np.linalg.norm(body.nearest(behind) - behind, axis=1) < 1e-9 * extent).any():
+        if _behind(body, tip, d, extent):
             message = f"the tool starts inside the body, which lies behind its tip at {listed(self.at)} m as it points"
             yield "direction", message, list(self.direction)
         elif alone and self.depth > 0:
@@ -438,6 +438,32 @@ class Indenter(Term):
                 "Refine the mesh there, or give it a rounder edge."
             )
             yield Finding("warning", text)
+
+    def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+        """Find samples, at the ends of ranges, in which it starts deep in the body, misses it or goes through it."""
+        stated = {name: scalar.value for name, scalar in self.scalars.items()}
+        own = {name: ends for name, ends in ranges.items() if name in stated and name != "friction"}
+        found: dict[str, tuple[float, str]] = {}
+        for ends in itertools.product(*own.values()):
+            numbers = stated | dict(zip(own, ends, strict=True))
+            if not any(numbers[name] for name in POINTING):
+                continue
+            inside, left = self.entered(body, numbers | {"depth": 0.0}), -self.entered(body, numbers)
+            tip, d = np.array([numbers[axis] for axis in "xyz"]), np.array(self.pointing(tools.NUMPY, numbers))
+            extent = float(sum(abs(d) * [high - low for low, high in body.bounds]))
+            far = numbers["depth"] - extent if self.shape != "plane" else 0.0
+            away = extent if inside <= tolerance(body) and _behind(body, tip, d, extent) else 0.0
+            where = ", ".join(f"{name} = {value:.3g}" for name, value in zip(own, ends, strict=True))
+            for what, size, least in (
+                ("starts {:.3g} m inside the body, which counts as a deeper push", inside, self.depth),
+                ("stays {:.3g} m off the body, and its force is 0", left, 0.0),
+                ("goes {:.3g} m through the body, for which there is no answer", far, 0.0),
+                ("points away from the body, in which it starts", away, 0.0),
+            ):
+                if size > max(least + tolerance(body), found.get(what, (0.0, ""))[0]):
+                    found[what] = size, where
+        for what, (size, where) in found.items():
+            yield Finding("warning", f"In some samples loads.{self.label} {what.format(size)}: at {where}.")
 
     def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
         """Return where it holds the body along its direction: a plane all of its boundary, others at their tip."""
@@ -476,6 +502,12 @@ class Indenter(Term):
             self.axis
         ) * np.linalg.norm(self.direction):
             yield "the axis of a cylinder lies along its direction, expected one across it"
+
+
+def _behind(body: Body, tip: FloatArray, d: FloatArray, extent: float) -> bool:
+    """Whether the body lies behind the tip (m) of a tool that points along d."""
+    behind = tip - np.outer([1e-3, 0.01, 0.05], extent * d)
+    return bool((np.linalg.norm(body.nearest(behind) - behind, axis=1) < 1e-9 * extent).any())
 
 
 def _dot(a: Any, b: Any) -> Any:

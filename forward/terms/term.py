@@ -166,6 +166,10 @@ class Term(Named):
         """Find what may be wrong on a body before anything is solved."""
         return iter(())
 
+    def findings_over(self, body: Body, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
+        """Find what may be wrong where its numbers are parameters, from their ranges by name."""
+        return iter(())
+
     def holds(self, body: Body) -> list[tuple[Vector, Vector]]:
         """Return points (m) of the body and the directions in which it holds them, be it from one side only."""
         return []

@@ -42,3 +42,29 @@ def test_what_holds_at_several_steps_is_said_once():
         Finding("warning", said.format("area.1", 7)),
         Finding("warning", "force.1 and force.2 differ by 1."),
     ]
+
+
+@pytest.mark.parametrize(
+    ("said", "shorter"),
+    [
+        (
+            "It errs by: force.1 18%, area.1 22%, force.2 21%, area.2 23%, force.3 20%, area.3 20%. So.",
+            "It errs by: force 21% (step 2, the largest of steps 1 to 3), "
+            "area 23% (step 2, the largest of steps 1 to 3). So.",
+        ),
+        (
+            "At: force.1 = 3,184 N, there 2; area.1 = 1 m; force.2 = −9,184 N, there 3; force.3 = 1e3 N, there 4.",
+            "At: force = −9,184 N, there 3 (step 2, the largest of steps 1 to 3); area.1 = 1 m.",
+        ),
+        ("They do not agree for force.1, force.2, force.3: why?", "They do not agree for force at steps 1 to 3: why?"),
+        ("They do not agree for force.1, force.2: why?", "They do not agree for force.1, force.2: why?"),
+        ("force.1 is small, force.2 is odd, force.3 is large.", "force.1 is small, force.2 is odd, force.3 is large."),
+    ],
+)
+def test_lists_of_many_steps_say_where_it_is_most(said, shorter):
+    names = [f"{name}.{step}" for step in (1, 2, 3) for name in ("force", "area")]
+    axes = {"output_of": ("output", ["force", "area"] * 3), "step": ("output", [1, 1, 2, 2, 3, 3])}
+    dataset = xr.Dataset(coords={"output": names, **axes})
+    add(dataset, Finding("note", said))
+    once_for_steps(dataset)
+    assert findings(dataset) == [Finding("note", shorter)]

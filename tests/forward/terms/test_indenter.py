@@ -6,12 +6,14 @@ from mpi4py import MPI
 from pydantic import ValidationError
 from scipy.optimize import minimize
 
+from benchmarks.half_spaces import CONTACT, TOOLS, Mesh, compared, half_space, pressed, textbook
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
 from forward.model import SolveError
 from forward.terms import tools
 from forward.terms.indenter import Indenter
 from tests.bodies import energy_density
+from tests.launch import run_script
 
 SIDE = 20e-3
 C1, D1 = 1e3, 2e3
@@ -175,7 +177,7 @@ def test_derivatives(shape):
     scale = np.array([1e-5, 1e-5, 1e-3 * values[2], 1e-3, 1e-3 * values[4]])
     model = spec.build(MPI.COMM_SELF, tuple(names))
     directions = np.array([[1.0, 0, 0, 0, 0], [0, 0.5, 0.5, 0, 0.5], [0, 0, 0, 1, 0]])
-    # That of the direction of a punch has too small a range: points pass its edge.
+    # That of the direction of a punch has too small a range: points pass its edge (differences: below).
     count = 3 if shape == "sphere" else 2
     check_derivatives(model, values, scale, directions=directions[:count]).require()
     slopes = model.solve(values).tangent(np.eye(len(names)))
@@ -183,6 +185,22 @@ def test_derivatives(shape):
         step = np.eye(len(names))[k] * scale[k]
         ends = [model.solve(values + sign * step).outputs for sign in (1, -1)]
         np.testing.assert_allclose((ends[0] - ends[1])[0] / (2 * step[k]), slopes[k, 0], rtol=1e-4)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize("edge", [2.5e-4, 2e-3])  # below the distance of points of contact, and above
+def test_the_slopes_of_a_punch_that_may_turn(edge):
+    """By differences so small that few points pass its edge."""
+    spec = body(only("flat", edge=edge, at=(2e-3, 1e-3, SIDE)))
+    names = [f"loads.indenter.{name}" for name in ("depth", "direction_x", "direction_y", "radius")]
+    values = np.array([spec.scalars[name].value for name in names])
+    model = spec.build(MPI.COMM_SELF, tuple(names))
+    found = model.solve(values)
+    slopes = found.tangent(np.eye(4))[:, 0]
+    np.testing.assert_allclose(found.adjoint(np.eye(len(model.outputs)))[0], slopes, rtol=1e-9)
+    for k, step in enumerate([1e-6, 1e-5, 1e-5, 5e-8]):
+        ends = [model.solve(values + sign * step * np.eye(4)[k]).outputs[0] for sign in (1, -1)]
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(slopes[k], rel=1e-4), names[k]
 
 
 @pytest.mark.fem
@@ -288,8 +306,44 @@ def test_the_force_of_an_unknown_tool():
     output = {"kind": "force", "name": "F", "tool": "punch"}
     with pytest.raises(ValidationError, match="unknown tool; expected one of: indenter"):
         body(tool(), outputs=(output,))
-    with pytest.raises(ValidationError, match="no load is an indenter"):
+    with pytest.raises(ValidationError, match="unknown tool; no load is an indenter"):
         body(outputs=(output,))
+    with pytest.raises(ValidationError, match=r"which tool\? expected one of: ball"):
+        body(tool(name="ball"), outputs=({"kind": "force", "name": "F"},))
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        {"clamp": ("z-max",)},
+        {"displacements": (*ON_ROLLERS, {"on": "z-max", "z": -1e-3})},
+    ],
+)
+def test_a_tool_does_not_press_on_what_is_held(held):
+    with pytest.raises(ValidationError, match="this boundary is held where the tool presses on it"):
+        body(tool(), **held)
+    aside = {
+        "displacements": (*ON_ROLLERS[:2], {"on": "z-min", "x": 0.0, "y": 0.0, "z": 0.0}, {"on": "z-max", "x": 0.0})
+    }
+    assert body(tool(), **aside)
+
+
+@pytest.mark.parametrize(
+    ("name", "ends", "said"),
+    [
+        ("x", (-0.05, 0.05), "stays 0.0452 m off the body, and its force is 0: at x = -0.05."),
+        ("z", (0.015, SIDE), "starts 0.005 m inside the body, which counts as a deeper push: at z = 0.015."),
+        ("depth", (1e-3, 0.03), "goes 0.01 m through the body, for which there is no answer: at depth = 0.03."),
+        ("direction_z", (-1.0, 1.0), "points away from the body, in which it starts: at direction_z = 1."),
+    ],
+)
+def test_samples_that_a_tool_does_not_suit_are_said_before(name, ends, said):
+    spec = body(tool(at=(4e-3, 4e-3, SIDE)))
+    path = f"loads.indenter.{name}"
+    texts = [one.text for one in spec.findings_over({path: ends})]
+    assert any(text == f"In some samples loads.indenter {said}" for text in texts), texts
+    near = spec.scalars[path].value
+    assert not any("In some samples" in one.text for one in spec.findings_over({path: (0.98 * near, 1.02 * near)}))
 
 
 def test_a_tool_sharper_than_the_mesh_is_said_to_be():
@@ -314,3 +368,79 @@ def test_a_singular_stiffness_is_not_remembered():
     with pytest.raises(SolveError, match="singular"):
         model.equations.factorise(np.full(model.equations.size, np.nan))
     np.testing.assert_allclose(model.solve(np.zeros(0)).outputs, before, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(
+    ("shape", "mesh", "error"),
+    [
+        ("cone", (40.0, 0.4, 2.0), 0.045),
+        pytest.param("sphere", (160.0, 0.2, 1.6), 0.02, marks=pytest.mark.slow),
+        pytest.param("cone", (160.0, 0.2, 1.6), 0.02, marks=pytest.mark.slow),
+        pytest.param("flat", (160.0, 0.2, 1.6), 0.02, marks=pytest.mark.slow),
+    ],
+)
+def test_closed_forms_of_a_half_space(shape, mesh, error):
+    """The body is finite and its cells are too stiff: forces are too large, by less where it is larger or finer."""
+    found = compared(shape, Mesh(*mesh))
+    assert 0 < found.own - 1 < error
+    assert found.penetration < 1e-3
+
+
+def test_closed_forms_of_profiles_tend_to_those_of_the_textbook():
+    """Where edges and tips are sharp; Hertz's sphere is a paraboloid."""
+    for shape in TOOLS:
+        ideal = pressed(shape)
+        sharper = {name: getattr(ideal, name) / 50 for name in ("edge", "tip") if getattr(ideal, name)}
+        found = half_space(ideal.model_copy(update=sharper), 3e3)
+        assert found.force == pytest.approx(textbook(shape, 3e3), rel=3e-3), shape
+        assert found.radius == pytest.approx(CONTACT, rel=3e-3), shape
+
+
+SHARED = """
+import numpy as np
+from mpi4py import MPI
+from tests.forward.terms.test_indenter import ON_ROLLERS, SIDE, body, only, tool
+from tests.ranks import groups
+
+names = [f"loads.ball.{name}" for name in ("depth", "x", "direction_x")] + ["material.C1"]
+table = only("plane", name="table", on="z-min", at=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0), depth=5e-4)
+outputs = (
+    {"kind": "force", "name": "force", "tool": "ball"},
+    {"kind": "force", "name": "across", "tool": "ball", "component": "x"},
+    {"kind": "force", "name": "below", "tool": "table"},
+    {"kind": "contact-area", "name": "area", "tool": "ball"},
+    {"kind": "max-pressure", "name": "pressure", "tool": "ball"},
+)
+spec = body(tool(name="ball", at=(4e-3, 3e-3, SIDE)), table, displacements=ON_ROLLERS[:2], outputs=outputs)
+values = np.array([spec.scalars[name].value for name in names])
+first = None
+for comm in groups(1, 2, 3):
+    model = spec.build(comm, tuple(names))
+    solution = model.solve(values)
+    states = comm.bcast(model.space.gather(solution.state[None]))
+    model.visit(solution)
+    touched = solution.touched()
+    found = [
+        solution.outputs,
+        solution.tangent(np.eye(4)),
+        solution.adjoint(np.eye(5)),
+        states,
+        np.array(list(model.equations.penetrations().values())),
+        *(rows[np.lexsort(np.round(rows[:, :3], 9).T), 3] for rows in (touched["ball"], touched["table"])),
+    ]
+    if first is None and comm.rank == 0:
+        first = found
+        assert solution.outputs[0] > 0.01
+    if comm.rank == 0:
+        for k, (one, other) in enumerate(zip(first, found, strict=True)):
+            scale = np.abs(one).max(axis=0)
+            np.testing.assert_allclose(other / scale, one / scale, atol=1e-7, err_msg=f"{k} on {comm.size} ranks")
+"""
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_ranks_share_a_body_between_two_tools():
+    done = run_script(3, SHARED)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,0 +1,62 @@
+"""Studies of a body that a tool touches."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.launch import TISSUQ, assert_same_bits, run
+
+STUDY = """
+[model]
+kind = "path"
+body = { kind = "box", size = [0.02, 0.02, 0.02], cells = [2, 2, 2], degree = 1, grading = { z-max = 4 } }
+formulation = "displacement"
+material = { kind = "neo-hookean", C1 = 1e3, D1 = 2e3 }
+clamp = ["z-min"]
+outputs = [{ name = "force", kind = "force" }, { name = "pressure", kind = "max-pressure" }]
+
+[[model.loads]]
+kind = "indenter"
+shape = "sphere"
+radius = 5e-3
+on = "z-max"
+at = [0.004, 0.003, 0.02]
+direction = [0, 0, -1]
+depth = [0.5e-3, 1e-3]
+
+[parameters]
+"material.C1" = { kind = "uniform", lower = 900, upper = 1100 }
+"loads.indenter.x" = { kind = "uniform", lower = 3e-3, upper = 5e-3 }
+
+[method]
+kind = "sensitivity-monte-carlo"
+samples = 5
+
+[accuracy]
+mesh_error = false
+"""
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_any_number_of_ranks(tmp_path):
+    """Groups give the same bytes; ranks that share a model agree to rounding."""
+    study = tmp_path / "ball.toml"
+    study.write_text(STUDY)
+    for name, ranks, words in (
+        ("one", None, ()),
+        ("two", 2, ()),
+        ("three", 3, ()),
+        ("shared", 3, ("--set", "parallel.ranks_per_model=3")),
+    ):
+        done = run(ranks, TISSUQ, "run", study, "--out", tmp_path / name, "--no-report", "--quiet", *words)
+        assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "one", tmp_path / "two")
+    assert_same_bits(tmp_path / "one", tmp_path / "three")
+    one, shared = (xr.load_dataset(tmp_path / name / "results.nc") for name in ("one", "shared"))
+    for name in ("values", "mean", "field_mean", "contact_position", "contact_pressure"):
+        scale = np.abs(one[name].values).max()
+        np.testing.assert_allclose(shared[name], one[name], atol=1e-8 * scale, err_msg=name)
+    assert list(json.loads((tmp_path / "one" / "summary.json").read_text())["outputs"])[-1] == "pressure.2"
