@@ -275,7 +275,8 @@ def run(case: Case) -> Row:
     if along is not None:
         path = float(np.linalg.norm(along.state - solution.state) / np.linalg.norm(along.state))
         if path > SAME:
-            note = f"small steps lead elsewhere: {negatives(other, along)} negative eigenvalues there"
+            there = negatives(other.linearise(along), along.state)
+            note = f"small steps lead elsewhere: {there} negative eigenvalues there"
     refuted = {
         "J ≤ 0": not row.smallest_jacobian > 0,
         "no equilibrium": not balanced,
@@ -323,7 +324,7 @@ def inspect(
     seen = replace(
         row,
         smallest_jacobian=equations.smallest_jacobian(solution.state),
-        negative=equations.inertia(),
+        negative=negatives(equations, solution.state),
         condition=condition(equations),
         residual=residual.relative,
         correction=correction,
@@ -332,9 +333,10 @@ def inspect(
     return seen, small and residual.gap == 0
 
 
-def negatives(model: HyperelasticModel, solution: FiniteElementSolution) -> int:
-    """Number of negative eigenvalues of the stiffness."""
-    return model.linearise(solution).inertia()
+def negatives(equations: Any, u: FloatArray) -> int:
+    """Number of negative eigenvalues of the stiffness at u, where equations are linearised; of its symmetric part."""
+    found = equations.inertia()
+    return int(equations.negative_eigenvalues(u) if found is None else found)
 
 
 def condition(equations: Any, iterations: int = 15) -> float:
