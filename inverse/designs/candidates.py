@@ -142,6 +142,8 @@ def _name(values: Values, rows: Sequence[int], each: Each) -> str:
             return middle.rpartition(".")[0] if values.displaced[rows[0]] else first
         case "output":
             return "displacements" if values.displaced[rows[0]] else values.part[rows[0]]
+        case "step":
+            return f"step {values.case[rows[0]]}" if values.case[rows[0]] else first
         case _:
             return values.case[rows[0]] or first
 

@@ -203,6 +203,9 @@ class DesignStudy(Sourced, StudyKind):
         if not nodal and not self.inputs.names:
             yield ("parameters",), "nothing is unknown, expected at least one parameter", {}
         yield from self.model.mistakes_of_mesh()
+        if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
+            message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
+            yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         if self.draws is not None:
             yield from mistakes_of_draws(self.model.scalars, self.draws)

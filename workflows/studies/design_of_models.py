@@ -138,6 +138,9 @@ class DesignOfModels(StudyKind):
                 continue
             for where, message, given in (*candidate.mistakes(spec), *spec.mistakes_of_mesh()):
                 yield (*place, *where), message, given
+            if self.parallel.ranks_per_model > 1 and not spec.shareable:
+                message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
+                yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
             if spec.coefficients:
                 message = "random fields, expected numbers only"
                 yield (*place, "model", "fields"), message, len(spec.coefficients)

@@ -41,7 +41,8 @@ def test_values_are_gathered(each, names, which):
 
 def test_steps_and_outputs_of_a_path():
     values = Values(("F.1", "u.1", "F.2", "u.2"), np.full((4, 3), np.nan), ("1", "1", "2", "2"), ("F", "u", "F", "u"))
-    assert Candidates.of(values, "step", NONE[:4]).which.tolist() == [0, 0, 1, 1]
+    steps = Candidates.of(values, "step", NONE[:4])
+    assert (steps.names, steps.which.tolist()) == (("step 1", "step 2"), [0, 0, 1, 1])
     outputs = Candidates.of(values, "output", NONE[:4])
     assert (outputs.names, outputs.which.tolist()) == (("F", "u"), [0, 1, 0, 1])
     assert values.kinds == [("", "F"), ("", "u"), ("", "F"), ("", "u")]

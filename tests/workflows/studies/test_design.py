@@ -1,7 +1,9 @@
 """Studies of designs: from files to results, as inputs of other studies, on ranks, and what is refused."""
 
 import json
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import xarray as xr
 from mpi4py import MPI
 from scipy.stats import multivariate_normal
 
-from tests.launch import TISSUQ, assert_same_bits
+from tests.launch import ROOT, TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
@@ -212,6 +214,52 @@ def test_whole_load_cases_are_observations(folder):
         load(cube(folder, "number = 400")).run()
 
 
+BUMPS = """
+import numpy as np
+
+AT = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+
+def value(p):
+    if p[0] > 2:
+        raise ValueError("beyond")
+    return (np.tanh(20 * (p[0] - AT))).tolist() + [0.001 * p[0]]
+
+def slopes(p):
+    return [[20 / np.cosh(20 * (p[0] - a)) ** 2] for a in AT] + [[0.001]]
+"""
+
+
+def test_draws_that_disagree_fail_or_are_told_little_are_findings(tmp_path, monkeypatch):
+    """Each output sees the unknown only where its bump is."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "bumps", raising=False)
+    (tmp_path / "bumps.py").write_text(BUMPS)
+    outputs = ", ".join(f'{{ name = "y{i}" }}' for i in range(6))
+    (tmp_path / "bumps.toml").write_text(f"""
+[model]
+kind = "python"
+function = "bumps.value"
+jacobian = "bumps.slopes"
+parameters = {{ a = 0.0 }}
+outputs = [{outputs}]
+[parameters]
+a = {{ kind = "normal", mean = 0, std = 1.5 }}
+[method]
+kind = "design"
+noise = {{ absolute = 0.01 }}
+draws = 64
+number = 6
+""")
+    assert run(load(tmp_path / "bumps.toml"), "bumps", tmp_path / "out", quiet=True, report=False) == 3
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["failed"] > 0
+    texts = {one["severity"]: one["text"] for one in summary["findings"]}
+    assert f"The model has no answer at {summary['failed']} of 64 draws" in json.dumps(summary["findings"])
+    assert "From observation 6 of 6 on, each adds less than" in texts["note"]
+    two = load(tmp_path / "bumps.toml", ["method.number=1"]).run()
+    assert "What is best depends on the unknowns" in two.attrs["findings"]
+
+
 CURVES = """
 import numpy as np
 
@@ -385,6 +433,23 @@ def test_fields_are_told_what_dense_matrices_say(tmp_path, criterion):
     left = root @ np.linalg.inv(after(chosen)) @ root.T
     share = 1 - (mass * np.diag(left)).sum() / (mass * np.diag(root @ root.T)).sum()
     assert float(found["field_variance_told"][-1]) == pytest.approx(share, rel=5e-3)
+
+
+@pytest.mark.fem
+def test_draws_of_a_field_are_found_by_a_restart(tmp_path):
+    (tmp_path / "field.toml").write_text(FIELD + "number = 3\ndraws = 4\n")
+    command = [TISSUQ, "run", tmp_path / "field.toml", "--no-report", "--quiet", "--out"]
+    whole = on_ranks(None, *command, tmp_path / "whole")
+    assert whole.returncode == 0, whole.stderr
+    out = tmp_path / "out"
+    with subprocess.Popen(list(map(str, [*command, out])), env=environment(), cwd=ROOT) as begun:
+        while begun.poll() is None and not list(out.glob("evaluations/*.nc")) + list(out.glob("evaluations/*.h5")):
+            time.sleep(0.02)
+        begun.kill()
+    assert not (out / "summary.json").exists()
+    done = on_ranks(None, *command, out)
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(tmp_path / "whole", out)
 
 
 @pytest.mark.fem
