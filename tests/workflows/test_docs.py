@@ -6,11 +6,13 @@ import re
 import shlex
 import sys
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from workflows.__main__ import _parser
+from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
 from workflows.run.run import run
 from workflows.starter import starter
@@ -67,7 +69,10 @@ def test_commands_parse(page, command):
     options = _parser().parse_args(arguments)
     study = getattr(options, "study", None)
     if study is not None and study.parts[0] == "configs":
-        load(ROOT / study, options.set)
+        taken = re.findall(r'"(results/[\w-]+)"', (ROOT / study).read_text())
+        missing = any(not (ROOT / place).exists() for place in taken)
+        with pytest.raises(StudyError, match=r"^\S+ \S*results/brain\S* is not there") if missing else nullcontext():
+            load(ROOT / study, options.set)  # what the command before it leaves may not be there
     if getattr(options, "kind", "list") not in {"list"}:
         assert starter(options.kind)
 

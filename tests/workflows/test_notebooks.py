@@ -11,10 +11,12 @@ from workflows.report import bodies
 
 ROOT = Path(__file__).parent.parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+LONG = {"06_pipeline"}  # four studies
+SHORT = [pytest.param(path, marks=[pytest.mark.slow] * (path.stem in LONG)) for path in NOTEBOOKS]
 
 
 @pytest.mark.fem
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", SHORT, ids=lambda path: path.stem)
 def test_every_line_runs(path, monkeypatch, tmp_path):
     """As a script: without reports, and without drawing bodies, which other tests do."""
     monkeypatch.chdir(ROOT)
