@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from forward.bodies.mesh_file import MeshFile
+from forward.fem.cost import REPORT, START
 from forward.fem.finer import finer, graded
+from uq.accuracy.budget import SHARE
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times
@@ -14,6 +17,7 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
 
 HOPELESS = 100  # times a textbook solve: what a failing solve may take, with its load steps
+NONE_TO_SPARE = -1e9  # solves: for estimates without what calibrates them
 NOT_ASKED = "not requested: no result will be called trusted"
 
 
@@ -22,6 +26,15 @@ def times_of(spec: ModelSpec) -> Times:
     found = spec.cost()
     assert found is not None
     return found
+
+
+def estimates_paid(spec: ModelSpec, parameters: int, solves: int) -> float:
+    """Predict how many estimates of the error of a mesh take a fifth of a study of so many solves."""
+    cost, one = spec.cost(), spec.mesh_error_cost(NONE_TO_SPARE)
+    if cost is None or one is None:
+        return math.inf
+    once = START + REPORT + cost.first + cost.reference_factor(parameters)
+    return float((SHARE * (once + solves * cost.sample) - one.once) / (cost.sample + one.seconds))
 
 
 def formulation(decision: Decision) -> str:

@@ -15,7 +15,7 @@ from forward.model import Finding, ModelError
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
+from uq.accuracy.budget import FEWEST, OF_SOLVER, estimates_for, spare_for
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
 from uq.methods.method import MESH, METHODS, Method
@@ -146,7 +146,12 @@ class Study(Sourced, StudyKind):
 
         Methods on several meshes, and comparisons that are asked to solve on a finer one, estimate it themselves.
         """
-        return 0 if not self._estimating or self._too_large is not None else estimates_for(self.planned)
+        return 0 if not self._estimating or self._too_large is not None else self.estimates_of(self.planned)
+
+    def estimates_of(self, solves: int) -> int:
+        """Number of estimates of the error of the mesh that so many solves afford, two at least, by predicted times."""
+        paid: float = named("workflows.studies.predictions:estimates_paid")(self.spec, len(self.inputs.names), solves)
+        return estimates_for(solves, paid)
 
     @property
     def spare(self) -> float:
@@ -199,6 +204,13 @@ class Study(Sourced, StudyKind):
                 "warning",
                 f"The error of the mesh is not estimated: that would take about {self._too_large:,.0f} MiB for each "
                 f"group of ranks, more than accuracy.memory = {self.accuracy.memory:,.0f} MiB.",
+            )
+        if 0 < self.estimates < FEWEST:
+            yield Finding(
+                "note",
+                f"The error of the mesh is estimated at {self.estimates} points only: more would take over a fifth of "
+                "the study, by prediction. What so few leave open is counted (mesh_error_doubt); more solves pay "
+                "for more.",
             )
         if self.accuracy.mesh_error and self.spec.meshed and self.spec.remembers:
             yield Finding(

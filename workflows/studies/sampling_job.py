@@ -12,7 +12,7 @@ import numpy as np
 from forward.external.derivatives import contradicted
 from forward.model import Finding, SolveError, Stability
 from forward.registry import named
-from uq.accuracy.budget import estimates_for, spare_for
+from uq.accuracy.budget import spare_for
 from uq.estimators import branch
 from uq.estimators.rounding import settled
 from uq.evaluation.evaluate import OWN, Evaluate, Evaluations, Recorder, merge
@@ -122,7 +122,7 @@ def _with_mesh_errors(
     except SolveError as error:
         add(found, Finding("note", f"The error of the mesh is not estimated: {error}."))
         return found
-    count, seed = estimates_for(recorder.solves), getattr(study.method, "seed", 0)
+    count, seed = study.estimates_of(recorder.solves), getattr(study.method, "seed", 0)
     errors = estimate(
         inputs, evaluate, centre, count, seed, fields="node" in found.dims, spare=spare_for(recorder.solves)
     )

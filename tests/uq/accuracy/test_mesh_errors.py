@@ -407,6 +407,7 @@ def test_designs_begin_at_the_mean_and_are_spread(count, d):
 
 def test_the_number_of_estimates_is_a_fifth_of_the_solves():
     assert [estimates_for(n) for n in (1, 50, 100, 200, 10_000)] == [3, 3, 5, 10, MOST]
+    assert [estimates_for(100, paid) for paid in (-3.0, 2.9, 3.2, 4.0, 100.0)] == [2, 2, 3, 4, 5]
 
 
 def test_results_of_other_shapes_are_left_alone():

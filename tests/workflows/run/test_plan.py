@@ -30,6 +30,15 @@ def test_predicted_times_grow_with_the_body(cell, form):
     assert sum(found[0]) < 60  # little but the start of the program
 
 
+def test_estimates_take_a_fifth_of_the_study():
+    large = ["model.body.cells=[30, 6, 12]", "model.formulation=mixed", "accuracy.memory=1e6"]
+    for settings, count in (([], 3), (large, 2), ([*large, "method.samples=6144"], 16)):
+        study = load(CONFIGS / "beam-qmc.toml", ["method.samples=48", "method.scrambles=3", *settings])
+        assert study.estimates == count
+        said = [one for one in study.findings if "at 2 points only" in one.text]
+        assert len(said) == (count == 2)
+
+
 def test_estimates_that_take_too_much_memory_are_left_out_and_it_is_said():
     study = load(CONFIGS / "organ.toml", ["accuracy.memory=500"])
     assert study.estimates == 0
