@@ -350,8 +350,8 @@ def _cells(study: Study) -> tuple[int, ...]:
 
 
 def _factor(before: Sequence[int], after: Sequence[int]) -> float:
-    """By what the longest edges of cells have become shorter."""
-    return min(n / m for m, n in zip(before, after, strict=True))
+    """By what the longest edges of cells have become shorter, but for a layer of plane strain, which stays one cell."""
+    return min((n / m for m, n in zip(before, after, strict=True) if max(m, n) > 1), default=1.0)
 
 
 def _rate(meshes: Sequence[Assessed]) -> float:

@@ -176,6 +176,18 @@ def test_a_mesh_that_takes_too_much_is_refined_as_errors_fall():
 
 
 @pytest.mark.unit
+def test_a_layer_of_plane_strain_is_refined_in_its_plane():
+    study = load(ROOT / "configs" / "cook.toml", ["method={kind='automatic'}", "accuracy.tolerance=1e-3"])
+    first = mesh(study, 8.0)
+    model, _, _ = _next(study, study, [first])
+    assert model.body.cells[2] == 1
+    assert model.body.cells[0] > study.model.body.cells[0]
+    finer = study.of(model)
+    factor = model.body.cells[0] / study.model.body.cells[0]
+    assert _rate([first, mesh(finer, 8.0 / factor**2)]) == pytest.approx(2.0)
+
+
+@pytest.mark.unit
 def test_estimates_that_contradict_each_other_are_said():
     outputs = {"u": {"mean": {"error": 0.001}}}
 
