@@ -28,7 +28,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint bench docs clean system
+.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint bench docs clean system browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -40,13 +40,13 @@ setup-wheel: $(WHEEL_READY) ## install DOLFINx 0.11 from PyPI into .venv-wheel (
 demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the report is
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
 
-test: $(READY) ## run the test suite (ARGS="-k word" goes to pytest)
+test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
 	@$(PYTHON) -m pytest $(WORKERS) $(ARGS)
 
 test-unit: $(READY) ## run the tests that take milliseconds, in less than 10 s
 	@$(PYTHON) -m pytest -m unit $(ARGS)
 
-test-all: $(READY) ## run the test suite with the slow tests
+test-all: $(READY) browser ## run the test suite with the slow tests
 	@$(PYTHON) -m pytest $(WORKERS) -m "not benchmark" $(ARGS)
 
 test-wheel: $(WHEEL_READY) ## run the tests that say that DOLFINx 0.11 gives the same results
@@ -69,6 +69,11 @@ docs: $(READY) ## build the documentation into site/, without network
 clean: ## remove .venv and caches; results stay
 	@rm -rf .venv $(WHEEL_VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Reports are tested in a browser; without one these tests are skipped, with the reason.
+browser:
+	@command -v chromium >/dev/null || ! command -v apt-get >/dev/null || $(MAKE) --no-print-directory system PACKAGES=chromium || \
+	    echo "Chromium could not be installed: reports are not tested in a browser" >&2
 
 system:
 	@missing=; for package in $(PACKAGES); do \

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from workflows.config.report import Report
     from workflows.report.blocks import Block
 
-ROWS = 40  # parameters that a table lists
+ROWS = 40  # parameters from which on a table is in the order of their effects
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,10 @@ class Results:
         return [str(name) for name in self.dataset["parameter"].values]
 
     def leading(self, effects: xr.DataArray) -> list[str]:
-        """Names of the parameters, or of those with the largest effects (parameter,) if there are many."""
+        """Names of the parameters; of many, those with the largest effects (parameter,) first."""
         if len(self.parameters) <= ROWS:
             return self.parameters
-        largest = (-abs(effects)).argsort().to_numpy()[:ROWS]
-        return [str(name) for name in effects["parameter"].to_numpy()[largest]]
+        return [str(name) for name in effects["parameter"].to_numpy()[(-abs(effects)).argsort().to_numpy()]]
 
     def estimate(self, output: str, name: str) -> str:
         """One estimate of an output with its error and unit."""

@@ -260,7 +260,7 @@ class Viewer {
     this.arrows = told.arrows.map((a) => ({ name: a.name, places: get(a.places), vectors: get(a.vectors), sizes: get(a.sizes), shown: false }));
     this.expansion = told.sliders ? new Expansion(told.sliders, arrays) : null;
     this.warp = 1; this.outlined = true; this.opacity = this.insides.some((i) => i.shown && !i.outside) ? 0.22 : 1;
-    this.cut = { axis: "", place: 0.5 };
+    this.cut = { axis: told.cut, place: 0.5 };
     this.surfaceProgram = this.program(...SURFACE); this.lineProgram = this.program(...LINE);
     this.texture = gl.createTexture(); this.lineBuffer = gl.createBuffer();
     this.own = new Map();
@@ -547,8 +547,9 @@ class Viewer {
     })));
     if (this.cells) {
       const where = range(0, 1, 0.5, (x) => { this.cut.place = x; this.update(); });
-      where.setAttribute("aria-label", "place of the cut"); where.hidden = true;
+      where.setAttribute("aria-label", "place of the cut"); where.hidden = !this.cut.axis;
       const kind = make("select", { className: "cut" }, ...[["", "none"], ["x", "x"], ["y", "y"], ["z", "z"], ["v", "equal value"]].map(([value, words]) => make("option", { value, textContent: words })));
+      kind.value = this.cut.axis;
       kind.addEventListener("change", () => { this.cut.axis = kind.value; where.hidden = !kind.value; this.update(); });
       bar.append(make("label", {}, "cut ", kind), where);
     }

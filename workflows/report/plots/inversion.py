@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+NARROW = 0.3  # part of a prior below which the whole of it is drawn beside its posterior
 MARGINALS = 12  # parameters whose densities are drawn
 RESOLUTION = 80  # points along the edge of a slice
 SEEN = 1.0  # λ above which the data say more about a direction than the prior
@@ -191,8 +192,21 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
         if np.isfinite(of["true"]):
             ax.axvline(float(of["true"]), color=HIGH, label="truth")
         _finish(ax, named(name, (units or {}).get(name, "1")), x)
+        if x[-1] - x[0] < NARROW * (values[-1] - values[0]):
+            _both(ax, values, density, x, _smooth(draws, float(of["std"]), _worth(one), x))
     _legend(found)
     return found[0]
+
+
+def _both(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
+    """Draw the whole prior in a corner, with the posterior in it, each to its own height."""
+    corner = ax.inset_axes((0.7, 0.68, 0.29, 0.3))
+    corner.fill_between(values, density / max(float(density.max()), 1e-300), color=PLAIN, alpha=0.35, linewidth=0)
+    corner.fill_between(x, posterior / max(float(posterior.max()), 1e-300), **_FILLED)
+    corner.plot([x.mean()] * 2, [0, 1], color=_FILLED["color"], linewidth=1)  # seen also where it is very narrow
+    corner.set(yticks=[], xticks=values[[0, -1]], xlim=values[[0, -1]], ylim=(0, 1.1))
+    corner.set_xticklabels([f"{end:.3g}" for end in values[[0, -1]]], fontsize=6)
+    corner.set_title("whole prior", fontsize=6, pad=2)
 
 
 def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[float, float]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.words import named, with_error
-from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, axes, span
-from workflows.studies.findings_selection import ranking
+from workflows.report.plots.figure import COLOURS, CONTROLLED, DARK, HIGH, axes, span
+from workflows.studies.findings_selection import by_probability, ranking
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,7 +24,10 @@ def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     errors = dataset["log_evidence_error"].sel(model=order).values
     places = np.arange(len(order))
     below = values - values.max()
-    ax.barh(places, below, xerr=3 * errors, color=CONTROLLED, ecolor=DARK, capsize=4, height=0.6)
+    # The first has no length: its place is marked.
+    colours = [HIGH if z == 0 else CONTROLLED for z in below]
+    ax.barh(places, below, xerr=3 * errors, color=colours, ecolor=DARK, capsize=4, height=0.6)
+    ax.plot(0, places[int(np.argmax(below))], "o", color=HIGH)
     # Next to hopeless models the differences of the others are invisible: the numbers are written with the names.
     labels = [f"{model}\n{with_error(float(z), float(e))}" for model, z, e in zip(order, below, errors, strict=True)]
     ax.set_yticks(places, labels, fontsize="small")
@@ -39,9 +42,18 @@ def probability_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     ax = ax or axes(height=1.6 + 0.36 * len(names))
     places = np.arange(len(names))[::-1]
     left = np.zeros(len(names))
+    best = by_probability(dataset, dataset["log_evidence"])[0]
+    muted = [colour for colour in COLOURS if colour != HIGH]
     for k, model in enumerate(dataset.model.values):
         share = dataset["variant_probability"].sel(model=model).values
-        ax.barh(places, share, left=left, color=COLOURS[k % len(COLOURS)], label=str(model), height=0.6)
+        ax.barh(
+            places,
+            share,
+            left=left,
+            color=HIGH if model == best else muted[k % len(muted)],
+            label=str(model),
+            height=0.6,
+        )
         left = left + share
     ax.set_yticks(places, names)
     ax.set_xlim(0, 1)

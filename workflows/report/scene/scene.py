@@ -77,6 +77,10 @@ class Scene:
         Places (p, 3), vectors (p, 3) (m) and sizes (p,) of residuals by name.
     sliders
         What the body does when parameters are moved.
+    motion_name
+        The displacements in words.
+    cut
+        What is seen inside at first: "x", "y" or "z" for a plane, "v" where the first quantity is half of its range.
     """
 
     points: FloatArray
@@ -89,6 +93,7 @@ class Scene:
     arrows: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
     sliders: Sliders | None = None
     motion_name: str = ""
+    cut: str = ""
 
     @property
     def skin(self) -> Skin:
@@ -143,6 +148,7 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
         list(_stiffness(one)),
         [*_regions(one, points, cells, kind), *insides],
         dict(_arrows(one)),
+        cut="" if inclusions or "stiffness_mean" not in one else "v",
     )
 
 
@@ -357,6 +363,7 @@ def packed(scene: Scene) -> tuple[str, str]:
     told: dict[str, Any] = {
         "up": scene.up.tolist(),
         "extent": extent,
+        "cut": scene.cut if whole else "",
         "points": pack.add(scene.points[kept], fine * extent),
         "skin": triangles(surface),
         "edges": pack.add(number[surface.edges]) if len(surface.edges) else None,

@@ -81,7 +81,7 @@ def evidences(dataset: xr.Dataset) -> Table:
         "P(model | data)",
         *(["stacking"] if stacked else []),
     ]
-    return Table([*head, *(["ln Z by nested sampling"] if nested else [])], rows, text=frozenset({0, 4}))
+    return Table([*head, *(["ln Z by nested sampling"] if nested else [])], rows, text=frozenset({0, 4}), strong=0)
 
 
 def routes(dataset: xr.Dataset) -> Table:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from uq.findings import findings
-from workflows.report.blocks import Block, Text
+from workflows.report.blocks import Block, Folded, Text
 from workflows.report.section import Results, Section
+
+NOTES = 2  # that are read at once
 
 
 class Findings(Section):
@@ -17,8 +19,14 @@ class Findings(Section):
         return "note" in results.summary or bool(findings(results.dataset))
 
     def content(self, results: Results) -> Iterator[Block]:
-        """A paragraph for each."""
+        """A paragraph for each; many notes are folded."""
         if "note" in results.summary:
             yield Text(results.summary["note"], "warning")
-        for found in findings(results.dataset):
-            yield Text(found.text, "" if found.severity == "note" else found.severity)
+        found = findings(results.dataset)
+        for one in found:
+            if one.severity != "note":
+                yield Text(one.text, one.severity)
+        notes = [Text(one.text) for one in found if one.severity == "note"]
+        yield from notes[:NOTES]
+        if len(notes) > NOTES:
+            yield Folded(f"{len(notes) - NOTES} more notes", notes[NOTES:])

@@ -13,6 +13,7 @@ from workflows.report.plots import inversion as plots
 from workflows.report.plots import path as curves
 from workflows.report.plots import residuals
 from workflows.report.section import Results, Section
+from workflows.report.sections.body import specimen
 from workflows.results.points import has_points
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec
     from workflows.studies.inversion import InversionStudy
 
-DIRECTIONS = 10  # that a table lists
 SMALL = 1e-3  # volume (m³) below which it is written in cm³
 SEEN_MOVE = 1e-5  # of the extent of the body: moves of points that are drawn
 DRAWN = 8  # data sets that have more than a row in the table
@@ -56,6 +56,7 @@ class Posterior(Section):
         before, units = prior_densities(results.study), results.study.units_of("/")
         for one in first(results):
             yield from verdict(results, one)
+            yield from again(results, one)
             yield Pairs([*amounts(one, one.sizes["direction"])])
             yield posterior(one, units)
             if _words(one) is OUTPUTS:
@@ -87,6 +88,13 @@ def verdict(results: Results, one: xr.Dataset) -> Iterator[Block]:
     yield Heading(str(one.data_set.item()))
     if results.dataset.sizes["data_set"] > 1:
         yield Text(str(one["why"].item()), "" if int(one["trust"]) <= 1 else "warning")
+
+
+def again(results: Results, one: xr.Dataset) -> Iterator[Block]:
+    """Show the specimen of a data set, unless it is the one on the first screen."""
+    shown = results.dataset.data_set.values[results.dataset["ok"]][0]
+    if "stiffness_mean" in one and "cell_nodes" in one and one.data_set.item() != shown:
+        yield specimen(one, results)
 
 
 def amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, list[str]]]:
@@ -186,7 +194,7 @@ def directions(one: xr.Dataset) -> Table:
     """The directions of the parameters, in whitened coordinates, from the most to the least constrained by the data."""
     names = [str(name) for name in one.parameter.values if name != "noise"]
     rows = []
-    for i, value in enumerate(one["eigenvalue"].to_numpy()[:DIRECTIONS]):
+    for i, value in enumerate(one["eigenvalue"].to_numpy()):
         vector = one["direction_parameter"].isel(direction=i).to_numpy()[: len(names)]
         rows.append((f"{i + 1}", number(value, 3), number((1 + value) ** -0.5, 2), *(f"{x:+.2f}" for x in vector)))
     return Table(("direction", "λ", "posterior over prior width", *names), rows)

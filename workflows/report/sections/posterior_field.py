@@ -12,6 +12,7 @@ from workflows.report.blocks import Block, Pairs, Picture, Pictures
 from workflows.report.plots import inversion as plots
 from workflows.report.section import Results, Section
 from workflows.report.sections.posterior import (
+    again,
     amounts,
     cases,
     each_case,
@@ -39,6 +40,7 @@ class FieldPosterior(Section):
         """The same for each of the first data sets."""
         for one in first(results):
             yield from verdict(results, one)
+            yield from again(results, one)
             yield Pairs([*amounts(one, one.sizes["node"]), *more_amounts(one)])
             yield posterior(one, results.study.units_of("/"))
             yield Pictures([Picture.drawn(ax, caption) for ax, caption in pictures(one)])
