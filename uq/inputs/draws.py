@@ -270,7 +270,7 @@ class _Tree:
             axis, share = level.axis[part], level.share[part]
             at = u[rows, axis]
             first = (at < share) | (share == 1.0)  # rounding may bring a coordinate to 1
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of the half that is not taken
                 u[rows, axis] = np.where(first, at / share, (at - share) / (1 - share))
             part = level.child[part] + ~first
         return np.asarray(self.draw[part])
