@@ -30,7 +30,7 @@ from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load
 from workflows.studies.design_job import values_of
 
-CELLS, NOISE, SPECIMENS, DRAWS = 3, 0.02, 32, 32
+CELLS, NOISE, SPECIMENS, DRAWS = 3, 0.02, 16, 32
 SAMPLES = 64
 LARGEST = 0.5  # error of an evidence (nat) that counts
 CASES = {
@@ -112,11 +112,13 @@ def load_cases(count: int) -> None:
     chosen = str(found["candidate"][int(found["chosen"][0])].item())
     print("| load case | predicted (nat) | told in inversions (nat) |\n|---|---|---|")
     ranked = sorted(predicted, key=lambda name: -predicted[name])
-    gained = {name: told(spec, name, count) for name in ranked}
-    for name, nat in gained.items():
-        known = nat[np.isfinite(nat)]
+    gained = {}
+    for name in ranked:
+        gained[name] = told(spec, name, count)
+        known = gained[name][np.isfinite(gained[name])]
         error = known.std() / np.sqrt(len(known))
-        print(f"| {name} | {predicted[name]:.2f} | {known.mean():.2f} ± {error:.2f} ({len(known)} specimens) |")
+        words = f"{known.mean():.2f} ± {error:.2f} ({len(known)} specimens)"
+        print(f"| {name} | {predicted[name]:.2f} | {words} |", flush=True)
     for name in ranked[1:]:  # on the same specimens
         more = gained[ranked[0]] - gained[name]
         more = more[np.isfinite(more)]
