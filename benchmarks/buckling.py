@@ -23,6 +23,7 @@ from forward.fem.reference import ReferenceFactor
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.stability import NOT_SCREENED, Screened
+from forward.solvers.steps import finish
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Distribution, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -241,7 +242,7 @@ def screened(factor: ReferenceFactor, model: HyperelasticModel, state: FloatArra
     equations.set_parameters(point)
     equations.at_load(1.0)
     residual = equations.residual(state)
-    return factor.screen(state, residual.vector, factor.rotation(state))
+    return finish(factor.screen(state, residual.vector, factor.rotation(state)), factor.solve)
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from forward.bodies.inclusions import Inclusion
 from forward.bodies.mesh_file import Contents, MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
-from forward.fem.cost import Estimate, Times, sum_of, times
+from forward.fem.cost import Estimate, Times, held_together, sum_of, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
@@ -437,7 +437,8 @@ class Hyperelastic(ModelSpec):
         contact, mixed, symmetric = self.touched, self.mixed, self.symmetric
         one = times(self.body, mixed=mixed, symmetric=symmetric, predicted=predicted, factors=factors, contact=contact)
         if self.increments == 1:
-            return one
+            held = held_together(self.unknowns) if predicted and factors > 1 and not contact else 0
+            return replace(one, bytes=one.bytes + held)
         whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
         return replace(whole, setup=one.setup, bytes=one.bytes)
 

@@ -404,6 +404,10 @@ class ForwardModel(Protocol):
     def space(self) -> NodalSpace | None:
         """Where the states of a body live; None for a model without states."""
 
+    @property
+    def together(self) -> int:
+        """How many points, one after the other, `solve_many` solves at once where that is cheaper."""
+
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Solve at `parameters` (d,), with the help of a guess.
 
@@ -424,6 +428,11 @@ class ForwardModel(Protocol):
 
 class OneByOne:
     """`solve_many` for models that solve one point at a time."""
+
+    @property
+    def together(self) -> int:
+        """One."""
+        return 1
 
     def solve_many(
         self: ForwardModel, points: FloatArray, guesses: Iterable[Guess | None] | None = None

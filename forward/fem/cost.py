@@ -89,6 +89,11 @@ COPIES = 4  # of the matrix, while what preconditions steps is taken from it
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
+# Points that are corrected together (docs/decisions/0027-lockstep.md).
+MOST_TOGETHER, BYTES_TOGETHER = 32, 2**27  # points, and what they hold: vectors of unknowns
+HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, rotations
+
+
 class Meshed(Protocol):
     """What a body must tell."""
 
@@ -233,6 +238,16 @@ def times(
         BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * size,
         contact,
     )
+
+
+def together(unknowns: int) -> int:
+    """How many points of a body are corrected together: no more than there is memory for."""
+    return min(max(BYTES_TOGETHER // (8 * HELD * unknowns), 1), MOST_TOGETHER)
+
+
+def held_together(unknowns: int) -> int:
+    """Memory (bytes) of the points that are corrected together."""
+    return 8 * HELD * unknowns * together(unknowns)
 
 
 class Way(StrEnum):

@@ -30,6 +30,7 @@ from forward.solvers.system import Residual
 
 NUDGE = 1e-6  # of the extent of the body, for products with the stiffness by differences
 STRETCH = 1e-6  # of the body, to see how stiff it is
+KEPT = 64  # sizes of loads
 VOLUME_ROUNDING = 1e-12  # ‖∫q (J−1 − p/κ) dX‖/‖∫q dX‖ that counts as rounding, over displacements relative to the body
 
 
@@ -45,6 +46,7 @@ class Discretisation(Linearisation):
         super().__init__(spec, comm, parameters, beside)
         self._jacobians = self.at_points(self.J)
         self._external = 0.0
+        self._sizes: dict[tuple[float, ...], float] = {}
         self._stretch = self._small_stretch()
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
@@ -65,14 +67,26 @@ class Discretisation(Linearisation):
         for path, mover in self._movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)
-        external = np.zeros(self.size) if self._proportional else self._forces_at_rest()
-        # A load that is not finite has no finite residual, which the solver reports.
-        with np.errstate(invalid="ignore"):
-            for path, force in self._unit_loads.items() if self._proportional else ():
-                external += self._values.get(path, 1.0) * force
-        self._external = self.norm(external)
+        self._external = self._size_of_loads()
         for field in self.fields:  # the size of the loads is their size without random fluctuations
             field.set(parameters)
+
+    def _size_of_loads(self) -> float:
+        """Norm (N) of the complete loads on the undeformed body, without tools.
+
+        That of the last points is kept: many points at once are set again and again.
+        """
+        key = tuple(self._values.values())
+        if key not in self._sizes:
+            external = np.zeros(self.size) if self._proportional else self._forces_at_rest()
+            # A load that is not finite has no finite residual, which the solver reports.
+            with np.errstate(invalid="ignore"):
+                for path, force in self._unit_loads.items() if self._proportional else ():
+                    external += self._values.get(path, 1.0) * force
+            if len(self._sizes) >= KEPT:
+                self._sizes.pop(next(iter(self._sizes)))
+            self._sizes[key] = self.norm(external)
+        return self._sizes[key]
 
     def _forces_at_rest(self) -> FloatArray:
         """Forces (U_local,) on the undeformed body due to the complete loads, without tools."""

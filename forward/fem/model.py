@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
 
 from forward.fem.affordable import allowance, richer
-from forward.fem.cost import MOST_BYTES, estimate
+from forward.fem.cost import MOST_BYTES, estimate, together
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
 from forward.fem.saturation import factors, typical
 from forward.fem.space import BodySpace
+from forward.fem.together import find_together, from_one_reference
 from forward.hyperelastic import Hyperelastic
 from forward.model import (
     FloatArray,
@@ -30,16 +33,18 @@ from forward.model import (
     OneByOne,
     ReferenceSolution,
     Saturation,
+    Solution,
     SolveError,
     Stability,
     Work,
 )
 from forward.observables.observable import Functional
 from forward.registry import named
-from forward.solvers.anderson import Inverse, block_galerkin
+from forward.solvers.anderson import block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
 from forward.solvers.stability import NOT_SCREENED, Screened, draw
+from forward.solvers.steps import Corrector, Steps
 from forward.solvers.system import Found, Residual
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
@@ -124,25 +129,79 @@ class HyperelasticModel(OneByOne):
         equations.latest.begin()
         self.require_admissible(parameters)
         guess = guess or Guess()
-        reference = guess.reference if self.spec.solver.kind != "newton" and guess.state is not None else None
-        screen = False
-        if reference is not None:
-            self.reference.prepare(reference)
-            screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
+        way = self.way(parameters, guess)
         equations.work = Work()
         equations.set_parameters(parameters)
-        way = None if reference is None else _Way(self, reference, parameters, screen=screen)
         with equations.time_limit(self.spec.solver.solve_seconds):
             found = solve(equations, self.spec.solver, np.zeros(equations.size), guess.state, way, guess.iterations)
             stiffer = 1.0
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)
-        # If Newton's method had to take over, the reference is too far away for the derivatives too.
-        way = way if found.corrected else None
-        solution = FiniteElementSolution(self, parameters, found, equations.work, way, stiffer)
+        solution = self.solution(parameters, found, equations.work, way, stiffer)
         if found.stability >= Stability.COUNTED and equations.symmetric:
             equations.latest.factorised = solution
         return solution
+
+    def way(self, parameters: FloatArray, guess: Guess) -> _Way | None:
+        """Return the path from the reference of a guess, whose factor is computed if it is another's; None without."""
+        if self.spec.solver.kind == "newton" or guess.state is None or guess.reference is None:
+            return None
+        self.reference.prepare(guess.reference)
+        screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
+        return _Way(self, guess.reference, parameters, screen=screen)
+
+    def solution(
+        self, parameters: FloatArray, found: Found, work: Work, way: _Way | None, stiffer: float = 1.0
+    ) -> FiniteElementSolution:
+        """Return what was found at `parameters` (d,) as a solution."""
+        # If Newton's method had to take over, the reference is too far away for the derivatives too.
+        return FiniteElementSolution(self, parameters, found, work, way if found.corrected else None, stiffer)
+
+    @cached_property
+    def together(self) -> int:
+        """How many points `solve_many` corrects together; 1 where each needs the equations for itself."""
+        solver = self.spec.solver
+        alone = self.equations.contact or solver.kind == "newton" or solver.solve_seconds is not None
+        return 1 if alone else together(self.equations.layout.size)
+
+    def solve_many(
+        self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
+    ) -> Iterator[Solution | SolveError]:
+        """Find the equilibria at points (n, d), those with a prediction from the same reference `together`; collective.
+
+        Which go together depends only on the points and their guesses.
+        """
+        pairs = zip(points, guesses or repeat(None), strict=False)
+        while some := list(islice(pairs, self.together)):
+            at = np.array([point for point, _ in some])
+            predicted = from_one_reference([guess for _, guess in some]) if len(some) > 1 else None
+            if predicted is None:
+                yield from super().solve_many(at, [guess for _, guess in some])
+            else:
+                yield from self._solve_together(at, predicted)
+
+    def _solve_together(self, points: FloatArray, guesses: list[Guess]) -> Iterator[Solution | SolveError]:
+        equations = self.equations
+        equations.latest.begin()
+        refused: dict[int, SolveError] = {}
+        ways: dict[int, _Way] = {}
+        for i, (point, guess) in enumerate(zip(points, guesses, strict=True)):
+            try:
+                self.require_admissible(point)
+            except InadmissibleError as error:
+                refused[i] = error
+            else:
+                way = self.way(point, guess)
+                assert way is not None
+                ways[i] = way
+        starts = [(way, guesses[i]) for i, way in ways.items()]
+        zero = np.zeros(equations.size)
+        found = find_together(equations, self.spec.solver, zero, starts, self.reference.solve_uncounted)
+        outcomes = dict(zip(ways, found, strict=True))
+        equations.latest.begin()  # the last factor may be that of any of them
+        for i, point in enumerate(points):
+            state = refused[i] if i in refused else outcomes[i].found
+            yield state if isinstance(state, SolveError) else self.solution(point, state, outcomes[i].work, ways[i])
 
     def require_admissible(self, parameters: FloatArray) -> None:
         """Refuse parameters (d,) for which there is no model."""
@@ -284,7 +343,7 @@ class _Way:
     def __init__(
         self, model: HyperelasticModel, reference: ReferenceSolution, parameters: FloatArray, *, screen: bool
     ) -> None:
-        self._screen = screen
+        self._screen, self._fraction = screen, 1.0
         self.draw = draw(parameters)
         self._equations, self._factor = model.equations, model.reference
         self._from, self._to = reference.parameters, parameters
@@ -292,18 +351,28 @@ class _Way:
         self.state = reference.state
         self.rotation: FloatArray | None = None
 
-    def inverse(self, u: FloatArray) -> Inverse:
+    def corrector(self, u: FloatArray) -> Corrector:
         self.rotation = self._factor.rotation(u)
-        return self._factor.inverse(self.rotation)
+        return self._factor.corrector(self.rotation)
 
-    def screen(self, u: FloatArray, residual: Residual) -> Screened:
+    def solve(self, right: FloatArray) -> FloatArray:
+        return self._factor.solve(right)
+
+    def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
         if not self._screen or self.rotation is None:
             return NOT_SCREENED
-        return self._factor.screen(u, residual.vector, self.rotation)
+        return (yield from self._factor.screen(u, residual.vector, self.rotation))
 
     def at(self, fraction: float) -> None:
+        self._fraction = fraction
         self._equations.set_parameters(self._to if fraction == 1 else self._from + fraction * (self._to - self._from))
         self._equations.at_load(1.0)
+
+    def resume(self, work: Work, solved: int) -> None:
+        """Set the equations to where they were on this path, and count their work and back-substitutions there."""
+        work.back_substitutions += solved
+        self._equations.work = work
+        self.at(self._fraction)
 
 
 class FiniteElementSolution:

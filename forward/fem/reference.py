@@ -13,8 +13,9 @@ from forward.fem.equations import Discretisation
 from forward.model import FloatArray, ReferenceSolution, Work
 from forward.solvers.anderson import Inverse
 from forward.solvers.linear import LinearSolver
-from forward.solvers.rotations import rotations, turn, turned
+from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
+from forward.solvers.steps import Corrector, Steps, finished
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
@@ -149,19 +150,21 @@ class ReferenceFactor:
 
             yield multiply
 
-    def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Screened:
+    def screen(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Steps[Screened]:
         """Screen a state u (U_local,) with its imbalance, rotated by R from the reference."""
         assert self._vectors is not None
         equations, free = self._equations, self._equations.free_displacements
         vectors = turn(self._vectors, R)
         vectors[:, equations.fixed] = 0
-        return screen(
+        steps = screen(
             vectors,
             lambda rows: equations.stiffness_near(u, imbalance, rows),
-            self._inverse(self._definite(), R),
+            Turned(R, equations.fixed),
             free,
             equations.total,
         )
+        # Where the stiffness is not symmetric, its symmetric part has a factor of its own.
+        return steps if equations.symmetric else finished(steps, self._counted(self._definite()))
 
     def rotation(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""
@@ -171,13 +174,23 @@ class ReferenceFactor:
 
     def inverse(self, R: FloatArray, *, transpose: bool = False) -> Inverse:
         """Return the approximate inverse at a state that is rotated by R (3, 3, n_owned) from the reference."""
-        return self._inverse(self._solver, R, transpose=transpose)
+        return Turned(R, self._equations.fixed).by(self._counted(self._solver, transpose=transpose))
 
-    def _inverse(self, solver: LinearSolver, R: FloatArray, *, transpose: bool = False) -> Inverse:
-        equations = self._equations
+    def corrector(self, R: FloatArray) -> Corrector:
+        """Return the same, asking for what `solve` does."""
+        return Turned(R, self._equations.fixed)
 
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve with the factor at the reference; (n,) or (k, n)."""
+        return self._counted(self._solver)(right)
+
+    def solve_uncounted(self, right: FloatArray) -> FloatArray:
+        """The same, where the caller knows to which solutions the work belongs."""
+        return self._solver.solve(right)
+
+    def _counted(self, solver: LinearSolver, *, transpose: bool = False) -> Inverse:
         def inverse(right: FloatArray) -> FloatArray:
-            equations.work.back_substitutions += 1 if right.ndim == 1 else len(right)
+            self._equations.work.back_substitutions += 1 if right.ndim == 1 else len(right)
             return solver.solve(right, transpose=transpose)
 
-        return turned(inverse, R, equations.fixed)
+        return inverse

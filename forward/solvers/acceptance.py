@@ -5,6 +5,7 @@ from __future__ import annotations
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.settings import SolverSettings
 from forward.solvers.stability import NOT_SCREENED
+from forward.solvers.steps import Steps
 from forward.solvers.system import Residual, System, Way
 
 STALLED = 0.5  # a residual that falls by less may have reached rounding
@@ -50,7 +51,7 @@ def accepted(
     residual: Residual,
     way: Way | None = None,
     history: list[str] | None = None,
-) -> Stability:
+) -> Steps[Stability]:
     """Check that an equilibrium has no inverted cell and is not unstable, or raise `Diverged`.
 
     What counts is the stiffness at the state itself, however it was found. Only with a reference solution may a screen
@@ -61,7 +62,7 @@ def accepted(
         return Stability.NOT_TESTED
     seen = NOT_SCREENED
     if way is not None:
-        seen = way.screen(u, residual)
+        seen = yield from way.screen(u, residual)
         if history is not None:
             history.append(f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}")
         if way.draw >= seen.chance:

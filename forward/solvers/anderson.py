@@ -26,8 +26,6 @@ class AndersonMixing:
 
     Parameters
     ----------
-    inverse
-        Applies P⁻¹.
     window
         Number of differences that are kept.
     size
@@ -38,10 +36,7 @@ class AndersonMixing:
         Weights that make the entries (n,) of f comparable in the Euclidean norm.
     """
 
-    def __init__(
-        self, inverse: Inverse, window: int, size: int, total: Total, weights: FloatArray | float = 1.0
-    ) -> None:
-        self._inverse = inverse
+    def __init__(self, window: int, size: int, total: Total, weights: FloatArray | float = 1.0) -> None:
         self._weights = weights
         self._window = window
         self._total = total
@@ -51,9 +46,9 @@ class AndersonMixing:
         self._count = 0
         self._last: tuple[FloatArray, FloatArray] | None = None
 
-    def next(self, u: FloatArray, f: FloatArray) -> FloatArray:
-        """Return the next iterate (n,) from the last one and its residual f."""
-        target = u - self._inverse(f)
+    def next(self, u: FloatArray, f: FloatArray, correction: FloatArray) -> FloatArray:
+        """Return the next iterate (n,) from the last one, its residual f, and P⁻¹f."""
+        target = u - correction
         f = self._weights * f
         if self._last is not None:
             slot = self._count % self._window
@@ -66,7 +61,7 @@ class AndersonMixing:
             return target
         slot = (self._count - 1) % self._window
         changes = self._changes[:kept]
-        row, right = self._total(np.array([changes @ changes[slot], changes @ f]))
+        row, right = self._total(np.array([changes[slot], f]) @ changes.T)
         self._gram[slot, :kept] = self._gram[:kept, slot] = row
         return target - _least_squares(self._gram[:kept, :kept], right) @ self._misses[:kept]
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.solvers.acceptance import Diverged, accepted, converged, convex
-from forward.solvers.anderson import AndersonMixing, Inverse
+from forward.solvers.anderson import AndersonMixing
 from forward.solvers.settings import SolverSettings
+from forward.solvers.steps import Corrector, Steps
 from forward.solvers.system import Found, Residual, System, Way
 
 WINDOW = 8  # differences that Anderson mixing keeps
@@ -17,7 +18,9 @@ SHORTEST = 1 / 8  # fraction of the path from the reference that is not divided 
 ROUNDED = 1e-2  # relative residual above which a useless correction is not due to rounding
 
 
-def predict_correct(system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]) -> Found:
+def predict_correct(
+    system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]
+) -> Steps[Found]:
     """Correct a prediction with a reference factor, in several steps if one is too long; or raise `Diverged`.
 
     With s the slope of the prediction, the state after a fraction t of the path is ū + t s + t² q(t). The first step
@@ -35,9 +38,10 @@ def predict_correct(system: System, settings: SolverSettings, start: FloatArray,
         residual = system.residual(u)
         close = np.isfinite(residual.size)
         if close:
-            u, residual, close = mix(system, tolerance, u, residual, way.inverse(u), settings.corrections, history)
+            correct = way.corrector(u)
+            u, residual, close = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
         if close and target == 1:
-            stability = accepted(system, settings, u, residual, way, history)
+            stability = yield from accepted(system, settings, u, residual, way, history)
             return Found(u, residual.relative, corrected=True, stability=stability)
         if close:
             known.append((target, ((u - way.state) / target - slope) / target))
@@ -67,12 +71,12 @@ def mix(
     tolerance: float,
     u: FloatArray,
     residual: Residual,
-    inverse: Inverse,
+    correct: Corrector,
     limit: int,
     history: list[str],
-) -> tuple[FloatArray, Residual, bool]:
+) -> Steps[tuple[FloatArray, Residual, bool]]:
     """Correct u with one factor; return the best state, its residual, and whether it is an equilibrium."""
-    mixing = AndersonMixing(inverse, WINDOW, len(u), system.total, system.weights())
+    mixing = AndersonMixing(WINDOW, len(u), system.total, system.weights())
     best, smallest, since = u, residual, 0
     sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
@@ -90,7 +94,7 @@ def mix(
         if iteration == limit or since > PATIENCE:
             break
         last = (u, residual)
-        u = mixing.next(u, residual.vector)
+        u = mixing.next(u, residual.vector, (yield from correct(residual.vector)))
         residual = system.residual(u)
         if not np.isfinite(residual.size):
             history.append("correction: the state has no finite residual")

@@ -21,6 +21,7 @@ from forward.solvers.anderson import AndersonMixing
 from forward.solvers.corrections import ROUNDED, WINDOW, predict_correct
 from forward.solvers.newton import admissible_step, factorise, load_steps, newton
 from forward.solvers.settings import SolverSettings
+from forward.solvers.steps import Corrector, Steps, finish, plain
 from forward.solvers.system import Found, Residual, System, Way
 
 ASTRAY = 100  # relative residual after all allowed corrections: the reference is too far away
@@ -34,6 +35,18 @@ def solve(
     way: Way | None = None,
     iterations: int | None = None,
 ) -> Found:
+    """Find the equilibrium as `solving` does, with the factor of the reference at hand."""
+    return finish(solving(system, settings, zero, start, way, iterations), system.solve if way is None else way.solve)
+
+
+def solving(
+    system: System,
+    settings: SolverSettings,
+    zero: FloatArray,
+    start: FloatArray | None = None,
+    way: Way | None = None,
+    iterations: int | None = None,
+) -> Steps[Found]:
     """Find the equilibrium at full load: directly if that converges, else by adaptive load steps from `zero`.
 
     Parameters
@@ -78,7 +91,9 @@ def solve(
     if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
         system.at_load(1.0)
         try:
-            return _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
+            return (
+                yield from _iterate_few(system, settings, zero if start is None else start, way, iterations, history)
+            )
         except Diverged as stop:
             history.append(f"{stop}: the equilibrium is looked for after all")
             failed(stop)
@@ -87,7 +102,7 @@ def solve(
     if way is not None and len(guesses) == 2:
         system.at_load(1.0)
         try:
-            return known(predict_correct(system, settings, guesses[0], way, history))
+            return known((yield from predict_correct(system, settings, guesses[0], way, history)))
         except Unstable as stop:
             failed(stop)
             guesses = [zero]  # from the same prediction Newton would only find the same equilibrium
@@ -109,7 +124,7 @@ def solve(
 
 def _iterate_few(
     system: System, settings: SolverSettings, start: FloatArray, way: Way | None, iterations: int, history: list[str]
-) -> Found:
+) -> Steps[Found]:
     """Make this many iterations, fewer if they meet the tolerance; or raise `Diverged`.
 
     The last state counts, not the one with the smallest residual: the first step of a slender body in bending raises
@@ -117,10 +132,11 @@ def _iterate_few(
     """
     u = system.on_target(start)
     residual = system.residual(u)
-    mixing = None
+    mixing: AndersonMixing | None = None
+    correct: Corrector = plain
     if way is not None and np.isfinite(residual.size):
-        window = min(iterations, WINDOW)
-        mixing = AndersonMixing(way.inverse(u), window, len(u), system.total, system.weights())
+        mixing = AndersonMixing(min(iterations, WINDOW), len(u), system.total, system.weights())
+        correct = way.corrector(u)
     sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(iterations + 1):
@@ -134,13 +150,14 @@ def _iterate_few(
             if mixing is not None and last is not None and not convex(system, last, (u, residual)):
                 message = "the stiffness is indefinite along the last move"
                 raise Diverged(message)
-            stability = accepted(system, settings, u, residual, way if mixing is not None else None, history)
+            tested = accepted(system, settings, u, residual, way if mixing is not None else None, history)
+            stability = yield from tested
             return Found(u, residual.relative, corrected=mixing is not None, stability=stability)
         if iteration == iterations:
             break
         last = (u, residual)
         if mixing is not None:
-            u = mixing.next(u, residual.vector)
+            u = mixing.next(u, residual.vector, (yield from correct(residual.vector)))
             residual = system.residual(u)
         else:
             factorise(system, u)

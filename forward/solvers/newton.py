@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from forward.model import FloatArray, SolveError
+from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.acceptance import Diverged, Unstable, accepted, converged, instability
 from forward.solvers.corrections import mix
 from forward.solvers.settings import SolverSettings
+from forward.solvers.steps import finish, plain
 from forward.solvers.system import Found, Residual, System
 
 QUICK = 5  # after a load step with at most this many iterations, the next one is twice as long
@@ -92,7 +93,7 @@ def _iterate(
     for iteration in range(limit + 1):
         history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if converged(system, settings.tolerance, u, residual, sizes):
-            return Found(u, residual.relative, stability=accepted(system, settings, u, residual)), iteration
+            return Found(u, residual.relative, stability=_accepted(system, settings, u, residual)), iteration
         if iteration == limit:
             break
         factorise(system, u, curved=not system.contact or residual.relative < CURVED)
@@ -106,11 +107,17 @@ def _iterate(
         else:
             u, residual = admissible_step(system, settings, u, step)
         if settings.kind != "newton" and length < NEAR * before < np.inf:
-            u, residual, reached = mix(system, settings.tolerance, u, residual, system.solve, POLISH, history)
+            polish = mix(system, settings.tolerance, u, residual, plain, POLISH, history)
+            u, residual, reached = finish(polish, system.solve)
             if reached:
-                return Found(u, residual.relative, stability=accepted(system, settings, u, residual)), iteration + 1
+                return Found(u, residual.relative, stability=_accepted(system, settings, u, residual)), iteration + 1
     message = f"no convergence in {limit} iterations (relative residual {residual.relative:.3g})"
     raise Diverged(message + instability(system))
+
+
+def _accepted(system: System, settings: SolverSettings, u: FloatArray, residual: Residual) -> Stability:
+    """Accept a state that no reference screens: its negative eigenvalues are counted."""
+    return finish(accepted(system, settings, u, residual), system.solve)
 
 
 def factorise(system: System, u: FloatArray, *, curved: bool = True) -> None:

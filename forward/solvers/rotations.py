@@ -9,11 +9,14 @@ those of the polar decompositions of the deformation gradients: N. J. Higham, SI
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.solvers.anderson import Inverse
+from forward.solvers.steps import Steps
 
 
 def rotations(F: FloatArray) -> FloatArray:
@@ -48,31 +51,41 @@ def turn(x: FloatArray, R: FloatArray) -> FloatArray:
     """Return x (n,) or rows (k, n) with nodal vectors turned by R (3, 3, n_owned); the rest is unchanged."""
     n = 3 * R.shape[2]
     y = np.array(x)
-    for i in range(3):  # nine products of long vectors: much faster than many small matrices
-        y[..., i:n:3] = R[i, 0] * x[..., 0:n:3] + R[i, 1] * x[..., 1:n:3] + R[i, 2] * x[..., 2:n:3]
+    for row in y.reshape(-1, y.shape[-1]):  # products of long vectors: much faster than many small matrices
+        components = np.ascontiguousarray(row[:n].reshape(-1, 3).T)
+        row[:n].reshape(-1, 3)[:] = (R * components).sum(axis=1).T
     return y
 
 
-def turned(inverse: Inverse, R: FloatArray, fixed: NDArray[np.int64]) -> Inverse:
-    """Return x → R K̄⁻¹ Rᵀ x on the free unknowns, and the identity on the prescribed ones.
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """x → R K̄⁻¹ Rᵀ x on the free unknowns, and the identity on the prescribed ones.
 
-    Parameters
+    Attributes
     ----------
-    inverse
-        Applies K̄⁻¹.
     R
         Rotations (3, 3, n_owned) of the nodes, for the first 3 n_owned unknowns.
     fixed
         Positions of the prescribed unknowns.
     """
-    back = R.swapaxes(0, 1)
 
-    def correct(x: FloatArray) -> FloatArray:
-        known = x[..., fixed]
-        y = turn(x, back)
-        y[..., fixed] = 0
-        y = turn(inverse(y), R)
-        y[..., fixed] = known
+    R: FloatArray
+    fixed: NDArray[np.int64]
+
+    def _back(self, x: FloatArray) -> FloatArray:
+        y = turn(x, self.R.swapaxes(0, 1))
+        y[..., self.fixed] = 0
         return y
 
-    return correct
+    def _forth(self, solution: FloatArray, x: FloatArray) -> FloatArray:
+        y = turn(solution, self.R)
+        y[..., self.fixed] = x[..., self.fixed]
+        return y
+
+    def __call__(self, x: FloatArray) -> Steps[FloatArray]:
+        """Apply it to (n,), asking for the back-substitution."""
+        return self._forth((yield self._back(x)), x)
+
+    def by(self, inverse: Inverse) -> Inverse:
+        """Return it as a function, given K̄⁻¹."""
+        return lambda x: self._forth(inverse(self._back(x)), x)

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
+from forward.solvers.steps import Corrector, Steps
 
 Rows = Callable[[FloatArray], FloatArray]  # (k, n) → (k, n), linear in each row
 Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
@@ -154,7 +155,7 @@ class _Space:
         return rows
 
 
-def screen(vectors: FloatArray, multiply: Rows, solve: Rows, free: FloatArray, total: Total) -> Screened:
+def screen(vectors: FloatArray, multiply: Rows, solve: Corrector, free: FloatArray, total: Total) -> Steps[Screened]:
     """Look for a direction in which the stiffness K of a state is negative.
 
     Parameters
@@ -172,7 +173,7 @@ def screen(vectors: FloatArray, multiply: Rows, solve: Rows, free: FloatArray, t
         return NOT_SCREENED
     values, turns = np.linalg.eigh(projected)
     force = (turns[:, 0] @ images) * free
-    z = solve(force[None])[0]
+    z = yield from solve(force)
     *part, size = total(np.append(vectors @ force, z @ force))
     z = z - part @ vectors
     left = size - np.square(part).sum()

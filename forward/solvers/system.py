@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from forward.model import FloatArray, Stability, Work
-from forward.solvers.anderson import Inverse
 from forward.solvers.stability import Screened
+from forward.solvers.steps import Corrector, Steps
 
 
 @dataclass(frozen=True)
@@ -124,14 +124,17 @@ class Way(Protocol):
     def draw(self) -> float:
         """A number in [0, 1) that depends only on the parameters: eigenvalues are counted if it is small."""
 
-    def screen(self, u: FloatArray, residual: Residual) -> Screened:
-        """Return the result of `forward.solvers.stability`'s screen for an equilibrium."""
+    def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
+        """Find the result of `forward.solvers.stability`'s screen for an equilibrium."""
 
     def at(self, fraction: float) -> None:
         """Set the parameters of the system to those after a fraction of the path."""
 
-    def inverse(self, u: FloatArray) -> Inverse:
-        """Return an approximate inverse of the stiffness at u."""
+    def corrector(self, u: FloatArray) -> Corrector:
+        """Return an approximate inverse of the stiffness at u, which asks for solutions as `solve` returns them."""
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve (n,) with the factor at the reference."""
 
 
 class Found(NamedTuple):

@@ -37,6 +37,7 @@ OWN = ""  # name of the first model of an evaluation
 LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers must not overflow or underflow
 MANY = 8  # points among which at least one should have an output that is not small by chance
 TOGETHER = 16  # realisations whose parts of a compact sum are formed at once
+COMPANY, FEW = 16, 16  # points in a block that begin from predictions, and blocks that there are before it is so large
 BLOCKS = 128  # an evaluation is cut into at most this many blocks, unless another number is asked for
 
 
@@ -227,9 +228,14 @@ class Request:
     saturations: float | None = None
 
     def blocks(self, most: int | None = None) -> list[Request]:
-        """Cut into blocks that depend only on the number of points, the size of rows, and `most`."""
-        together = 1 if self.joint is None else self.joint.size
-        size = together * max(1, -(-len(self.points) // (together * (most or BLOCKS))))
+        """Cut into blocks that depend only on the number of points, the size of rows, and `most`.
+
+        Points that are predicted from a reference are cheaper in company: as long as no more blocks than usual are
+        asked for, which is for many groups of ranks, there are several in each.
+        """
+        together, n = 1 if self.joint is None else self.joint.size, len(self.points)
+        company = min(COMPANY, n // FEW) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
+        size = together * max(1, -(-n // (together * (most or BLOCKS))), -(-company // together))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 
 
@@ -453,7 +459,7 @@ class BlockSolver:
         outputs = np.full((n, m), np.nan)
         tangents = np.full((n, m, d), np.nan) if self._tangents else None
         of_meshes = _MeshErrors(n, m, saturations=self._saturations) if self._mesh_errors else None
-        seconds = np.empty(n)
+        seconds, solving = np.empty(n), np.zeros(n)
         work = np.zeros((n, len(WORK)), dtype=np.int64)
         residuals, converged = np.full(n, np.nan), np.zeros(n, dtype=bool)
         stability = np.zeros(n, dtype=np.int8)
@@ -466,6 +472,7 @@ class BlockSolver:
             row = None
             try:
                 solution = next(solutions)
+                solving[i] = time.process_time() - begin
                 if isinstance(solution, SolveError):
                     raise solution
                 if of_meshes is not None:
@@ -492,8 +499,10 @@ class BlockSolver:
                 states = []
             if row is not None:
                 self._keep(rows, row)
-            seconds[i] = time.process_time() - begin
+            seconds[i] = time.process_time() - begin - solving[i]
             progress(1, int(bool(failures) and failures[-1].index == i))
+        for some in (slice(i, i + model.together) for i in range(0, n, model.together)):
+            seconds[some] += solving[some].mean()
         fields = gathered(model, np.concatenate(rows)) if rows else np.zeros((0, 0))
         if fields is None:
             fields = np.zeros((0, 0))

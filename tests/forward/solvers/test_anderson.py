@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from forward.solvers.anderson import AndersonMixing, block_galerkin
-from forward.solvers.rotations import rotations, turned
+from forward.solvers.rotations import Turned, rotations
 
 pytestmark = pytest.mark.unit
 
@@ -65,10 +65,11 @@ def test_mixing_finds_the_fixed_point_that_plain_corrections_miss():
     A, _ = matrices(0.0)
     b = RNG.standard_normal(N)
     inverse = np.eye(N) * 2.5  # plain corrections with it grow
-    mixing, u = AndersonMixing(lambda f: f @ inverse, N, N, same), np.zeros(N)
+    mixing, u = AndersonMixing(N, N, same), np.zeros(N)
     plain = np.zeros(N)
     for _ in range(25):
-        u = mixing.next(u, A @ u - b)
+        f = A @ u - b
+        u = mixing.next(u, f, f @ inverse)
         plain = plain - (A @ plain - b) @ inverse
     assert np.linalg.norm(A @ u - b) < 1e-8 * np.linalg.norm(b)
     assert np.linalg.norm(A @ plain - b) > np.linalg.norm(b)
@@ -79,10 +80,11 @@ def test_mixing_keeps_no_more_than_its_window():
     b = RNG.standard_normal(N)
     counts = []
     for window in (1, 3, 12):
-        mixing, u = AndersonMixing(lambda f: inverse @ f, window, N, same), np.zeros(N)
+        mixing, u = AndersonMixing(window, N, same), np.zeros(N)
         count = 0
         while np.linalg.norm(A @ u - b) > 1e-10:
-            u = mixing.next(u, A @ u - b)
+            f = A @ u - b
+            u = mixing.next(u, f, inverse @ f)
             count += 1
         counts.append(count)
     assert counts[0] > counts[1] > counts[2]
@@ -111,7 +113,7 @@ def test_a_turned_inverse_leaves_prescribed_and_further_unknowns_alone():
     expected = block @ np.linalg.inv(K) @ block.T
     expected[fixed] = np.eye(14)[fixed]
     rows = RNG.standard_normal((2, 14))
-    inverse = turned(lambda x: x @ np.linalg.inv(K), R, fixed)
+    inverse = Turned(R, fixed).by(lambda x: x @ np.linalg.inv(K))
     np.testing.assert_allclose(inverse(rows), rows @ expected.T, atol=1e-14)
     np.testing.assert_allclose(inverse(rows[0]), expected @ rows[0], atol=1e-14)
 

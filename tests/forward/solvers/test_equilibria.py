@@ -14,6 +14,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, ReferenceSolution, SolveError, Stability
 from forward.solvers import stability
 from forward.solvers.rotations import turn
+from forward.solvers.steps import finish, plain
 from uq.estimators import branch
 from uq.evaluation.evaluate import Evaluations, Failure, SerialEvaluate
 from uq.inputs.random_parameters import Inputs
@@ -53,7 +54,8 @@ def test_the_screen_bounds_the_lowest_eigenvalue_from_above_and_sees_its_sign(se
     np.testing.assert_allclose(V @ K @ V.T, np.eye(len(V)), atol=1e-8)
     for t in np.linspace(-3, 3, 25):
         there = K + t * changes[0] + np.cos(t) * changes[1]
-        seen = stability.screen(V, lambda rows: rows @ there, lambda r: np.linalg.solve(K, r.T).T, FREE, whole)  # noqa: B023
+        steps = stability.screen(V, lambda rows: rows @ there, plain, FREE, whole)  # noqa: B023
+        seen = finish(steps, lambda right: np.linalg.solve(K, right))
         lowest = eigh(there, K, eigvals_only=True)[0]
         assert seen.lowest >= lowest - 1e-9
         if lowest < 0.7:

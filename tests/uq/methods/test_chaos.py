@@ -405,10 +405,14 @@ def test_fields_are_the_regression_of_all_states(beam, method):
 
 @pytest.mark.fem
 def test_blocks_change_no_bit_and_keep_states_only(beam, tmp_path, monkeypatch):
-    """Projections are added sample by sample, whatever the blocks; files hold d + 1 fields for each sample."""
+    """Projections are added sample by sample, whatever the blocks; files hold d + 1 fields for each sample.
+
+    Samples are solved one by one here: those of a block would be rounded together.
+    """
     from mpi4py import MPI
 
     inputs, evaluate = beam
+    monkeypatch.setattr(evaluate.model, "together", 1)
     method = Chaos(samples=7)
     expected = method.run(inputs, evaluate)
     monkeypatch.setattr("uq.evaluation.evaluate.BLOCKS", 3)

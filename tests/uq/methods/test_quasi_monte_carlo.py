@@ -695,7 +695,8 @@ def test_fields_do_not_change_scalars_and_are_continued(beam):
     scalars = QuasiMonteCarlo(samples=128, scrambles=8, fields=False).run(inputs, evaluate)
     grown = QuasiMonteCarlo(samples=128, scrambles=8, tolerance=1e-12).run(inputs, evaluate)
     for name in ("points", "values", "mean", "mean_error", "std", "std_error"):
-        np.testing.assert_array_equal(fixed[name], scalars[name])
-        np.testing.assert_array_equal(fixed[name], grown[name])
+        rounding = 1e-11 * float(np.abs(fixed["points" if name == "points" else "values"]).max())
+        for other in (scalars, grown):  # samples of a block are rounded together, and blocks are others
+            np.testing.assert_allclose(other[name], fixed[name], rtol=0, atol=0 if name == "points" else rounding)
     for name in ("field_mean", "field_mean_error", "field_std", "field_std_error"):
         np.testing.assert_allclose(grown[name], fixed[name], rtol=1e-7, atol=1e-14)

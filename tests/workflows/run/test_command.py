@@ -183,7 +183,7 @@ def test_a_model_on_two_ranks_agrees(finished, tmp_path):
 @pytest.mark.mpi
 def test_same_bits_after_kills_and_restarts_on_other_numbers_of_ranks(tmp_path):
     # Kills while errors of the mesh are estimated are in tests/workflows/studies/test_mesh_error.py.
-    arguments = ("run", TINY, "--set", "method.samples=160", "--set", "mesh_error=false", "--no-report", "--out")
+    arguments = ("run", TINY, "--set", "method.samples=480", "--set", "mesh_error=false", "--no-report", "--out")
     whole = tmp_path / "whole"
     assert tissuq(*arguments, whole).returncode == 0
     broken = tmp_path / "broken"
