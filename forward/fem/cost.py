@@ -89,7 +89,7 @@ COPIES = 4  # of the matrix, while what preconditions steps is taken from it
 FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and the corrections needed then
 
 
-# Points that are corrected together (docs/decisions/0027-lockstep.md).
+# Points that are corrected together (docs/decisions/0028-lockstep.md).
 MOST_TOGETHER, BYTES_TOGETHER = 32, 2**27  # points, and what they hold: vectors of unknowns
 HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, rotations
 

@@ -3,7 +3,7 @@
 Most of what a corrected sample costs is reading the factor of the reference for one right-hand side at a time. Samples
 that are corrected together share each reading; everything else (residuals, rotations, what Anderson mixing remembers,
 when to stop, what to do if the reference is too far away) is each sample's own
-(docs/decisions/0027-lockstep.md).
+(docs/decisions/0028-lockstep.md).
 """
 
 from __future__ import annotations
