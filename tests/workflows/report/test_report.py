@@ -491,6 +491,17 @@ def test_pictures_draw_where_they_are_told(sampled):
     assert plots.png(left).startswith(PNG)
 
 
+def test_figures_of_thousands_of_marks_stay_small():
+    """Marks of many sizes are no paths each."""
+    ax = plots.axes()
+    x = np.linspace(0, 1, 400)
+    ax.scatter(x, x**2, s=1 + 20 * x)
+    drawn = plots.svg(ax)
+    assert b"<image" in drawn
+    assert len(drawn) < 100_000
+    assert plots.svg(ax) == drawn
+
+
 @pytest.mark.filterwarnings("error")
 def test_two_samples_of_a_linear_model_are_drawn():
     dataset = solve(study(samples=2, fields=False), lambda p: np.array([p[0] / 750, 0.0]))

@@ -48,7 +48,11 @@ def _points(artist: Any) -> int:
     if hasattr(artist, "get_xdata"):
         return int(np.size(artist.get_xdata()))
     offsets, paths = artist.get_offsets(), artist.get_paths()
-    return max(len(offsets), sum(len(path.vertices) for path in paths), int(np.size(artist.get_array())))
+    drawn = sum(len(path.vertices) for path in paths)
+    sizes = artist.get_sizes() if hasattr(artist, "get_sizes") else ()
+    # Marks of one size are drawn once and repeated; those of many sizes are drawn each.
+    marks = len(offsets) * drawn // max(len(paths), 1) if len(sizes) > 1 else len(offsets)
+    return max(marks, drawn, int(np.size(artist.get_array())))
 
 
 def axes(height: float = 3.2, width: float = 5.4) -> Axes:

@@ -201,7 +201,10 @@ def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, s
 def _both(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, posterior: FloatArray) -> None:
     """Draw the whole prior in a corner, with the posterior in it, each to its own height."""
     corner = ax.inset_axes((0.7, 0.68, 0.29, 0.3))
-    corner.fill_between(values, density / max(float(density.max()), 1e-300), color=PLAIN, alpha=0.35, linewidth=0)
+    every = slice(None, None, max(1, len(values) // 120))
+    corner.fill_between(
+        values[every], density[every] / max(float(density.max()), 1e-300), color=PLAIN, alpha=0.35, linewidth=0
+    )
     corner.fill_between(x, posterior / max(float(posterior.max()), 1e-300), **_FILLED)
     corner.plot([x.mean()] * 2, [0, 1], color=_FILLED["color"], linewidth=1)  # seen also where it is very narrow
     corner.set(yticks=[], xticks=values[[0, -1]], xlim=values[[0, -1]], ylim=(0, 1.1))
