@@ -263,6 +263,9 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     """
     # Samples that are left out together are next to each other.
     n = len(data.points)
+    too_few = f"{n} samples have an answer, too few for an expansion of order 1"
+    if not n:
+        raise SolveError(too_few)
     held = np.arange(n) % min(n, FOLDS)
     order = np.argsort(held, kind="stable")
     data, held = data.some(order), held[order]
@@ -273,8 +276,7 @@ def fit_best(candidates: Candidates, largest: Basis, data: Data) -> Fit:
     if explained.any() and not explained.all():
         scores, _ = _scores(candidates, products, right, data, held, np.flatnonzero(explained))
     if not scores:
-        message = f"{n} samples have an answer, too few for an expansion of order 1"
-        raise SolveError(message)
+        raise SolveError(too_few)
     best = min(score for score, *_ in scores)
     # The smallest of those that are equally good.
     good = [(candidate, folds) for score, candidate, folds in scores if score <= 1.05 * best + 1e-13]

@@ -171,7 +171,8 @@ def test_forces_balance_and_contact_is_from_one_side():
 @pytest.mark.fem
 @pytest.mark.parametrize("shape", ["sphere", "flat"])
 def test_derivatives(shape):
-    spec = body(only(shape, at=(2e-3, 1e-3, SIDE)))
+    # Remainders are seen down to 1e-11 of the outputs: states are solved for further than that.
+    spec = body(only(shape, at=(2e-3, 1e-3, SIDE)), solver={"tolerance": 1e-11})
     names = [f"loads.indenter.{name}" for name in ("depth", "x", "radius", "direction_x")] + ["material.C1"]
     values = np.array([spec.scalars[name].value for name in names])
     scale = np.array([1e-5, 1e-5, 1e-3 * values[2], 1e-3, 1e-3 * values[4]])
