@@ -191,6 +191,11 @@ class Prediction:
         return lambda parameters: Guess(state + (self.coordinates.of(parameters) - here) @ slopes, reference)
 
 
+def company_of(samples: int) -> int:
+    """How many samples that begin from predictions are in one block, of so many in all."""
+    return min(COMPANY, max(samples // FEW, 1))
+
+
 @dataclass(frozen=True)
 class Request:
     """What an evaluation is asked for.
@@ -234,7 +239,7 @@ class Request:
         asked for, which is for many groups of ranks, there are several in each.
         """
         together, n = 1 if self.joint is None else self.joint.size, len(self.points)
-        company = min(COMPANY, n // FEW) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
+        company = company_of(n) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
         size = together * max(1, -(-n // (together * (most or BLOCKS))), -(-company // together))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START
 from forward.machine import MIB, compiled_forms
-from uq.evaluation.evaluate import OWN
+from uq.evaluation.evaluate import OWN, company_of
 from workflows.config.priors import ranges
 from workflows.studies import tolerance_asked
 from workflows.studies.predictions import duration, times_of
@@ -76,7 +76,9 @@ def parts(study: Study) -> list[Part]:
     samples = study.planned - len(found)
     seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
     corrected = samples > 0 and found[0].predicted
-    further = f"{samples:,} further solves, {found[0].sample:.2g} s each"
+    each = found[0].in_company(company_of(samples))
+    seconds *= each / found[0].sample
+    further = f"{samples:,} further solves, {each:.2g} s each"
     return [
         Part(START, "start of the program"),
         *([] if _compiled_before() else [Part(_compilation(study), "compilation of the forms")]),

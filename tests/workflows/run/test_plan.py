@@ -1,11 +1,13 @@
 """What `tissuq check` predicts."""
 
+import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from forward.fem.cost import CORRECTIONS
 from workflows.config.study import load
 from workflows.run.plan import plan
 from workflows.studies.sampling_plan import parts
@@ -114,3 +116,18 @@ def test_tools_that_are_pressed_from_afar_cost_more_than_a_step_further(tmp_path
     assert once.textbook > 2 * steps.textbook / 2
     assert once.corrected > 2 * steps.corrected / 2
     assert once.factorisation == pytest.approx(steps.factorisation / 2)
+
+
+def test_many_samples_share_passes_through_the_factor():
+    """Samples of a block are corrected together from 32 on; what is left are residuals, and a share of the solves."""
+    cost = load(CONFIGS / "beam.toml").model.cost()
+    assert cost.in_company(1) == cost.sample
+    assert cost.in_company(16) == pytest.approx(cost.sample - (CORRECTIONS[True] + 2) * 0.703125 * cost.substitution)
+    assert dataclasses.replace(cost, contact=True).in_company(16) == dataclasses.replace(cost, contact=True).sample
+    each = []
+    for samples in (16, 256):  # without expansions in between
+        study = load(CONFIGS / "beam.toml", [f"method.samples={samples}"])
+        (line,) = (line for line in plan(study, 1) if "further solves" in line)
+        each.append(float(line.split()[-3]))
+    assert each[1] == pytest.approx(cost.in_company(16), rel=0.05)
+    assert each[0] == pytest.approx(cost.sample, rel=0.05)
