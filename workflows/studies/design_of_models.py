@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
@@ -17,7 +17,7 @@ from workflows.config.blocks import Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import ranges
 from workflows.config.report import Report
-from workflows.studies.model_selection import ModelCandidate, changed
+from workflows.studies.model_selection import ModelCandidate, changed, described
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
 
@@ -128,16 +128,10 @@ class DesignOfModels(StudyKind):
     def _mistakes(self) -> Iterator[Mistake]:
         if self.method.criterion != "models":
             yield ("method", "criterion"), "there are candidates, expected 'models'", self.method.criterion
-        for name, candidate in self.candidates.items():
-            place = ("candidates", name)
-            try:
-                spec = _SPEC.validate_python(changed(self.model, candidate.model))
-            except ValidationError as error:
-                for line in error.errors(include_url=False):
-                    yield (*place, "model", *line["loc"]), line["msg"], line["input"]
+        for place, spec, mistakes in described(self.candidates, self.model, _SPEC.validate_python):
+            yield from mistakes
+            if spec is None:
                 continue
-            for where, message, given in (*candidate.mistakes(spec), *spec.mistakes_of_mesh()):
-                yield (*place, *where), message, given
             if self.parallel.ranks_per_model > 1 and not spec.shareable:
                 message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
                 yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -234,16 +234,10 @@ class ModelSelection(Comparison):
         return self
 
     def _mistakes(self) -> Iterator[Mistake]:
-        for name, candidate in self.candidates.items():
-            place = ("candidates", name)
-            try:
-                spec = self.spec_of(changed(self.model, candidate.model))
-            except ValidationError as error:
-                for line in error.errors(include_url=False):
-                    yield (*place, "model", *line["loc"]), line["msg"], line["input"]
+        for place, spec, mistakes in described(self.candidates, self.model, self.spec_of):
+            yield from mistakes
+            if spec is None:
                 continue
-            for where, message, given in (*candidate.mistakes(spec), *spec.mistakes_of_mesh()):
-                yield (*place, *where), message, given
             if spec.coefficients:
                 message = "random fields, expected numbers only: evidences are of few parameters"
                 yield (*place, "model", "fields"), message, len(spec.coefficients)
@@ -264,6 +258,24 @@ def _bytes(specs: Iterable[Any]) -> float:
     for cost in (one.cost() for one in specs):
         found += 0.0 if cost is None else cost.bytes
     return found
+
+
+def described(
+    candidates: Mapping[str, ModelCandidate],
+    block: Mapping[str, Any],
+    spec_of: Callable[[Mapping[str, Any]], ModelSpec],
+) -> Iterator[tuple[tuple[str, str], ModelSpec | None, list[Mistake]]]:
+    """Find the place of each candidate in a study, its model (None if it is none), and what is wrong with it."""
+    for name, candidate in candidates.items():
+        place = ("candidates", name)
+        try:
+            spec = spec_of(changed(block, candidate.model))
+        except ValidationError as error:
+            lines = error.errors(include_url=False)
+            yield place, None, [((*place, "model", *line["loc"]), line["msg"], line["input"]) for line in lines]
+            continue
+        found = (*candidate.mistakes(spec), *spec.mistakes_of_mesh())
+        yield place, spec, [((*place, *where), message, given) for where, message, given in found]
 
 
 def changed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
