@@ -13,9 +13,10 @@ from uq.evaluation.evaluate import Evaluate, Request, SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import random_points, sobol_points
 from uq.surrogates.basis import orthonormal
+from uq.surrogates.candidates import whole
 from uq.surrogates.field_regression import Projections, StateExpansion
+from uq.surrogates.least_squares import Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise
-from uq.surrogates.regression import Data, fit_best, whole
 
 DRAWS = 50
 ORDER, SOLVES = 3, 16  # of the chaos prediction, which is fitted to values and gradients

@@ -19,7 +19,8 @@ from uq.methods.compare import Compare
 from uq.methods.derivative_based import DerivativeBased
 from uq.methods.method import METHODS  # noqa: F401, the methods that a comparison names
 from uq.surrogates.basis import orthonormal
-from uq.surrogates.regression import DICTIONARY, Data, candidates_of, fit_best
+from uq.surrogates.candidates import DICTIONARY, candidates_of
+from uq.surrogates.least_squares import Data, fit_best
 
 SAMPLES = 200  # values of a fit
 UNIT = Uniform(lower=0.0, upper=1.0)

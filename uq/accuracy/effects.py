@@ -26,8 +26,8 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import even_points
 from uq.surrogates.expansion import Expansion
+from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.regression import NOTHING
 
 if TYPE_CHECKING:
     import xarray as xr

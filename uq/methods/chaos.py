@@ -25,6 +25,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.stopping import Amount
 from uq.surrogates.basis import Basis, gauss, orthonormal
+from uq.surrogates.candidates import DICTIONARY, FULL, ROWS_PER_TERM, candidates_of, rows_of, whole
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
@@ -34,21 +35,9 @@ from uq.surrogates.field_regression import (
     relative_of_field,
     solved,
 )
+from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import (
-    DICTIONARY,
-    FULL,
-    NOTHING,
-    ROUNDING,
-    ROWS_PER_TERM,
-    TRUSTED,
-    Data,
-    Regression,
-    candidates_of,
-    fit_best,
-    rows_of,
-    whole,
-)
+from uq.surrogates.regression import TRUSTED, Regression
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -56,8 +56,9 @@ from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, failure_note
 from uq.methods.stopping import Amount
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
+from uq.surrogates.candidates import FULL
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import FULL, Regression
+from uq.surrogates.regression import Regression
 
 if TYPE_CHECKING:
     import xarray as xr

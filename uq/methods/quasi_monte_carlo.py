@@ -37,9 +37,10 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, MonteCarlo, by_node, failure_note
+from uq.surrogates.candidates import FULL, ROWS_PER_TERM
 from uq.surrogates.field_regression import Deviations, fit_deviations
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import FULL, ROWS_PER_TERM, beyond
+from uq.surrogates.regression import beyond
 from uq.surrogates.taylor import Control, expansion, held_expansion, quadratic, tangent
 
 if TYPE_CHECKING:

@@ -50,8 +50,9 @@ from uq.inputs.sampling import check_scrambles, power_of_two, sobol_points
 from uq.methods.chaos import LARGEST, Chaos, expansion_dataset
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, Probability, by_node
 from uq.methods.stopping import Amount
+from uq.surrogates.least_squares import NOTHING
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import NOTHING, Regression
+from uq.surrogates.regression import Regression
 
 if TYPE_CHECKING:
     import xarray as xr

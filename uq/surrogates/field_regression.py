@@ -23,17 +23,10 @@ from uq.estimators.indices import partial_variances, shares
 from uq.evaluation.evaluate import Evaluate, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.basis import Basis, orthonormal
+from uq.surrogates.candidates import candidates_of, rows_of
+from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.regression import (
-    NOTHING,
-    ROUNDING,
-    Data,
-    Fit,
-    Regression,
-    candidates_of,
-    fit_best,
-    rows_of,
-)
+from uq.surrogates.regression import Regression
 
 FIELD_DICTIONARY = 500  # functions to select from, at most; each needs a field in memory
 SKETCHES = 8  # of each sample's field
