@@ -2,10 +2,11 @@
 
 SYSTEM_PYTHON := /usr/bin/python3
 PACKAGES := python3-dolfinx python3-h5py-mpi libopenblas0-serial openmpi-bin \
-    python3-venv python3-dev gcc g++ \
-    libegl1 libgl1-mesa-dri libxrender1
+    python3-venv python3-dev gcc g++
+GRAPHICS := libegl1 libgl1-mesa-dri libxrender1
 PYTHON := .venv/bin/python
 READY := .venv/ready
+RUNS := .venv/runs
 # The second lane: DOLFINx from a wheel, for another Python. The first of these that runs; pyenv hides its own.
 WHEEL_PYTHON = $(shell for python in python3.12 python3.13 python3.14 $$(ls -d $$HOME/.pyenv/versions/3.1[2-4].*/bin/python 2>/dev/null); \
     do $$python -c 'import venv, ensurepip' 2>/dev/null && echo $$python && break; done)
@@ -18,6 +19,7 @@ DEMO := beam
 # Files of tests go to as many workers as there are cores; a file stays together, since its tests share what is built.
 WORKERS := --numprocesses auto --dist loadfile
 ARGS :=
+INSTALL = PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --no-compile --editable
 
 # Open MPI refuses root without these two; one BLAS thread per rank.
 export OMPI_ALLOW_RUN_AS_ROOT := 1
@@ -28,7 +30,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint bench docs clean system browser
+.PHONY: help setup setup-wheel demo test test-unit test-all test-wheel lint notebooks bench docs clean system graphics browser
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -37,7 +39,7 @@ setup: $(READY) ## install what is missing
 
 setup-wheel: $(WHEEL_READY) ## install DOLFINx 0.11 from PyPI into .venv-wheel (Python 3.12 or newer)
 
-demo: $(READY) ## run configs/beam.toml on 2 ranks; its last line says where the report is
+demo: $(or $(wildcard $(READY)),$(RUNS)) ## run configs/beam.toml on 2 ranks; its last line says where the report is
 	@mpirun -n 2 --oversubscribe --bind-to none .venv/bin/tissuq run configs/$(DEMO).toml --out results/$(DEMO)
 
 test: $(READY) browser ## run the test suite (ARGS="-k word" goes to pytest)
@@ -59,6 +61,9 @@ lint: $(READY) ## check style, types and layers
 	@.venv/bin/lint-imports
 	@$(PYTHON) -m tests.circles
 
+notebooks: $(READY) ## run the notebooks, and leave them in results/notebooks with their pictures
+	@$(PYTHON) -m tests.notebooks $(ARGS)
+
 bench: $(READY) ## measure times
 	@$(PYTHON) -m benchmarks $(ARGS)
 
@@ -75,6 +80,9 @@ browser:
 	@command -v chromium >/dev/null || ! command -v apt-get >/dev/null || $(MAKE) --no-print-directory system PACKAGES=chromium || \
 	    echo "Chromium could not be installed: reports are not tested in a browser" >&2
 
+graphics:
+	@$(MAKE) --no-print-directory system PACKAGES="$(GRAPHICS)"
+
 system:
 	@missing=; for package in $(PACKAGES); do \
 	    case "$$(dpkg-query -W -f '$${db:Status-Status}' $$package 2>/dev/null || true)" in \
@@ -88,25 +96,25 @@ system:
 	    $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
 	fi
 
-# Debian's h5py is there, but under a name that pip does not know: tell pip, or it fetches a wheel that breaks DOLFINx.
-# A constraint file given by environment holds for build environments too.
-$(READY): pyproject.toml constraints.txt | system
+# What runs studies, and what tests, documentation and notebooks need besides. A constraint file given by environment
+# holds for build environments too. Files of packages are compiled when they are first used, which most never are.
+$(RUNS): pyproject.toml constraints.txt | system
 	@echo "installing Python packages into .venv"
 	@$(SYSTEM_PYTHON) -m venv --system-site-packages .venv
-	@$(PYTHON) -c 'import h5py, pathlib, sysconfig; \
-	    info = pathlib.Path(sysconfig.get_path("purelib"), f"h5py-{h5py.__version__}.dist-info"); \
-	    info.mkdir(exist_ok=True); \
-	    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: h5py\nVersion: {h5py.__version__}\n")'
-	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(PYTHON) -m pip install --quiet --editable '.[dev]'
+	@$(INSTALL) .
 	@$(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
 	@touch $@
 
-# Files of packages are compiled when they are first used, which most never are.
+$(READY): $(RUNS) | graphics
+	@echo "installing what tests, documentation and notebooks need"
+	@$(INSTALL) '.[dev]'
+	@touch $@
+
 $(WHEEL_READY): pyproject.toml constraints.txt
 	@[ -n "$(WHEEL_PYTHON)" ] || { echo "no Python 3.12 or newer found" >&2; exit 1; }
 	@echo "installing Python packages into $(WHEEL_VENV)"
 	@$(WHEEL_PYTHON) -m venv $(WHEEL_VENV)
 	@PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(WHEEL_VENV)/bin/python -m pip install --quiet --no-compile \
-	    --editable '.[fenicsx]' dynesty hatchling hypothesis jsonschema pytest SALib
+	    --editable '.[fenicsx,vtk]' dynesty hatchling hypothesis jsonschema pytest SALib
 	@$(WHEEL_VENV)/bin/python -c 'import dolfinx_solver, dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
 	@touch $@

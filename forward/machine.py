@@ -32,6 +32,12 @@ OUT_OF_MEMORY = (
     "out of memory",
     "virtual memory exhausted",
 )
+FENICSX = {"dolfinx", "dolfinx_solver", "basix", "ffcx", "ufl", "petsc4py", "mpi4py", "h5py"}
+HOW_TO_INSTALL = (
+    "tissuq needs FEniCSx. On Debian 12: apt-get install python3-dolfinx python3-h5py-mpi libopenblas0-serial, and "
+    "install tissuq in an environment of `/usr/bin/python3 -m venv --system-site-packages`; elsewhere, with Python "
+    "3.12 or newer: pip install 'tissuq[fenicsx]', and `import dolfinx_solver` before dolfinx in your own code"
+)
 NO_ROOM = ("no space left on device", "disk quota exceeded", "file too large")
 
 
@@ -234,9 +240,18 @@ def reason_to_stop(error: BaseException, needed: float | None = None) -> str | N
     if room is not None:
         return f"{room}; the same command continues once there is room"
     if not out_of_memory(error):
-        return None
+        return missing(error)
     wants = "" if needed is None else f"about {needed / MIB:,.0f} MiB are needed in all, "
     return f"memory ran out: {wants}{headroom()} now; the same command continues where there is more"
+
+
+def missing(error: BaseException) -> str | None:
+    """Say in a line what to install, if an exception or one of its causes says that FEniCSx is not there."""
+    for one in _chain(error):
+        name = (one.name or "").partition(".")[0] if isinstance(one, ImportError) else ""
+        if name in FENICSX:
+            return f"{name} cannot be imported ({' '.join(str(one).split())}): {HOW_TO_INSTALL}"
+    return None
 
 
 def write_whole(path: Path, data: bytes) -> None:

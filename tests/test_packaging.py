@@ -1,12 +1,17 @@
 """What is installed: one package in site-packages, which finds the others in itself."""
 
+import re
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
 
-from tests.launch import ROOT
+from tests.launch import ROOT, environment
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +32,7 @@ def python(site, folder, *arguments):
     return subprocess.run(
         [sys.executable, *arguments],
         cwd=folder,
-        env={"PYTHONPATH": str(site)},
+        env=environment() | {"PYTHONPATH": str(site)},
         check=False,
         capture_output=True,
         text=True,
@@ -59,3 +64,96 @@ def test_another_package_of_that_name_is_not_taken_for_it(site, tmp_path):
     (tmp_path / "forward.py").write_text("")
     done = python(site, tmp_path, "-c", "import forward, tissuq")
     assert "a module called 'forward'" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("absent", ["dolfinx", "petsc4py", "mpi4py", "h5py"])
+def test_a_run_without_fenicsx_says_in_a_line_how_to_get_it(site, tmp_path, absent):
+    words = ["run", str(ROOT / "configs" / "tiny.toml"), "--out", str(tmp_path / "out")]
+    script = f"import sys; sys.modules['{absent}'] = None; from tissuq.__main__ import main; sys.exit(main({words}))"
+    done = python(site, tmp_path, "-c", script)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"failed: {absent} cannot be imported")
+    assert "apt-get install python3-dolfinx python3-h5py-mpi" in line
+    assert "pip install 'tissuq[fenicsx]'" in line
+
+
+def test_a_script_without_fenicsx_is_told_too(site, tmp_path):
+    script = (
+        "import sys; sys.modules['petsc4py'] = None; import tissuq; "
+        f"tissuq.Model(tissuq.load({str(ROOT / 'configs' / 'tiny.toml')!r}).model)"
+    )
+    assert "pip install 'tissuq[fenicsx]'" in python(site, tmp_path, "-c", script).stderr.splitlines()[-1]
+
+
+def test_on_debian_pip_takes_nothing_that_its_dolfinx_brings(site):
+    """Debian's h5py has a name that pip does not know; another NumPy would break its DOLFINx."""
+    (information,) = site.glob("tissuq-*.dist-info")
+    lines = (information / "METADATA").read_text().splitlines()
+    needed = [Requirement(line.removeprefix("Requires-Dist: ")) for line in lines if line.startswith("Requires-Dist: ")]
+    debian = {"python_version": "3.11", "extra": ""}
+    on_debian = {one.name: one for one in needed if one.marker is None or one.marker.evaluate(debian)}
+    assert not {"h5py", "pyvista", "dolfinx-solver-real"} & set(on_debian)
+    assert "1.24.2" in on_debian["numpy"].specifier
+    assert "1.26.0" not in on_debian["numpy"].specifier
+
+
+def test_the_source_archive_holds_what_the_wheel_is_made_from(site, tmp_path):
+    build = "import sys; from hatchling.build import build_sdist; print(build_sdist(sys.argv[1]))"
+    done = subprocess.run(
+        [sys.executable, "-c", build, tmp_path], check=True, cwd=ROOT, capture_output=True, text=True
+    ).stdout.split()
+    with tarfile.open(tmp_path / done[-1]) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    packages = site / "tissuq" / "_packages"
+    installed = {
+        str(path.relative_to(packages)) for path in packages.rglob("*") if path.is_file() and path.suffix != ".pyc"
+    }
+    assert installed <= held
+    assert {"Makefile", "constraints.txt", "configs/tiny.toml", "docs/tutorial.md", "LICENSE"} <= held
+
+
+PAGE = (ROOT / "docs" / "install.md").read_text()
+RECIPES = {name: (ROOT / "packaging" / name).read_text() for name in ("Dockerfile", "tissuq.def", "conda/recipe.yaml")}
+
+
+def variable(name):
+    """A variable of the Makefile, as words."""
+    found = re.search(rf"^{name} :?= ((?:.*\\\n)*.*)$", (ROOT / "Makefile").read_text(), re.M)
+    return found[1].replace("\\\n", " ").split()
+
+
+def test_containers_take_the_packages_and_versions_of_the_makefile():
+    install = [*variable("INSTALL")]
+    for name in ("Dockerfile", "tissuq.def"):
+        joined = RECIPES[name].replace("\\\n", " ")
+        taken = re.search(r"--no-install-recommends (.*?)(?:&&|\n)", joined)[1].split()
+        assert taken == variable("PACKAGES")
+        pip = next(line for line in joined.replace("&&", "\n").splitlines() if "pip install" in line).split()
+        assert pip[0] == f"PIP_CONSTRAINT=/src/{install[0].partition('=')[2]}"
+        assert "--no-compile" in pip
+    assert set(re.search(r"apt-get install (.*)", PAGE)[1].split()) == set(variable("PACKAGES"))
+
+
+def test_the_page_has_the_commands_of_the_recipes():
+    for name in ("Dockerfile", "tissuq.def"):
+        for command in re.findall(r"^#     (.*)$", RECIPES[name], re.M):
+            assert f"    {command}\n" in PAGE
+    for path in re.findall(r"packaging/[\w./]+\w", PAGE):
+        assert (ROOT / path).exists()
+
+
+def test_the_recipe_of_conda_needs_what_the_wheel_needs():
+    recipe = yaml.safe_load(re.sub(r"\$\{\{.*?\}\}", "x", RECIPES["conda/recipe.yaml"]))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert recipe["context"]["version"] == project["version"]
+    run = {line.split()[0] for line in recipe["requirements"]["run"]}
+    needed = {Requirement(line).name for line in project["dependencies"]}
+    assert run - {"python", "c-compiler", "fenics-dolfinx", "petsc4py", "h5py"} == (needed - {"matplotlib"}) | {
+        "matplotlib-base"
+    }
+
+
+def test_the_extras_of_the_page_are_those_that_there_are():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(extras) - {"benchmarks", "check", "dev"}

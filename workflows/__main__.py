@@ -1,4 +1,4 @@
-"""The command line: tissuq check | run | report | serve | init | schema."""
+"""The command line: tissuq check | run | report | serve | init | schema | completion."""
 
 from __future__ import annotations
 
@@ -125,6 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
     report.add_argument("--out", type=Path, metavar="FILE", help="file of a comparison (default: comparison.html)")
     schema = commands.add_parser("schema", help="print the JSON Schema of study files, for editors")
+    completion = commands.add_parser("completion", help="print what lets a shell complete commands, options and files")
+    completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
     init.add_argument("kind", metavar="KIND", help="a method.kind, such as chaos; `tissuq init list` names them all")
     check.set_defaults(command=_check)
     run.set_defaults(command=_run)
@@ -132,6 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     serve.set_defaults(command=_serve)
     init.set_defaults(command=_init)
     schema.set_defaults(command=_schema)
+    completion.set_defaults(command=_completion)
     return parser
 
 
@@ -217,6 +220,13 @@ def _init(options: argparse.Namespace) -> int:
     from workflows.starter import starter
 
     sys.stdout.write(starter(options.kind))
+    return DONE
+
+
+def _completion(options: argparse.Namespace) -> int:
+    from workflows.completion import completion
+
+    sys.stdout.write(completion(options.shell, _parser()))
     return DONE
 
 

@@ -81,7 +81,9 @@ def points_of(path: Path) -> Points:
     except DataError:
         raise
     except ImportError as error:
-        raise DataError(f"{path.name}: files of this kind need {error.name} (pip install {error.name})") from None
+        package = (error.name or "").partition(".")[0]
+        wanted = {"vtkmodules": "'tissuq[vtk]'"}.get(package, package)
+        raise DataError(f"{path.name}: files of this kind need {package} (pip install {wanted})") from None
     except Exception as error:  # files may be anything, and their readers fail in many ways
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DataError(one_line(f"{path.name}: cannot be read as {path.suffix}: {reason}")) from None

@@ -33,13 +33,12 @@ def test_every_line_runs(path, monkeypatch, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_jupyter_executes_it_and_shows_pictures(path, monkeypatch, tmp_path):
-    nbclient, jupytext = pytest.importorskip("nbclient"), pytest.importorskip("jupytext")
+    pytest.importorskip("nbclient")
+    from tests.notebooks import executed
+
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    notebook = jupytext.read(path)
-    notebook.metadata.pop("kernelspec", None)
-    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}})
-    client.execute()
+    notebook = executed(path, timeout=300)
     shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
     assert sum("image/png" in data for data in shown) >= 2
 

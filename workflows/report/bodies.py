@@ -17,8 +17,7 @@ import numpy as np
 from forward.model import FloatArray
 from workflows.report.scene.scene import up_of
 from workflows.results.directory import body_grid, mesh_grid
-from workflows.results.tools import surface as tool_surface
-from workflows.results.tools import tools_of
+from workflows.results.tools import tool_grid, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -128,7 +127,7 @@ def body(dataset: xr.Dataset, shown: str = "mean", skin: Skin | None = None) -> 
     )
     plotter.add_mesh(edges, color=DARK, line_width=1.5)
     for tool in () if undeformed else tools_of(dataset):
-        plotter.add_mesh(tool_surface(tool, still), color=TOOL, opacity=0.45, smooth_shading=True)
+        plotter.add_mesh(tool_grid(tool, still).pyvista(), color=TOOL, opacity=0.45, smooth_shading=True)
     _show_lengths(plotter, np.concatenate([still, moved]), up_of(dataset))
     _look(plotter, up_of(dataset))
     plotter.subplot(1, 0)

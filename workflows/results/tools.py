@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray
+from workflows.results.level import IntArray, level
 from workflows.results.vtu import Grid
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from forward.terms.indenter import Indenter
 
 TRIANGLE = 5  # of VTK
-POINTS = 96  # of the lattice on which distances are computed, along each axis
+POINTS = 40  # of the lattice on which distances are computed, along each axis
 SHOWN = 0.35  # part of the body's extent that a tool without end is drawn over, to each side
 
 
@@ -42,26 +43,23 @@ def tools_of(dataset: xr.Dataset) -> Iterator[Indenter]:
         yield Indenter.model_validate(block | own)
 
 
-def surface(tool: Indenter, points: FloatArray) -> Any:
-    """Return the surface of a tool at its depth, as a pyvista mesh: where the distance from it is zero.
+def surface(tool: Indenter, points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return points (n, 3) and triangles (t, 3) of the surface of a tool at its depth: where the distance is zero.
 
     Parameters
     ----------
     points
         Points (n, 3) of the body (m); tools without end are drawn as far as it reaches.
     """
-    import pyvista
-
-    if tool.shape == "plane":
-        centre, extent = middle(tool, points)
-        return pyvista.Plane(
-            center=[float(x) for x in centre], direction=tool.along, i_size=1.1 * extent, j_size=1.1 * extent
-        )
-    low, high = around(tool, points)
-    spacing = (high - low) / (POINTS - 1)
-    lattice = pyvista.ImageData(dimensions=(POINTS,) * 3, spacing=tuple(spacing), origin=tuple(low))
-    lattice.point_data["gap"] = tool.gaps(np.asarray(lattice.points))
-    return lattice.contour([0.0], scalars="gap")
+    if tool.shape != "plane":
+        return level(tool.gaps, *around(tool, points), POINTS)
+    centre, extent = middle(tool, points)
+    d = np.array(tool.along)
+    one = np.cross(d, np.eye(3)[int(np.abs(d).argmin())])
+    one *= 0.55 * extent / np.linalg.norm(one)
+    other = np.cross(d, one) / np.linalg.norm(d)
+    corners = centre + np.array([one + other, other - one, -one - other, one - other])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def middle(tool: Indenter, points: FloatArray) -> tuple[FloatArray, float]:
@@ -90,5 +88,5 @@ def around(tool: Indenter, points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
     """Return the surface of a tool, in triangles."""
-    triangles = surface(tool, points).triangulate()
-    return Grid(np.asarray(triangles.points), triangles.regular_faces, TRIANGLE)
+    places, triangles = surface(tool, points)
+    return Grid(places, triangles, TRIANGLE)

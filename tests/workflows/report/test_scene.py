@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from forward.terms.indenter import Indenter
-from tests.forward.terms.test_indenter import SHAPES, SIDE, only
 from tests.workflows.report.test_report import CUBE, HEXAHEDRON, PNG, solve, study
 from workflows.report.scene.pack import Packer
-from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, outline, packed
-from workflows.report.scene.skin import level, skin, split, tetrahedra
+from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, packed
+from workflows.report.scene.skin import skin, split
 from workflows.report.scene.sliders import sliders
 from workflows.report.scene.still import still
+from workflows.results.level import level, tetrahedra
 
 pytestmark = pytest.mark.unit
 pyvista = pytest.importorskip("pyvista")
@@ -82,14 +81,6 @@ def test_levels_are_where_a_function_is_zero():
     assert np.abs(distance(points)).max() < 2e-3
     assert volume(points, triangles) == pytest.approx(4 / 3 * np.pi * 0.027, rel=0.02)
     assert len(split(points, triangles).nodes) == len(np.unique(triangles))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_outlines_of_tools_lie_on_them(shape):
-    tool = Indenter.model_validate(only(shape, at=(0.4 * SIDE, 0.5 * SIDE, SIDE)))
-    points, triangles = outline(tool, SIDE * CUBE)
-    assert len(triangles) >= 2
-    assert np.abs(tool.gaps(points)).max() < 0.02 * SIDE
 
 
 def unpacked(told, text):

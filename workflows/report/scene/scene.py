@@ -14,15 +14,15 @@ from forward.bodies.inclusions import INDICATORS, OPS
 from forward.model import FloatArray
 from workflows.report.readable import spoken
 from workflows.report.scene.pack import Packer
-from workflows.report.scene.skin import IntArray, Skin, level, skin, split, tetrahedra
+from workflows.report.scene.skin import Skin, skin, split
 from workflows.report.scene.sliders import Sliders, sliders
+from workflows.results.level import IntArray, level, tetrahedra
 from workflows.results.points import has_points, measured_points
-from workflows.results.tools import around, middle, tools_of
+from workflows.results.tools import surface, tools_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.terms.indenter import Indenter
 
 DERIVATIVES_SHOWN = 6  # parameters whose effect on the body is shown
 MAPS_SHOWN = 6  # parameters whose indices are
@@ -166,19 +166,6 @@ def up_of(dataset: xr.Dataset) -> FloatArray:
     return up
 
 
-def outline(tool: Indenter, points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return points (n, 3) and triangles (t, 3) of the surface of a tool at its depth, beside points of a body."""
-    if tool.shape != "plane":
-        return level(tool.gaps, *around(tool, points), 40)
-    centre, extent = middle(tool, points)
-    d = np.array(tool.along)
-    one = np.cross(d, np.eye(3)[int(np.abs(d).argmin())])
-    one *= 0.55 * extent / np.linalg.norm(one)
-    other = np.cross(d, one) / np.linalg.norm(d)
-    corners = centre + np.array([one + other, other - one, -one - other, one - other])
-    return corners, np.array([[0, 1, 2], [0, 2, 3]])
-
-
 def _mesh(dataset: xr.Dataset) -> tuple[FloatArray, IntArray, int]:
     cells = dataset["cell_nodes"]
     return dataset["node_position"].to_numpy(), cells.to_numpy().astype(np.int64), int(cells.attrs["vtk_cell_type"])
@@ -268,7 +255,7 @@ def skin_triangles(points: FloatArray, cells: IntArray, kind: int) -> IntArray:
 
 def _tools(of: xr.Dataset, points: FloatArray) -> Iterator[Inside]:
     for tool in tools_of(of):
-        at, triangles = outline(tool, points)
+        at, triangles = surface(tool, points)
         yield Inside(f"tool {tool.label}", triangles, at, "tool", 0.5)
 
 

@@ -12,7 +12,7 @@ from forward.words import named
 from uq.surrogates.expansion import Expansion
 from workflows.report.readable import spoken
 from workflows.report.scene.pack import Packer
-from workflows.report.scene.skin import IntArray
+from workflows.results.level import IntArray
 
 if TYPE_CHECKING:
     import xarray as xr

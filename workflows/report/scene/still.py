@@ -11,7 +11,7 @@ import numpy as np
 from forward.model import FloatArray
 from workflows.report.readable import scale
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends
-from workflows.report.scene.skin import IntArray
+from workflows.results.level import IntArray
 
 SIZE = (7.2, 4.8)  # inches
 DPI = 110

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from workflows.report.scene.scene import Scene
 
 STILLS = 2  # pictures for paper
-NO_BODY = "The mesh could not be drawn on this machine: drawing needs OpenGL without a display (Debian: libegl1)."
+NO_BODY = (
+    "The mesh could not be drawn on this machine: that needs pyvista (pip install 'tissuq[vtk]') and OpenGL without a "
+    "display (Debian: libegl1)."
+)
 
 
 class Body(Section):

@@ -1,0 +1,70 @@
+"""Completion of the command line, in the shells themselves."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from tests.launch import ROOT, TISSUQ
+from workflows.__main__ import _parser
+from workflows.completion import SHELLS, commands, completion
+from workflows.starter import starter
+
+pytestmark = pytest.mark.unit
+
+
+def in_shell(shell, text, folder=ROOT):
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    done = subprocess.run([shell, "-c", text], check=False, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def in_bash(*words, folder=ROOT):
+    """What bash offers for the last of some words."""
+    typed = " ".join(f"'{word}'" for word in ("tissuq", *words))
+    script = completion("bash", _parser())
+    at = f"COMP_WORDS=({typed}); COMP_CWORD={len(words)}; _tissuq; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    return in_shell("bash", f"{script}\n{at}", folder)
+
+
+def test_every_command_and_option_is_known():
+    found = {one.name: one for one in commands(_parser())}
+    assert list(found) == ["check", "run", "report", "serve", "init", "schema", "completion"]
+    assert {option.name for option in found["run"].options} == {"--help", "--set", "--out", "--quiet", "--no-report"}
+    for shell in SHELLS:
+        script = completion(shell, _parser())
+        for one in found.values():
+            for option in one.options:
+                assert option.name.removeprefix("--") in script
+
+
+def test_bash_completes_commands_options_kinds_and_files(tmp_path):
+    assert in_bash("re") == ["report"]
+    assert in_bash("run", "--no") == ["--no-report"]
+    assert set(in_bash("init", "sens")) == {"sensitivity-monte-carlo"}
+    assert set(in_bash("init", "")) == {*starter("list").split(), "list"}
+    for name in ("one.toml", "other.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "on").mkdir()
+    assert in_bash("check", "o", folder=tmp_path) == ["one.toml", "on"]
+    assert set(in_bash("run", "--out", "o", folder=tmp_path)) == {"on", "one.toml", "other.txt"}
+    assert in_bash("run", "--set", "") == []
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_can_read_theirs(shell, tmp_path):
+    (tmp_path / "script").write_text(completion(shell, _parser()))
+    in_shell(shell, f"{shell} -n script", tmp_path)
+
+
+def test_fish_completes():
+    script = completion("fish", _parser())
+    offered = in_shell("fish", f"{script}\ncomplete -C 'tissuq re'")
+    assert offered[0] == "report"
+
+
+def test_the_command_prints_it():
+    done = subprocess.run([TISSUQ, "completion", "bash"], check=True, capture_output=True, text=True)
+    assert done.stdout == completion("bash", _parser())
