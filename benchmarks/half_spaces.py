@@ -19,7 +19,7 @@ from scipy.integrate import trapezoid
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
-from forward.bodies.mesh_file import Loaded
+from forward.bodies.mesh import Loaded
 from forward.bodies.tetrahedra import packed
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray

@@ -20,7 +20,8 @@ from forward import adapt as adaptive
 from forward.adapt import Adapt
 from forward.bodies.geometry import AXES, Axis, Body, Vector, holds, moved_points, unit_vector
 from forward.bodies.inclusions import Inclusion
-from forward.bodies.mesh_file import Contents, MeshFile
+from forward.bodies.mesh import Contents
+from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
 from forward.fem.cost import Estimate, Times, held_together, sum_of, times

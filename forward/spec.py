@@ -18,7 +18,7 @@ from forward.settings import Settings
 from forward.words import named
 
 if TYPE_CHECKING:
-    from forward.bodies.mesh_file import Contents
+    from forward.bodies.mesh import Contents
     from forward.fem.cost import Estimate
     from forward.fem.cost import Times as Times  # noqa: PLC0414 - methods know it from here
     from forward.fem.locking import Ranges

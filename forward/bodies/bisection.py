@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh_file import IntArray, Loaded
+from forward.bodies.mesh import IntArray, Loaded
 from forward.model import FloatArray, ModelError
 
 BoolArray = NDArray[np.bool_]

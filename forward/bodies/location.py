@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh_file import nearest_of
 from forward.model import FloatArray
 
 ROUNDING = 1e-12  # of the extent of the mesh: distance that counts as rounding
@@ -140,3 +139,22 @@ def _in_hexahedra(corners: FloatArray, points: FloatArray) -> FloatArray:
         if moved < 1e-14:
             break
     return x
+
+
+def nearest_of(triangles: FloatArray, point: FloatArray) -> FloatArray:
+    """Return the place (n, 3) of each triangle (n, 3, 3) that is nearest to a point (3,), or to one (n, 3) each."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    square = (normal**2).sum(axis=1)
+    foot = point - (((point - a) * normal).sum(axis=1) / square)[:, None] * normal
+    inside = np.ones(len(triangles), dtype=bool)
+    best, least = foot, np.full(len(triangles), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along = end - start
+        inside &= (np.cross(along, foot - start) * normal).sum(axis=1) >= 0
+        share = np.clip(((point - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+        place = start + share[:, None] * along
+        distance = ((place - point) ** 2).sum(axis=1)
+        best = np.where((distance < least)[:, None], place, best)
+        least = np.minimum(least, distance)
+    return np.where(inside[:, None], foot, best)

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
-from forward.bodies.mesh_file import MeshFile, nearest_of
+from forward.bodies.location import nearest_of
+from forward.bodies.mesh_file import MeshFile
 from forward.model import FloatArray
 
 NEAREST = 4  # triangles that are tried first

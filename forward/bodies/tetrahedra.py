@@ -12,7 +12,9 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from forward.bodies.geometry import AXES, Body
-from forward.bodies.mesh_file import BOUNDARY, Contents, Loaded, MeshFile
+from forward.bodies.mesh import Contents, Loaded
+from forward.bodies.mesh_file import MeshFile
+from forward.bodies.mesh_reading import BOUNDARY
 from forward.model import FloatArray, ModelError
 
 INDICATORS = "indicators"  # name of the array

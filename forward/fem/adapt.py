@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from forward.bodies.bisection import Bisected
 from forward.bodies.location import locate, shapes
-from forward.bodies.mesh_file import Contents, IntArray, Loaded, contents
+from forward.bodies.mesh import Contents, IntArray, Loaded, contents
 from forward.bodies.tetrahedra import MeshInMemory, tetrahedra
 from forward.fem import recovery
 from forward.fem.affordable import own_estimate

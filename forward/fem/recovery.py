@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 
 if TYPE_CHECKING:
-    from forward.bodies.mesh_file import Loaded
+    from forward.bodies.mesh import Loaded
 
 
 def squares(mesh: Loaded, stresses: FloatArray) -> NDArray[np.float64]:

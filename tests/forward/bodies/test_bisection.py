@@ -9,7 +9,8 @@ from scipy.spatial import Delaunay
 
 from forward.bodies.bisection import EDGES, FACES, Bisected
 from forward.bodies.geometry import Block, Box
-from forward.bodies.mesh_file import Loaded, MeshFile
+from forward.bodies.mesh import Loaded
+from forward.bodies.mesh_file import MeshFile
 from forward.bodies.tetrahedra import packed, tetrahedra
 from forward.model import ModelError
 from tests.meshes import box

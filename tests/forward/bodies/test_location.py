@@ -5,7 +5,7 @@ import pytest
 
 from forward.bodies.geometry import Block, Box, holds, tolerance
 from forward.bodies.location import locate, shapes
-from forward.bodies.mesh_file import _FACES
+from forward.bodies.mesh import FACES
 from tests.launch import run_script
 
 UNIT = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
@@ -116,7 +116,7 @@ def test_every_point_of_a_scan_has_one_rank(tmp_path, ranks):
             edges = points[numbers[:, 1:]] - points[numbers[:, :1]]
             turned = np.linalg.det(edges) < 0
             numbers[turned] = numbers[turned][:, [1, 0, 2, 3]]
-        faces = np.concatenate([numbers[:, face] for face in _FACES[kind]])
+        faces = np.concatenate([numbers[:, face] for face in FACES[kind]])
         _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
         blocks = [(name, numbers), ("quad" if kind == "hexahedron" else "triangle", faces[first[count == 1]])]
         meshio.Mesh(points, blocks).write(tmp_path / f"{kind}.vtu")

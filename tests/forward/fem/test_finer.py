@@ -7,7 +7,8 @@ from pydantic import ValidationError
 
 from forward.bodies.geometry import Block, Box
 from forward.bodies.hexahedra import FACES
-from forward.bodies.mesh_file import MeshFile, contents, divided
+from forward.bodies.mesh import contents, divided
+from forward.bodies.mesh_file import MeshFile
 from forward.extrapolated import HALVED
 from forward.fem.finer import OF_LINEAR, OtherMesh, extrapolated, finer, graded, held, share
 from forward.hyperelastic import Hyperelastic

@@ -1,0 +1,250 @@
+"""Meshes as arrays: what a body from a file is in memory, what a study knows about it, and how cells are divided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.bodies import hexahedra
+from forward.model import FloatArray, ModelError
+from forward.settings import Settings, nearest
+
+Point = tuple[float, float, float]
+IntArray = NDArray[np.int64]
+QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
+CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
+FACES = {
+    "tetrahedron": [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]],
+    "hexahedron": hexahedra.FACES.tolist(),
+}
+EDGES = {
+    "tetrahedron": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
+    "hexahedron": hexahedra.EDGES.tolist(),
+}
+TETRAHEDRA = {
+    "tetrahedron": [[0, 1, 2, 3]],
+    "hexahedron": [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]],
+}
+# Corners of hexahedra with their neighbours, in an order that makes all determinants positive.
+CORNERS = [
+    [0, 1, 3, 4],
+    [1, 2, 0, 5],
+    [2, 3, 1, 6],
+    [3, 0, 2, 7],
+    [4, 7, 5, 0],
+    [5, 4, 6, 1],
+    [6, 5, 7, 2],
+    [7, 6, 4, 3],
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A mesh in memory.
+
+    Attributes
+    ----------
+    points
+        Vertices (n, 3) in m.
+    cells
+        Vertices of each cell, in VTK's order.
+    cell
+        "tetrahedron" or "hexahedron".
+    boundaries
+        Facets (k, 3 or 4) of the surface of the body by name.
+    regions
+        Names of the regions.
+    region
+        Number of the region of each cell.
+    """
+
+    points: FloatArray
+    cells: IntArray
+    cell: Literal["tetrahedron", "hexahedron"]
+    boundaries: dict[str, IntArray]
+    regions: tuple[str, ...]
+    region: IntArray
+
+
+class Contents(Settings):
+    """What a file holds, found when it is read.
+
+    Parameters
+    ----------
+    digest
+        Hash of the file.
+    cell
+        Shape of the cells.
+    cells, vertices, edges, faces
+        How many there are.
+    bounds
+        Smallest and largest coordinate (m) along each axis.
+    longest_edge
+        Of all cells (m); of those that a study divides, what it is at most.
+    boundaries
+        Names of the boundaries, each with up to four points (m) that span it.
+    areas
+        Names of the boundaries, each with its area (m²).
+    regions
+        Names of the regions, each with its volume (m³).
+    """
+
+    digest: str
+    cell: Literal["tetrahedron", "hexahedron"]
+    cells: int
+    vertices: int
+    edges: int
+    faces: int
+    bounds: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    longest_edge: float
+    boundaries: dict[str, tuple[Point, ...]]
+    areas: dict[str, float]
+    regions: dict[str, float]
+
+
+def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
+    """Divide every cell into eight, thinner ones at some boundaries.
+
+    Edges that leave these boundaries are divided at a quarter, nearer to the boundary, others in the middle (graded
+    meshes for singularities: H. Li, A. Mazzucato, V. Nistor, Electron. Trans. Numer. Anal. 37 (2010) 41–69). The
+    octahedron inside a tetrahedron is cut along the diagonal that leaves its smallest part largest; of equal ones, as
+    all are where edges are divided in the middle, along the shortest (as J. Bey, Tetrahedral grid refinement,
+    Computing 55 (1995) 355–378, keeps the shapes of cells).
+
+    Raises
+    ------
+    ModelError
+        If there is no such boundary.
+    """
+    unknown = [name for name in towards if name not in mesh.boundaries]
+    if unknown:
+        message = f"divide: {nearest(unknown[0], tuple(mesh.boundaries))}"
+        raise ModelError(message)
+    held = np.zeros(len(mesh.points))
+    for name in towards:
+        held[mesh.boundaries[name]] = 0.5 - QUARTER
+    if mesh.cell == "hexahedron":
+        found = hexahedra.divided(mesh.points, mesh.cells, mesh.boundaries, held)
+        return replace(mesh, **found._asdict(), region=np.repeat(mesh.region, 8))
+    ends, which = np.unique(
+        np.sort(mesh.cells[:, EDGES["tetrahedron"]].reshape(-1, 2), axis=1), axis=0, return_inverse=True
+    )
+    number = len(mesh.points) + which.reshape(-1, 6)
+    share = 0.5 + held[ends[:, 1]] - held[ends[:, 0]]  # of the second end
+    points = np.concatenate(
+        [mesh.points, (1 - share)[:, None] * mesh.points[ends[:, 0]] + share[:, None] * mesh.points[ends[:, 1]]]
+    )
+    m01, m02, m03, m12, m13, m23 = number.T
+    v0, v1, v2, v3 = mesh.cells.T
+    corners = [(v0, m01, m02, m03), (v1, m01, m12, m13), (v2, m02, m12, m23), (v3, m03, m13, m23)]
+    cuts = []
+    for a, b, around in (
+        (m01, m23, (m02, m12, m13, m03)),
+        (m02, m13, (m01, m12, m23, m03)),
+        (m03, m12, (m01, m02, m23, m13)),
+    ):
+        cuts.append(np.stack([np.stack([a, b, around[k], around[k - 1]], axis=1) for k in range(4)], axis=1))
+    inner = np.array(cuts)  # (3, n, 4, 4)
+    at = points[inner]
+    volumes = np.abs(np.linalg.det(at[..., 1:, :] - at[..., :1, :])).min(axis=2)
+    lengths = np.linalg.norm(at[:, :, 0, 1] - at[:, :, 0, 0], axis=-1)
+    rounded = np.round(lengths / (CLOSE * lengths.max()))  # equal ones are, whatever rounding does to them
+    largest = volumes >= (1 - 1e-9) * volumes.max(axis=0)
+    best = inner[np.where(largest, rounded, np.inf).argmin(axis=0), np.arange(len(mesh.cells))]
+    cells = np.concatenate([np.stack([np.stack(corner, axis=1) for corner in corners], axis=1), best], axis=1)
+    keys = ends[:, 0] << 32 | ends[:, 1]
+
+    def quartered(facets: IntArray) -> IntArray:
+        pairs = np.sort(facets[:, [[0, 1], [1, 2], [0, 2]]], axis=2)
+        ij, jk, ik = (len(mesh.points) + np.searchsorted(keys, pairs[..., 0] << 32 | pairs[..., 1])).T
+        i, j, k = facets.T
+        parts = [(i, ij, ik), (j, ij, jk), (k, ik, jk), (ij, jk, ik)]
+        return np.asarray(np.stack([np.stack(part, axis=1) for part in parts], axis=1).reshape(-1, 3))
+
+    boundaries = {name: quartered(facets) for name, facets in mesh.boundaries.items()}
+    return Loaded(points, cells.reshape(-1, 4), mesh.cell, boundaries, mesh.regions, np.repeat(mesh.region, 8))
+
+
+def divided_contents(found: Contents) -> Contents:
+    """Say what a mesh holds whose cells are divided into eight.
+
+    Every edge is halved. A triangle has three new ones and a tetrahedron one: the shortest of the three that join the
+    middles of opposite edges, the squares of which are a quarter of the sum of those of the six edges. A quadrilateral
+    has four, a hexahedron six.
+    """
+    if found.cell == "hexahedron":
+        return found.model_copy(
+            update={
+                "vertices": found.vertices + found.edges + found.faces + found.cells,
+                "edges": 2 * found.edges + 4 * found.faces + 6 * found.cells,
+                "faces": 4 * found.faces + 12 * found.cells,
+                "cells": 8 * found.cells,
+                "longest_edge": found.longest_edge / 2,
+            }
+        )
+    return found.model_copy(
+        update={
+            "vertices": found.vertices + found.edges,
+            "edges": 2 * found.edges + 3 * found.faces + found.cells,
+            "faces": 4 * found.faces + 8 * found.cells,
+            "cells": 8 * found.cells,
+            "longest_edge": found.longest_edge / 2**0.5,
+        }
+    )
+
+
+def contents(mesh: Loaded, digest: str) -> Contents:
+    """Return what a study needs to know about a mesh."""
+    points, cells = mesh.points, mesh.cells
+    edges = np.unique(np.sort(cells[:, EDGES[mesh.cell]].reshape(-1, 2), axis=1), axis=0)
+    faces = np.unique(
+        np.sort(cells[:, FACES[mesh.cell]].reshape(len(cells) * len(FACES[mesh.cell]), -1), axis=1), axis=0
+    )
+    corners = [[0, 1, 2, 3]] if mesh.cell == "tetrahedron" else CORNERS
+    at = points[cells[:, corners]]
+    # Of a hexahedron, the mean of the volumes at its corners: near enough to be shown.
+    share = 6 if mesh.cell == "tetrahedron" else 1
+    volumes = np.abs(np.linalg.det(at[:, :, 1:] - at[:, :, :1])).mean(axis=1) / share
+    sums = np.bincount(mesh.region, weights=volumes, minlength=len(mesh.regions))
+    low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return Contents(
+        digest=digest,
+        cell=mesh.cell,
+        cells=len(cells),
+        vertices=len(points),
+        edges=len(edges),
+        faces=len(faces),
+        bounds=((low[0], high[0]), (low[1], high[1]), (low[2], high[2])),
+        longest_edge=float(np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max()),
+        boundaries={name: _spanning(points[np.unique(facets)]) for name, facets in mesh.boundaries.items()},
+        areas={name: float(f"{_area(points[facets]):.6g}") for name, facets in mesh.boundaries.items()},
+        regions={name: float(f"{volume:.6g}") for name, volume in zip(mesh.regions, sums, strict=True)},
+    )
+
+
+def _area(corners: FloatArray) -> float:
+    """Return the area of facets (n, 3 or 4, 3) together."""
+    around = [[0, k, k + 1] for k in range(1, corners.shape[1] - 1)]
+    a, b, c = np.moveaxis(corners[:, around], 2, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
+
+
+def _spanning(points: FloatArray) -> tuple[Point, ...]:
+    """Return up to four points, each as far as possible from the span of those before it."""
+    chosen = [points[0]]
+    directions: list[FloatArray] = []
+    extent = np.ptp(points, axis=0).max()
+    for _ in range(3):
+        apart = points - chosen[0]
+        for direction in directions:
+            apart = apart - np.outer(apart @ direction, direction)
+        lengths = np.linalg.norm(apart, axis=1)
+        k = int(lengths.argmax())
+        if lengths[k] <= 1e-9 * extent:
+            break
+        chosen.append(points[k])
+        directions.append(apart[k] / lengths[k])
+    return tuple((float(x), float(y), float(z)) for x, y, z in chosen)
