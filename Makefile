@@ -105,7 +105,7 @@ $(RUNS): pyproject.toml constraints.txt | system
 	@$(PYTHON) -c 'import dolfinx, chaospy, h5py, h5netcdf, numpy, scipy'
 	@touch $@
 
-$(READY): $(RUNS) | graphics
+$(READY): pyproject.toml constraints.txt | $(if $(wildcard $(READY)),,$(RUNS)) graphics
 	@echo "installing what tests, documentation and notebooks need"
 	@$(INSTALL) '.[dev]'
 	@touch $@

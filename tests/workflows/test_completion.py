@@ -10,8 +10,6 @@ from workflows.__main__ import _parser
 from workflows.completion import SHELLS, commands, completion
 from workflows.starter import starter
 
-pytestmark = pytest.mark.unit
-
 
 def in_shell(shell, text, folder=ROOT):
     if shutil.which(shell) is None:
