@@ -82,6 +82,7 @@ ALL = {
 }
 WITH_OPTIONS = {
     "designs": designs.main,
+    "intervals": intervals.main,
     "calibration": calibration.main,
     "indentation": indentation.main,
     "chaos": chaos.main,

@@ -2,21 +2,27 @@
 
 Each specimen is of Demiray's material, its constants a draw of the prior, and is stretched to at most 1.3 with errors
 of 5 %; predicted are its stresses at stretches of 1.2 and 1.5, and in shear. All go through one study, `tissuq run`.
+Beside them stand the intervals of the same posteriors by summation over a fine grid: what these hold of so few
+specimens is chance, and what the study's hold less than they is its error.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+from inverse.criticism.comparison import quantiles
+from uq.inputs.random_parameters import Inputs
 from workflows.__main__ import main as run
 from workflows.config.study import load
 
-COUNT = 200
+COUNT, SAMPLES = 200, 256
 OUTPUTS = [f"p{i}" for i in range(6)]
 MODULE = """
 import numpy as np
@@ -25,17 +31,23 @@ STRETCH = np.array([1.05, 1.1, 1.15, 1.2, 1.25, 1.3])
 FARTHER = np.array([1.2, 1.5])
 
 
+def stretched(p, stretch):
+    mu, b = p[:, ..., None]
+    return mu * np.exp(b * (stretch**2 + 2 / stretch - 3)) * (stretch - stretch**-2)
+
+
+def shear(p, amount):
+    return p[0] * amount * np.exp(p[1] * amount**2)
+
+
 def uniaxial(p, stretch):
-    mu, b = p
-    more = stretch**2 + 2 / stretch - 3
-    stress = mu * np.exp(b * more) * (stretch - stretch**-2)
-    return stress, np.column_stack([stress / mu, stress * more])
+    stress = stretched(np.asarray(p), stretch)
+    return stress, np.column_stack([stress / p[0], stress * (stretch**2 + 2 / stretch - 3)])
 
 
-def sheared(p, shear):
-    mu, b = p
-    stress = mu * shear * np.exp(b * shear**2)
-    return stress, np.array([stress / mu, stress * shear**2])
+def sheared(p, amount):
+    stress = shear(p, amount)
+    return stress, np.array([stress / p[0], stress * amount**2])
 
 
 def measured(p):
@@ -53,6 +65,7 @@ def predicted(p):
 def predicted_slopes(p):
     return np.vstack([uniaxial(p, FARTHER)[1], sheared(p, 0.4)[1]])
 """
+GRID = 601  # points in each direction
 GOALS = ("stretched to 1.2", "stretched to 1.5", "sheared by 0.4")
 STUDY = f"""
 [model]
@@ -75,47 +88,81 @@ samples = 12
 
 [method]
 kind = "invert"
-samples = 128
+samples = SAMPLES
 starts = 1
 """
 
 
-def coverage(folder: Path, count: int = COUNT, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shares (k,) of 95 % intervals that hold the truth: after the data, and before them."""
+def held(folder: Path, count: int, seed: int, samples: int = SAMPLES) -> tuple[np.ndarray, ...]:
+    """Return how far inside 95 % intervals truths lie (count, k, 2), over their widths: negative ones lie outside.
+
+    The last axis has the distances from the lower and to the upper end; after the data, before them, and exactly
+    after them.
+    """
     (folder / "demiray.py").write_text(MODULE)
-    (folder / "study.toml").write_text(STUDY)
+    (folder / "study.toml").write_text(STUDY.replace("SAMPLES", str(samples)))
     (folder / "data").mkdir()
     (folder / "data" / "none.csv").write_text("output,value,sigma\np0,1,1\n")
     model: dict = {}
     exec(MODULE, model)
     rng = np.random.default_rng(seed)
-    points = load(folder / "study.toml").inputs.random(seed, 0, count)
+    inputs = load(folder / "study.toml").inputs
+    points = inputs.random(seed, 0, count)
+    exact = []
     (folder / "data" / "none.csv").unlink()
     for k, point in enumerate(points):
         clean = model["measured"](point)
         sigma = 0.05 * clean
-        rows = [
-            f"p{i},{y!r},{s!r}"
-            for i, (y, s) in enumerate(
-                zip((clean + sigma * rng.standard_normal(clean.size)).tolist(), sigma.tolist(), strict=True)
-            )
-        ]
+        data = clean + sigma * rng.standard_normal(clean.size)
+        exact.append(exactly(inputs, model, data, sigma))
+        rows = [f"p{i},{y!r},{s!r}" for i, (y, s) in enumerate(zip(data.tolist(), sigma.tolist(), strict=True))]
         (folder / "data" / f"{k:03}.csv").write_text("\n".join(["output,value,sigma", *rows]) + "\n")
     run(["run", str(folder / "study.toml"), "--out", str(folder / "out"), "--quiet", "--no-report"])
     found = xr.load_dataset(folder / "out" / "results.nc", engine="h5netcdf")
     truth = np.array([model["predicted"](point) for point in points])
     ends = [[found[f"prediction_{of}{end}"].to_numpy() for end in ("lower", "upper")] for of in ("", "prior_")]
-    after, before = (((lower <= truth) & (truth <= upper)).mean(axis=0) for lower, upper in ends)
+    ends.append(list(np.moveaxis(np.array(exact), 1, 0)))
     widths = [float(np.median(upper - lower)) for lower, upper in ends]
-    print(f"median width of intervals, all outputs: {widths[0]:.3g} Pa after, {widths[1]:.3g} Pa before the data")
-    return after, before
+    print(
+        "median width of intervals, all outputs: {:.4g} Pa after, {:.4g} Pa before, {:.4g} Pa exactly".format(*widths)
+    )
+    return tuple(np.stack([truth - low, up - truth], axis=2) / (up - low)[:, :, None] for low, up in ends)
 
 
-def main() -> None:
+def exactly(inputs: Inputs, model: dict, data: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Return the ends (2, k) of 95 % intervals by a sum over a grid, first wide and then where the posterior is."""
+    lower, upper = np.full(2, -6.0), np.full(2, 6.0)
+    for _ in range(3):
+        axes = [np.linspace(a, b, GRID) for a, b in zip(lower, upper, strict=True)]
+        x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        at = inputs.from_normals(x)[0].T
+        gaps = (model["stretched"](at, model["STRETCH"]) - data) / sigma
+        logs = -(gaps**2).sum(axis=1) / 2 - (x**2).sum(axis=1) / 2
+        some = logs > logs.max() - 18
+        steps = (upper - lower) / (GRID - 1)
+        lower, upper = x[some].min(axis=0) - 2 * steps, x[some].max(axis=0) + 2 * steps
+    weights = np.exp(logs - logs.max())
+    goals = np.column_stack([model["stretched"](at, model["FARTHER"]), model["shear"](at, 0.4)])
+    return np.array([quantiles(column, weights / weights.sum(), (0.025, 0.975)) for column in goals.T]).T
+
+
+def main(given: Sequence[str] = ()) -> None:
     """Print the coverage of 95 % intervals."""
+    parser = ArgumentParser(prog="intervals")
+    parser.add_argument("--count", type=int, default=COUNT, help="specimens")
+    parser.add_argument("--samples", type=int, default=SAMPLES, help="points of each posterior")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args(given)
     begin = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        after, before = coverage(Path(folder))
-    for goal, shares in zip(GOALS, zip(after, before, strict=True), strict=True):
-        print(f"{goal:18} {100 * shares[0]:5.1f} % after the data, {100 * shares[1]:5.1f} % before", flush=True)
-    print(f"{COUNT} specimens, {time.process_time() - begin:.0f} s of CPU")
+        after, before, exact = held(Path(folder), asked.count, asked.seed, asked.samples)
+    error = 100 * np.sqrt(0.95 * 0.05 / asked.count)
+    print(
+        f"| 95 % interval, {asked.samples} points | holds (± {error:.1f} %) | truth below, above | exactly | before |"
+    )
+    print("|---|---|---|---|---|")
+    for k, goal in enumerate(GOALS):
+        inside, prior, best = (100 * (one[:, k] > 0).all(axis=1).mean() for one in (after, before, exact))
+        low, high = (int((after[:, k, end] < 0).sum()) for end in (0, 1))
+        print(f"| {goal} | {inside:.1f} % | {low}, {high} | {best:.1f} % | {prior:.1f} % |", flush=True)
+    print(f"{asked.count} specimens, {time.process_time() - begin:.0f} s of CPU")

@@ -6,11 +6,13 @@ the posterior p_i: no model is solved again (D. W. Hogg, A. D. Myers, J. Bovy, A
 
 A sum over draws alone fails where a population is narrow: few draws lie there, and as C → 0 the nearest decides. So
 each draw has a normal kernel of covariance h² V_i, V_i the covariance of the posterior, and draws are moved towards
-their mean by √(1 − h²), which leaves mean and covariance as they are (M. West, J. R. Stat. Soc. B 55 (1993) 409–422):
+their mean by √(1 − h²), which leaves mean and covariance as they are (M. West, J. R. Stat. Soc. B 55 (1993) 409–422).
+π_0 varies within a kernel: ln π_0 is a quadratic polynomial, fitted to the draws, and a rest that is taken at the draw.
+Kernel over polynomial is a normal kernel again, of covariance B_i, at other places b_is with other weights v_is:
 
-    ∫ p_i/π_0 N(z|m, C) dz ≈ Σ_s w_is/π_0(z_is) N(z_is | m, C + h² V_i).
+    ∫ p_i/π_0 N(z|m, C) dz ≈ Σ_s v_is N(b_is | m, C + B_i).
 
-For normal posteriors under a flat prior it is exact for normal kernels of any width. The prior of m is normal, twice
+For normal posteriors under normal priors it is exact for normal kernels of any width. The prior of m is normal, twice
 as wide as π_0, around its mean; standard deviations of the population have half-t priors with 3 degrees of freedom
 and those of π_0 as scale; correlations have density ∝ det R (Lewandowski, Kurowicka and Joe's with η = 2). m, the
 logarithms of standard deviations and the angles of R are sampled by an ensemble of walkers (J. Goodman, J. Weare,
@@ -25,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +38,8 @@ STRETCH = 2.0  # a of the stretch move
 FREEDOM = 3.0  # of the prior of standard deviations
 WIDER = 2.0  # prior of the mean of a population over that of a specimen
 KEPT = 200  # draws of a specimen that are used
+FLAT = 1e-14  # smallest eigenvalue of a covariance over the largest
+MOST_BENT = 0.99  # second derivatives of ln π_0 over those of a posterior as a normal distribution
 
 
 @dataclass(frozen=True)
@@ -76,15 +81,40 @@ class Specimen:
         return float(min(1.0, (4 / (d + 2) / max(self.effective, 1.0)) ** (1 / (d + 4))))
 
     @cached_property
-    def shrunken(self) -> FloatArray:
-        """The draws (S, d), moved towards their mean."""
-        return np.asarray(self.mean + np.sqrt(1 - self.width**2) * (self.draws - self.mean))
-
-    @cached_property
-    def log_weights(self) -> FloatArray:
-        """Ln of w/π_0 (S,)."""
+    def kernels(self) -> Kernels:
+        """The draws as kernels over π_0."""
+        S, d = self.draws.shape
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, FLAT * values[-1]) + 1e-300)
+        u = np.linalg.solve(root, (self.draws - self.mean).T).T
+        # ln π_0 ≈ c + g·u + u·H u/2, by draws as far as they count
+        pairs = [(i, j) for i in range(d) for j in range(i + 1)]
+        squares = np.column_stack([u[:, i] * u[:, j] * (0.5 if i == j else 1.0) for i, j in pairs])
+        columns = np.column_stack([np.ones(S), u, squares])
+        columns = columns if 3 * columns.shape[1] <= S else columns[:, : 1 + d]
+        rows = np.sqrt(self.weights)
+        found = np.linalg.lstsq(columns * rows[:, None], self.log_prior * rows, rcond=1e-8)[0]
+        rest = self.log_prior - columns @ found
+        H = np.zeros((d, d))
+        for (i, j), value in zip(pairs, found[1 + d :], strict=False):
+            H[i, j] = H[j, i] = value
+        bent, axes = np.linalg.eigh(H)
+        H = (axes * bent.clip(-MOST_BENT, MOST_BENT)) @ axes.T  # no prior is narrower than a posterior
+        near, h = np.sqrt(1 - self.width**2) * u, self.width
+        B = np.linalg.inv(np.eye(d) / h**2 + H)
+        at = (near / h**2 - found[1 : 1 + d]) @ B
         with np.errstate(divide="ignore"):
-            return np.asarray(np.log(self.weights) - self.log_prior)
+            logs = np.log(self.weights) - rest - found[0]
+        logs += (np.einsum("si,ij,sj->s", at, np.eye(d) / h**2 + H, at) - (near**2).sum(axis=1) / h**2) / 2
+        return Kernels(self.mean + at @ root.T, root @ B @ root.T, logs)
+
+
+class Kernels(NamedTuple):
+    """Normal kernels: their places b (S, d), their covariance B (d, d), and ln of their weights v (S,)."""
+
+    places: FloatArray
+    covariance: FloatArray
+    log_weights: FloatArray
 
 
 def thinned(one: Specimen, seed: int) -> Specimen:
@@ -152,7 +182,7 @@ class Fit:
         The size is that of the draws of the posterior with the weights that they have over the population.
         """
         one, rng = self.specimens[number], np.random.default_rng([seed, 2, number])
-        kernel = one.width**2 * one.covariance
+        kernel = one.kernels.covariance
         mean = self.at(None if self.covariates is None else self.covariates[number])
         logs = _log_kernels(one, mean, self.covariance)
         weights = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -160,7 +190,7 @@ class Fit:
         chosen = (weights.cumsum(axis=1) < rng.random((len(weights), 1))).sum(axis=1).clip(max=weights.shape[1] - 1)
         kernels = np.broadcast_to(kernel, self.covariance.shape)
         gain = np.swapaxes(np.linalg.solve(self.covariance + kernel, kernels), 1, 2)
-        at = one.shrunken[chosen]
+        at = one.kernels.places[chosen]
         middle = at + np.einsum("aij,aj->ai", gain, mean - at)
         left = kernel - gain @ kernel
         values, vectors = np.linalg.eigh((left + np.swapaxes(left, 1, 2)) / 2)
@@ -170,12 +200,12 @@ class Fit:
 
 
 def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Ln of w/π_0 N(z | m, C + h² V) (A, S) of all draws."""
-    roots = np.linalg.cholesky(covariances + one.width**2 * one.covariance)
-    deviations = one.shrunken[None] - means[:, None, :]
+    """Ln of v N(b | m, C + B) (A, S) of all draws."""
+    roots = np.linalg.cholesky(covariances + one.kernels.covariance)
+    deviations = one.kernels.places[None] - means[:, None, :]
     whitened = np.linalg.solve(roots, np.swapaxes(deviations, 1, 2))
     logs = np.log(np.einsum("aii->ai", roots)).sum(axis=1)
-    return np.asarray(one.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
+    return np.asarray(one.kernels.log_weights - (whitened**2).sum(axis=1) / 2 - logs[:, None])
 
 
 def fitted(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,6 +13,7 @@ from forward.model import Finding, FloatArray
 from forward.settings import Settings, nearest
 from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, fitted
 from uq.findings import add
+from uq.inputs.distributions import Distribution, LogNormal, Normal, TruncatedNormal
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -21,10 +22,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
 LEAST = 20.0  # effective size of a specimen's draws under the population, below which its estimates are rough
+ROUNDS = 6  # of fits to draws that are made again
+WIDER = 1.5  # priors with which specimens are drawn again, over the distribution of a new specimen
 MIXED = 100.0  # independent draws of the population, below which its quantiles are rough
 FEW = 4  # specimens, below which the prior decides how wide a population is
 PRIOR = 4096  # points that stand for the prior
 QUANTILES = (0.025, 0.5, 0.975)
+
+Again = Callable[[str, Inputs], "Draws | str"]  # name of a specimen, prior → its draws, or why there are none
 
 
 class Population(Settings):
@@ -36,6 +41,9 @@ class Population(Settings):
         Results of ``invert`` with several data sets, or of ``select`` with several groups of data: the specimens.
     model
         The candidate of ``select``: its name, or "best".
+    study
+        The file of the study that the source is of, if its data stand in files beside it: where few draws of a specimen
+        lie in the population, it is inverted again, from these data.
     distribution
         "log-normal" (parameters of one sign; of negative ones their size) or "normal", with covariance.
     covariates
@@ -54,6 +62,7 @@ class Population(Settings):
     kind: Literal["population"] = "population"
     source: str = Field(min_length=1)
     model: str | None = None
+    study: str | None = None
     distribution: Literal["normal", "log-normal"] = "log-normal"
     covariates: dict[str, dict[str, float | str]] = Field(default={})
     new: dict[str, float | str] = Field(default={})
@@ -61,8 +70,8 @@ class Population(Settings):
     seed: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
 
-    def run(self, posteriors: Mapping[str, Draws], prior: Inputs) -> xr.Dataset:
-        """Fit the population, without solving anything.
+    def run(self, posteriors: Mapping[str, Draws], prior: Inputs, again: Again | None = None) -> xr.Dataset:
+        """Fit the population, without solving anything but for specimens whose draws do not reach it.
 
         Parameters
         ----------
@@ -70,6 +79,8 @@ class Population(Settings):
             Draws of the specimens, all of the same parameters.
         prior
             The prior of every specimen.
+        again
+            Draws a specimen again under another prior; None if that cannot be done.
 
         Returns
         -------
@@ -84,11 +95,12 @@ class Population(Settings):
         import xarray as xr
 
         scale = Scale.of(self.distribution, posteriors)
-        specimens, hyperprior = scale.specimens(posteriors, prior)
         columns = Columns.of(self.covariates, list(posteriors))
         x, at = (columns.values, columns.row(self.new)) if self.covariates else (None, None)
-        fit = fitted(specimens, hyperprior, self.draws, self.seed, covariates=x)
-        estimates = [fit.estimates(i, self.seed) for i in range(len(specimens))]
+        reached = self._reached(
+            _Known(posteriors, dict.fromkeys(posteriors, prior)), scale, scale.of_prior(prior), x, again
+        )
+        fit, estimates = reached.fit, reached.estimates
         new = scale.back(fit.predictive(self.seed, at))
         own = np.array([np.array(_moments(one)) for one in posteriors.values()])
         together = np.array([scale.back(z) for z, _ in estimates])
@@ -116,6 +128,7 @@ class Population(Settings):
                 "specimen_lower": (each, np.quantile(together, QUANTILES[0], axis=1)),
                 "specimen_upper": (each, np.quantile(together, QUANTILES[2], axis=1)),
                 "specimen_effective": (("specimen",), np.array([size for _, size in estimates])),
+                "specimen_redrawn": (("specimen",), np.array([reached.times.get(name, 0) for name in posteriors])),
                 "logarithmic": ((), int(scale.logarithmic)),
             },
             {
@@ -133,8 +146,72 @@ class Population(Settings):
                 slope_quantiles=(("quantile", *by_covariate), np.quantile(slopes, QUANTILES, axis=0)),
                 covariate_value=(("specimen", "covariate"), columns.values + columns.means),
             ).assign_coords(covariate=list(columns.names))
-        add(found, *_findings(fit, list(posteriors), [size for _, size in estimates]))
+        add(found, *_findings(reached, list(posteriors)))
         return found
+
+    def _reached(
+        self, known: _Known, scale: Scale, hyperprior: Hyperprior, x: FloatArray | None, again: Again | None
+    ) -> _Reached:
+        """Fit the population, and draw those specimens again of which few draws lie there, until there are none."""
+        names = list(known.draws)
+        times: dict[str, int] = {}
+        refused: dict[str, str] = {}
+        for left in reversed(range(ROUNDS)):
+            fit = fitted(known.specimens(scale), hyperprior, self.draws, self.seed, covariates=x)
+            estimates = [fit.estimates(i, self.seed) for i in range(len(names))]
+            low = [i for i, (_, size) in enumerate(estimates) if size < LEAST and names[i] not in refused]
+            if again is None or not low or not left:
+                break
+            for i in low:
+                wider = scale.inputs(known.names, fit.predictive(self.seed, None if x is None else x[i]), hyperprior)
+                found = again(names[i], wider)
+                if isinstance(found, str):
+                    refused[names[i]] = found
+                    continue
+                known = known.replaced(names[i], found, wider)
+                times[names[i]] = times.get(names[i], 0) + 1
+        return _Reached(fit, estimates, times, refused)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Draws of each specimen, and the priors under which they were drawn."""
+
+    draws: Mapping[str, Draws]
+    priors: Mapping[str, Inputs]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return prior_names(self.draws)
+
+    def replaced(self, specimen: str, draws: Draws, prior: Inputs) -> _Known:
+        """Return the same with other draws of a specimen, with columns in the same order."""
+        order = [draws.names.index(name) for name in self.names]
+        found = Draws(self.names, draws.values[:, order], draws.weights, draws.effective)
+        return _Known({**self.draws, specimen: found}, {**self.priors, specimen: prior})
+
+    def specimens(self, scale: Scale) -> list[Specimen]:
+        """Return the specimens on the scale of the population."""
+        return [scale.specimen(one, self.priors[name]) for name, one in self.draws.items()]
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """A population, the draws of each specimen under it with their effective sizes, and what was drawn again.
+
+    Attributes
+    ----------
+    times
+        How often specimens were drawn again, by name.
+    refused
+        Why others could not be.
+    """
+
+    fit: Fit
+    estimates: list[tuple[FloatArray, float]]
+    times: dict[str, int]
+    refused: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -262,32 +339,71 @@ class Scale:
         """Return parameters (…, d) of z (…, d)."""
         return self.signs * np.exp(z) if self.logarithmic else z
 
-    def specimens(self, posteriors: Mapping[str, Draws], prior: Inputs) -> tuple[list[Specimen], Hyperprior]:
-        """Return the posteriors and the prior of a specimen."""
-        found = []
-        for draws in posteriors.values():
-            some = draws.weights > 0
-            z = self.to(draws.values[some])
-            # dθ = |θ| dz
-            logs = prior.log_density(draws.values[some]) + (z.sum(axis=1) if self.logarithmic else 0.0)
-            found.append(Specimen(z, draws.weights[some] / draws.weights[some].sum(), logs, draws.effective))
+    def specimen(self, draws: Draws, prior: Inputs) -> Specimen:
+        """Return a posterior that was found under a prior."""
+        some = draws.weights > 0
+        z = self.to(draws.values[some])
+        # dθ = |θ| dz
+        logs = prior.log_density(draws.values[some]) + (z.sum(axis=1) if self.logarithmic else 0.0)
+        return Specimen(z, draws.weights[some] / draws.weights[some].sum(), logs, draws.effective)
+
+    def of_prior(self, prior: Inputs) -> Hyperprior:
+        """Return mean and standard deviation of the prior of a specimen."""
         points = prior.points(sobol_points(0, 0, 0, PRIOR, len(prior.names)))
         fits = (points * self.signs > 0).all(axis=1) if self.logarithmic else np.ones(PRIOR, dtype=bool)
         z = self.to(points[fits])
-        return found, Hyperprior(z.mean(axis=0), z.std(axis=0))
+        return Hyperprior(z.mean(axis=0), z.std(axis=0))
+
+    def inputs(self, names: Sequence[str], new: FloatArray, hyperprior: Hyperprior) -> Inputs:
+        """Return a prior that covers draws (A, d) of a new specimen: as they are distributed, but wider.
+
+        Widths are by quantiles, as few specimens leave long tails, and at most those of the prior of a population.
+        There are no negative log-normal parameters: they are normal, cut at zero.
+        """
+        lower, middle, upper = np.quantile(new, (0.1587, 0.5, 0.8413), axis=0)
+        widths = np.minimum(WIDER * (upper - lower) / 2, 2 * hyperprior.std)
+        ranks = new.argsort(axis=0).argsort(axis=0)
+        correlation = np.atleast_2d(2 * np.sin(np.pi / 6 * np.corrcoef(ranks.T))) * np.outer(self.signs, self.signs)
+        correlation = 0.9 * correlation + 0.1 * np.eye(len(names))
+        pairs = [(i, j) for i in range(len(names)) for j in range(i)]
+        marginals = map(self._marginal, self.signs, middle, widths)
+        return Inputs(
+            dict(zip(names, marginals, strict=True)),
+            tuple((names[i], names[j], float(correlation[i, j])) for i, j in pairs),
+        )
+
+    def _marginal(self, sign: float, middle: float, width: float) -> Distribution:
+        if not self.logarithmic:
+            return Normal(mean=middle, std=width)
+        mean = float(np.exp(middle + width**2 / 2))
+        std = mean * float(np.sqrt(np.expm1(width**2)))
+        if sign > 0:
+            return LogNormal(mean=mean, std=std)
+        return TruncatedNormal(mean=-mean, std=std, lower=-mean - 8 * std, upper=0.0)
 
 
-def _findings(fit: Fit, names: list[str], sizes: list[float]) -> Iterator[Finding]:
-    low = [f"{name} ({size:.0f})" for name, size in zip(names, sizes, strict=True) if size < LEAST]
+def _findings(reached: _Reached, names: list[str]) -> Iterator[Finding]:
+    again = [f"{name} ({times})" if times > 1 else name for name, times in reached.times.items()]
+    if again:
+        often = " (how often, in parentheses)" if max(reached.times.values()) > 1 else ""
+        yield Finding(
+            "note",
+            f"Few draws of {', '.join(again)} lay where the population has its specimens, so they were drawn again "
+            f"under a prior like the population{often}.",
+        )
+    sizes = zip(names, (size for _, size in reached.estimates), strict=True)
+    low = {name: f"{name} ({size:.0f})" for name, size in sizes if size < LEAST}
     if low:
+        reasons = dict.fromkeys(reached.refused[name] for name in low if name in reached.refused)
+        why = f"They cannot be drawn again: {'; '.join(reasons)}. " if reasons else ""
         yield Finding(
             "warning",
-            f"Few draws of {', '.join(low)} lie where the population has its specimens (effective sizes in "
-            "parentheses): their estimates, and what they say of the population, are rough. More samples in their own "
-            "study, or a prior like the population there, help.",
+            f"Few draws of {', '.join(low.values())} lie where the population has its specimens (effective sizes in "
+            f"parentheses): their estimates, and what they say of the population, are rough. {why}More samples in "
+            "their own study, or a prior like the population there, help.",
         )
-    if fit.effective < MIXED:
-        worth = f"{fit.effective:.0f} independent ones"
+    if reached.fit.effective < MIXED:
+        worth = f"{reached.fit.effective:.0f} independent ones"
         yield Finding("warning", f"The draws of the population are worth {worth}: its ends are rough.")
     if len(names) < FEW:
         yield Finding("note", f"{len(names)} specimens say little on how wide the population is: its prior does.")

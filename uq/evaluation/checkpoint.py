@@ -72,6 +72,10 @@ class Checkpoint:
         self._identity = identity.encode()
         self._code = code
 
+    def part(self, name: str) -> Checkpoint:
+        """Return that of a part of the study, whose answers are its own."""
+        return Checkpoint(self._directory, json.dumps([self._identity.decode(), name]), self._code)
+
     def key(self, block: object) -> str:
         """Return the name of a block, from a request or another value that specifies it."""
         return digest(block, self._identity).hex()[:24]

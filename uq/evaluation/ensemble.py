@@ -25,6 +25,7 @@ from uq.evaluation.turns import Progress, Turns, abort_all, end_job, gather_here
 
 T = TypeVar("T")
 O = TypeVar("O")
+R = TypeVar("R")
 CHEAP = 1e-3  # seconds below which computing a block is faster than writing and reading its file;
 SELDOM = 0.1  # files of such blocks are written at intervals of this length (s)
 SECONDS_FOR_OTHERS = 5.0  # for ranks that fail in the same way to meet
@@ -170,6 +171,41 @@ class Ensemble:
             finally:
                 self.told(ended)
 
+    def led(self, task: Callable[[Callable[[O], R]], T], step: Callable[[O], R]) -> T | None:
+        """Run `task` on rank 0 with a function that runs `step`, which is collective, on all ranks; collective.
+
+        Returns
+        -------
+        object
+            What the task returned, on rank 0; None on the other ranks.
+
+        Raises
+        ------
+        Exception
+            What the task raises, on all ranks.
+        """
+        if self.world.rank > 0:
+            with abort_all(self.world):
+                while isinstance(order := self.told(None), _Step):
+                    step(order.of)
+            if order is not None:
+                raise order
+            return None
+
+        def asked(of: O) -> R:
+            self.told(_Step(of))
+            with abort_all(self.world):
+                return step(of)
+
+        ended = None
+        try:
+            return task(asked)
+        except Exception as error:
+            ended = _told_to_others(error)
+            raise
+        finally:
+            self.told(ended)
+
     def told(self, order: O) -> O:
         """Return what rank 0 says, for which the others may wait long; collective."""
         gather_here(self.world)
@@ -183,6 +219,13 @@ def _told_to_others(error: Exception) -> Exception:
     except Exception:
         return StopError(str(error))
     return error
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What all ranks do a step with."""
+
+    of: Any
 
 
 @dataclass(frozen=True)

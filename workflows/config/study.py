@@ -92,15 +92,16 @@ def _beyond(place: str, value: Any) -> Iterator[str]:
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Give the full paths of a mesh and of another study's results, which a study names relative to its own folder.
+    """Give the full paths of a mesh, and of another study and its results, which are relative to the study's folder.
 
-    Results may be in the working directory too.
+    Another study and results may be in the working directory too.
     """
     method, model = blocks.get("method"), blocks.get("model")
-    source = method.get("source") if isinstance(method, Mapping) else None
-    if isinstance(source, str) and isinstance(method, Mapping):
-        place = next((path for path in (folder / source, Path(source)) if path.exists()), folder / source)
-        blocks = blocks | {"method": {**method, "source": str(place.resolve())}}
+    for key in ("source", "study"):
+        file = method.get(key) if isinstance(method, Mapping) else None
+        if isinstance(file, str):
+            place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+            blocks = blocks | {"method": {**blocks["method"], key: str(place.resolve())}}
     blocks = _with_draws(blocks, folder)
     body = model.get("body") if isinstance(model, Mapping) else None
     file = body.get("file") if isinstance(body, Mapping) else None

@@ -1,4 +1,7 @@
-"""A study of a population: what the posteriors of specimens say on specimens in general. Nothing is solved."""
+"""A study of a population: what the posteriors of specimens say on specimens in general.
+
+Nothing is solved, but for specimens whose draws do not reach the population (`workflows.studies.redrawn`).
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import model_validator
 
 from forward.model import Finding
+from forward.registry import named
 from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.of_draws import findings_of_few
 from uq.inputs.draws import Draws
 from workflows.config.blocks import Parallel
 from workflows.config.mistakes import StudyError, refused
 from workflows.config.report import Report
-from workflows.studies.job import Job, TasksJob
-from workflows.studies.posteriors import LETTERS, prior_of, specimens
+from workflows.studies.job import Job
+from workflows.studies.posteriors import LETTERS, specimens
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
@@ -35,13 +37,12 @@ class PopulationStudy(StudyKind):
     method
         What is computed and how.
     parallel
-        Use of ranks: it takes one.
+        Use of ranks, by specimens that are drawn again.
     report
         Your own sections of the report.
     """
 
     stopped: ClassVar[str] = "a population"
-    explains: ClassVar[bool] = False
 
     method: Population
     parallel: Parallel = Parallel()
@@ -54,12 +55,12 @@ class PopulationStudy(StudyKind):
 
     @property
     def planned(self) -> int:
-        """One evaluation: none is solved."""
+        """One evaluation: none is solved, unless specimens are drawn again."""
         return 1
 
     @property
     def solves(self) -> int:
-        """There are none."""
+        """There are none that could be counted before."""
         return 0
 
     @property
@@ -80,21 +81,23 @@ class PopulationStudy(StudyKind):
             f"source      {self.method.source}",
             f"specimens   {', '.join(self.posteriors)}",
             f"parameters  {', '.join(names)}",
-            "solves      none",
+            "solves      none, but for specimens whose draws do not reach the population",
         ]
 
     def parameters_of(self, label: str) -> tuple[str, ...]:
         """Names of the parameters."""
         return prior_names(self.posteriors)
 
+    @cached_property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that a user has written for the models of the specimens."""
+        found: tuple[str, ...] = named("workflows.studies.redrawn:modules")(self)
+        return found
+
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
-        """Fit on the first rank, at once."""
-
-        def results(_: Any) -> xr.Dataset:
-            names = prior_names(self.posteriors)
-            return self.method.run(self.posteriors, prior_of(self.method.source, self.method.model, names))
-
-        return TasksJob((), _nothing, _nothing, _nothing, results, lambda found: found)
+        """Fit on the first rank, and draw specimens again on all of them where that is needed."""
+        made: Job = named("workflows.studies.redrawn:PopulationJob")(self, name, directory)
+        return made
 
     def summary(self, job: Job) -> dict[str, Any]:
         """There is more in results.nc."""
@@ -118,7 +121,3 @@ class PopulationStudy(StudyKind):
             refused("Population", [(place, message, self.method.source)])
         object.__setattr__(self.method, "digest", found)
         return self
-
-
-def _nothing(*_: Any) -> Any:
-    """Do nothing: there are no tasks."""

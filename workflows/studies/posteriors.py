@@ -23,6 +23,8 @@ from workflows.config.source import KEPT
 from workflows.studies.tables_of_draws import of_table
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from forward.scalars import Mistake, Scalar
     from forward.spec import ModelSpec
     from workflows.config.source import Source
@@ -248,20 +250,34 @@ def specimens(file: str, model: str | None) -> dict[str, Draws]:
     return {str(name): read(file, str(name), model) for name, one in zip(names, done, strict=True) if one}
 
 
+def source_blocks(file: str) -> dict[str, Any]:
+    """Return the blocks of the study that left results in a directory."""
+    attributes = variables((Path(file) / "results.nc").read_bytes())[1]
+    return tomllib.loads(str(attributes["config"]))
+
+
+def candidate_of(file: str, model: str | None) -> str:
+    """Return the name of the candidate that is meant, or that is the most probable."""
+    found = variables((Path(file) / "results.nc").read_bytes())[0]
+    best = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
+    return best if model in (None, BEST) else str(model)
+
+
 def prior_of(file: str, model: str | None, names: Sequence[str]) -> Inputs:
     """Return the prior of these parameters, which posteriors in a results directory were found with."""
     from workflows.config.study import parse
 
-    found, attributes = variables((Path(file) / "results.nc").read_bytes())
-    study: Any = parse(tomllib.loads(str(attributes["config"])), folder=Path(file))
-    if "candidates" in tomllib.loads(str(attributes["config"])):
-        chosen = model
-        if model in (None, BEST):
-            chosen = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
-        inputs: Inputs = study.models[chosen].inputs
-    else:
-        inputs = study.inputs
+    blocks = source_blocks(file)
+    study: Any = parse(blocks, folder=Path(file))
+    inputs: Inputs = study.models[candidate_of(file, model)].inputs if "candidates" in blocks else study.inputs
     return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
+
+
+def draws_in(found: xr.Dataset, kind: str) -> Draws:
+    """Return the draws in the results of a study of one group of data or data set; errors as of `read`."""
+    return READERS[kind](
+        Path("results"), {str(name): one.values for name, one in found.variables.items()}, None, None, ""
+    )
 
 
 # --- numbers of the model --------------------------------------------------------------------------------------------
@@ -357,14 +373,11 @@ def material_of(source: Source) -> dict[str, Any]:
 def material(file: str, model: str | None) -> dict[str, Any]:
     """Return the block of the material of a candidate, or of an inversion; empty where there is none."""
     path = _directory(file)
-    found, attributes = variables((path / "results.nc").read_bytes())
-    config = tomllib.loads(str(attributes["config"]))
+    config = source_blocks(str(path))
     if "candidates" not in config:
         chosen = config.get("model", {})
     else:
-        name = model
-        if name in (None, BEST):
-            name = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
+        name = candidate_of(str(path), model)
         candidate = config["candidates"].get(name, {})
         chosen = {**config.get("model", {}), **candidate.get("model", candidate)}
     block = chosen.get("material", {})

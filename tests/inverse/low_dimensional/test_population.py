@@ -5,10 +5,88 @@ import re
 import numpy as np
 import pytest
 
-from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, _roots, fitted
-from inverse.methods.population import Columns
+from inverse.low_dimensional.population import Fit, Hyperprior, Specimen, _log_kernels, _roots, fitted
+from inverse.methods.population import LEAST, Columns, Population, Scale
+from uq.findings import findings
 from uq.inputs.distributions import Normal, Uniform
+from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
+
+
+def test_kernels_are_exact_for_normal_posteriors_under_normal_priors():
+    """p/π_0 of N(1, 0.5) under N(0, 1) is the likelihood N(2 | z, 1); few draws of a density that has wide kernels."""
+    from scipy.stats import norm
+
+    u = norm.ppf((np.arange(200) + 0.5) / 200)
+    z = (1 + np.sqrt(0.5) * u / u.std())[:, None]
+    one = Specimen(z, np.full(200, 1 / 200), -(z[:, 0] ** 2) / 2, 20.0)
+    assert one.width > 0.5
+    means, variances = np.array([[1.0], [2.0], [2.5]]), np.array([[[0.2]], [[0.5]], [[0.1]]])
+    found = np.log(np.exp(_log_kernels(one, means, variances)).sum(axis=1))
+    exact = norm.logpdf(2, means[:, 0], np.sqrt(1 + variances[:, 0, 0]))
+    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)  # 0.17 with π_0 constant in a kernel
+
+
+def of_normal(y, sigma, prior, rng):
+    """Draws of the posterior of a number that was measured once, under a normal prior."""
+    variance = 1 / (1 / sigma**2 + 1 / prior.std**2)
+    z = rng.standard_normal(400)
+    mean = variance * (y / sigma**2 + prior.mean / prior.std**2)
+    values = mean + np.sqrt(variance) * (z - z.mean()) / z.std()
+    return Draws(("a",), values[:, None], np.full(400, 1 / 400), 400.0)
+
+
+def closed_form(y, sigma, prior):
+    """Mean and deviation of a population's mean, and of each specimen the mean, by a sum over a grid."""
+    m, logs = np.linspace(-2, 12, 701)[:, None], np.linspace(np.log(1e-3), np.log(20), 400)[None, :]
+    s = np.exp(logs)
+    found = -(((m - prior.mean) / (2 * prior.std)) ** 2) / 2 + logs - 2 * np.log1p((s / prior.std) ** 2 / 3)
+    for one in y:
+        found = found - (one - m) ** 2 / (2 * (s**2 + sigma**2)) - np.log(s**2 + sigma**2) / 2
+    w = np.exp(found - found.max())
+    w /= w.sum()
+    mean = float((w * m).sum())
+    each = [float((w * (one * s**2 + m * sigma**2) / (s**2 + sigma**2)).sum()) for one in y]
+    return mean, float(np.sqrt((w * (m - mean) ** 2).sum())), each
+
+
+def test_specimens_far_from_their_prior_are_drawn_again():
+    """Their own draws do not reach where the population is; without them it errs by four standard deviations."""
+    rng, sigma, prior = np.random.default_rng(1), 1.0, Normal(mean=0.0, std=1.0)
+    y = 6 + np.hypot(0.5, sigma) * rng.standard_normal(8)
+    names = [f"s{k}" for k in range(8)]
+    first = {name: of_normal(one, sigma, prior, rng) for name, one in zip(names, y, strict=True)}
+    mean, std, each = closed_form(y, sigma, prior)
+    population = Population(source="batch", distribution="normal", draws=1000)
+
+    def again(name, under):
+        return of_normal(y[names.index(name)], sigma, under.marginals["a"], rng)
+
+    once = population.run(first, Inputs({"a": prior}))
+    assert float(once["location_mean"][0]) < mean - 2 * std
+    assert any("their estimates, and what they say of the population, are rough" in one.text for one in findings(once))
+    found = population.run(first, Inputs({"a": prior}), again)
+    assert float(found["location_mean"][0]) == pytest.approx(mean, abs=0.4 * std)
+    assert float(found["location_std"][0]) == pytest.approx(std, rel=0.2)
+    np.testing.assert_allclose(found["specimen_mean"][:, 0], each, atol=0.4 * std)
+    assert (found["specimen_redrawn"] >= 1).all()
+    assert (found["specimen_effective"] >= LEAST).all()
+    assert [one.severity for one in findings(found)] == ["note"]
+    np.testing.assert_array_equal(found["own_mean"], once["own_mean"])  # by themselves they are what they were
+    text = "; ".join(one.text for one in findings(population.run(first, Inputs({"a": prior}), lambda *_: "no data")))
+    assert "They cannot be drawn again: no data." in text
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+def test_priors_of_specimens_that_are_drawn_again_cover_the_population(logarithmic):
+    rng = np.random.default_rng(3)
+    scale = Scale(logarithmic, np.array([1.0, -1.0 if logarithmic else 1.0]))
+    new = rng.multivariate_normal([1.0, 2.0], [[0.04, 0.03], [0.03, 0.09]], 20_000)
+    prior = scale.inputs(("a", "b"), new, Hyperprior(np.zeros(2), np.ones(2)))
+    z = scale.to(prior.points(rng.random((20_000, 2))))
+    np.testing.assert_allclose(z.mean(axis=0), [1, 2], atol=0.05 if not logarithmic else 0.2)
+    np.testing.assert_allclose(z.std(axis=0), 1.5 * np.array([0.2, 0.3]), rtol=0.05 if not logarithmic else 0.4)
+    assert np.corrcoef(z.T)[0, 1] == pytest.approx(0.45, abs=0.06)
 
 
 @pytest.mark.parametrize("width", [0.05, 0.4])  # of a population, over the errors of its specimens

@@ -1,0 +1,141 @@
+"""Populations some of whose specimens have to be drawn again: batches of `invert` and groups of `select`."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from inverse.methods.population import LEAST
+from tests.inverse.low_dimensional.test_population import closed_form
+from tests.launch import TISSUQ
+from tests.launch import run as on_ranks
+from uq.inputs.distributions import LogNormal, Normal
+from workflows.config.study import load
+from workflows.run.run import run
+
+MODULE = "def value(p):\n    return [p[0]]\ndef slope(p):\n    return [[1.0]]\n"
+INVERT = """
+[model]
+kind = "python"
+function = "measured_once.value"
+jacobian = "measured_once.slope"
+parameters = { a = 0.0 }
+outputs = ["u"]
+[parameters]
+a = { kind = "normal", mean = 0.0, std = 1.0 }
+[data]
+files = ["data"]
+[method]
+kind = "invert"
+samples = 128
+starts = 1
+"""
+SELECT = """
+[data]
+file = "curve.csv"
+group = "specimen"
+[candidates.neo-hookean]
+material = { kind = "neo-hookean" }
+parameters.C1 = { kind = "log-normal", mean = 100, std = 20 }
+[method]
+kind = "select"
+samples = 64
+noise = { absolute = 100 }
+subsets = { tension = ["uniaxial"] }
+"""
+VALUES = 6 + np.hypot(0.5, 1.0) * np.random.default_rng(1).standard_normal(4)
+
+
+def population(folder, source, more=""):
+    path = folder / "population.toml"
+    path.write_text(f'[method]\nkind = "population"\nsource = "{source}"\ndraws = 400\n{more}\n')
+    return path
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory):
+    """Four specimens of a number, measured once each, whose prior is six of its deviations away."""
+    folder = tmp_path_factory.mktemp("batch")
+    (folder / "measured_once.py").write_text(MODULE)
+    (folder / "data").mkdir()
+    for k, value in enumerate(VALUES):
+        (folder / "data" / f"s{k}.csv").write_text(f"output,value,sigma\nu,{value},1\n")
+    (folder / "invert.toml").write_text(INVERT)
+    sys.path.insert(0, str(folder))
+    assert run(load(folder / "invert.toml"), "invert", folder / "results", quiet=True, report=False) in (0, 3)
+    yield folder
+    sys.path.remove(str(folder))
+
+
+def texts(directory):
+    return [one["text"] for one in json.loads((directory / "summary.json").read_text())["findings"]]
+
+
+def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path):
+    """The same bytes on any number of ranks, and without the data a finding that says where they are missing."""
+    mean, std, each = closed_form(VALUES, 1.0, Normal(mean=0.0, std=1.0))
+    more = f'distribution = "normal"\nstudy = "{batch / "invert.toml"}"'
+    path = population(tmp_path, batch / "results", more)
+    assert run(load(path), "population", tmp_path / "one", quiet=True, report=False) == 0
+    done = on_ranks(2, TISSUQ, "run", path, "--out", tmp_path / "two", "--quiet", "--no-report")
+    assert done.returncode == 0, done.stderr
+    one, two = (xr.load_dataset(tmp_path / name / "results.nc", engine="h5netcdf") for name in ("one", "two"))
+    assert all(one[name].values.tobytes() == two[name].values.tobytes() for name in one.variables)
+    found = one
+    assert (found["specimen_redrawn"] >= 1).all()
+    assert (found["specimen_effective"] >= LEAST).all()
+    assert float(found["location_mean"][0]) == pytest.approx(mean, abs=0.5 * std)
+    np.testing.assert_allclose(found["specimen_mean"][:, 0], each, atol=0.5 * std)
+    summary = json.loads((tmp_path / "one" / "summary.json").read_text())
+    assert summary["evaluations"] > 4 * 128
+    assert any(text.startswith("Few draws of s0") and "drawn again" in text for text in texts(tmp_path / "one"))
+    alone = population(tmp_path, batch / "results", 'distribution = "normal"')
+    assert run(load(alone), "population", tmp_path / "alone", quiet=True, report=False) == 0
+    assert any("cannot be drawn again: s0.csv is not in" in text for text in texts(tmp_path / "alone"))
+
+
+def test_data_that_have_changed_are_not_inverted_again(batch, tmp_path):
+    shutil.copytree(batch, tmp_path / "moved")
+    changed = tmp_path / "moved" / "data" / "s1.csv"
+    changed.write_text(changed.read_text().replace("u,", "u,1"))
+    more = f'distribution = "normal"\nstudy = "{tmp_path / "moved" / "invert.toml"}"'
+    study = load(population(tmp_path, batch / "results", more))
+    assert run(study, "population", tmp_path / "population", quiet=True, report=False) == 0
+    found = xr.load_dataset(tmp_path / "population" / "results.nc")
+    assert found["specimen_redrawn"].values.tolist()[1] == 0
+    assert any("s1.csv has changed since s1 was inverted" in text for text in texts(tmp_path / "population"))
+
+
+def by_sums(truth, slope, sigma):
+    """Median of the typical modulus, by sums over grids of ln C1, and of its mean and deviation over specimens."""
+    z, m = np.linspace(3, 9, 1201), np.linspace(3, 9, 121)
+    s, prior = np.exp(np.linspace(np.log(0.01), np.log(10), 80)), LogNormal(mean=100.0, std=20.0).of_coordinate
+    deviations = (np.outer(np.exp(z), slope) - C1 * slope for C1 in truth)
+    likelihoods = np.array([np.exp(-((one / sigma) ** 2).sum(axis=1) / 2) for one in deviations])
+    found = -(((m[:, None] - prior[0]) / (2 * prior[1])) ** 2) / 2 + np.log(s) - 2 * np.log1p((s / prior[1]) ** 2 / 3)
+    for j, width in enumerate(s):
+        kernel = np.exp(-(((z - m[:, None]) / width) ** 2) / 2) / width
+        found[:, j] += np.log(kernel @ likelihoods.T + 1e-300).sum(axis=1)
+    w = np.exp(found - found.max()).sum(axis=1)
+    return float(np.exp(np.interp(0.5, np.cumsum(w) / w.sum(), m)))
+
+
+def test_groups_of_a_comparison_are_solved_again(tmp_path):
+    """Specimens that are three times as stiff as the prior expects."""
+    stretch, truth = np.array([1.1, 1.2, 1.3]), {"one": 300.0, "two": 320.0, "three": 280.0, "four": 310.0}
+    slope = 2 * (stretch - stretch**-2)
+    rows = [f"uniaxial,{name},{x},{C1 * k}" for name, C1 in truth.items() for x, k in zip(stretch, slope, strict=True)]
+    (tmp_path / "curve.csv").write_text("\n".join(["mode,specimen,stretch,stress", *rows]))
+    (tmp_path / "select.toml").write_text(SELECT)
+    assert run(load(tmp_path / "select.toml"), "select", tmp_path / "results", quiet=True, report=False) in (0, 3)
+    path = population(tmp_path, tmp_path / "results")
+    assert run(load(path), "population", tmp_path / "population", quiet=True, report=False) == 0
+    found = xr.load_dataset(tmp_path / "population" / "results.nc")
+    assert (found["own_mean"] < 200).all()  # the prior holds them
+    assert (found["specimen_redrawn"] >= 1).all()
+    assert (found["specimen_effective"] >= LEAST).all()
+    right = by_sums(truth.values(), slope, 100.0)
+    assert float(found["typical_quantiles"][1, 0]) == pytest.approx(right, rel=0.1)
