@@ -140,6 +140,8 @@ class Hyperelastic(ModelSpec):
         may be above 3: for some values of the inputs in a study, otherwise for the constants as given.
     adapt
         Whether the mesh is refined first, and until when; tetrahedra only, in studies that sample.
+    stresses
+        Whether results hold stresses and strains too, at the mean of the inputs.
     """
 
     meshed: ClassVar[bool] = True
@@ -158,6 +160,7 @@ class Hyperelastic(ModelSpec):
     outputs: tuple[Output, ...] = Field(min_length=1)
     solver: SolverSettings = SolverSettings()
     adapt: Adapt | None = None
+    stresses: bool = False
 
     @field_validator("solver", mode="before", json_schema_input_type=SolverSettings | str)
     @classmethod

@@ -110,6 +110,17 @@ class Discretisation(Linearisation):
         """How deep (m) the body enters each tool, by their labels, at the state that is set."""
         return {load.label: -ranks.smallest(self.comm, float(gaps().min(initial=0.0))) for load, gaps in self._gaps}
 
+    def stressed(self) -> FloatArray | None:
+        """Stresses (Pa) and strains (2, N, 6) at all nodes, as of `FiniteElementSolution`; collective."""
+        rows = np.zeros((4, self.size))  # as parts of states, which have three numbers at a node
+        found = self.stresses_at_nodes().reshape(4, 3, -1)
+        rows[:, : found[0].size] = np.moveaxis(found, 1, 2).reshape(4, -1)
+        whole = self.layout.gather(rows)
+        if whole is None:
+            return None
+        parts = whole[:, : self.layout.coordinates.size].reshape(2, 2, -1, 3)
+        return np.asarray(np.concatenate([parts[:, 0], parts[:, 1]], axis=2))
+
     def touched(self) -> dict[str, FloatArray]:
         """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices of the boundary of each tool; collective.
 

@@ -22,6 +22,8 @@ from forward.model import FloatArray
 from forward.terms import tools
 from forward.terms.term import Place, Since, Term
 
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # components of symmetric tensors, as in ParaView
+
 
 class Forms:
     """What is integrated over a body, as functions of its state, its parameters and directions of both.
@@ -392,9 +394,20 @@ class Forms:
         return assembly.PointValues(stress, corners, self.space, self.comm)
 
     @cached_property
-    def gradients(self) -> assembly.NodalGradients:
-        """Deformation gradients at the nodes, at the current state."""
-        return assembly.NodalGradients(self.F, self.space, self.comm)
+    def gradients(self) -> assembly.NodalAverages:
+        """Deformation gradients (3, 3, n_owned) at the nodes, at the current state."""
+        return assembly.NodalAverages(self.F, (3, 3), self.space, self.comm)
+
+    @cached_property
+    def stresses_at_nodes(self) -> assembly.NodalAverages:
+        """Cauchy stresses (Pa) and Green–Lagrange strains (2, 6, n_owned) at the nodes, at the current state.
+
+        σ = P Fᵀ/J and E = (FᵀF − I)/2, components xx, yy, zz, xy, yz, xz.
+        """
+        cauchy = self._invariants.inserted(self.stress_of(self._potential)) * self.F.T / self.J
+        strain = (self.F.T * self.F - ufl.Identity(3)) / 2
+        both = ufl.as_vector([tensor[i, j] for tensor in (cauchy, strain) for i, j in SYMMETRIC])
+        return assembly.NodalAverages(both, (2, 6), self.space, self.comm)
 
 
 class PressuresAtVertices:

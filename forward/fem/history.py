@@ -236,6 +236,10 @@ class HistorySolution:
         """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
         return self._visit(len(self.passed) - 1).touched()
 
+    def stressed(self) -> FloatArray | None:
+        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
+        return self._visit(len(self.passed) - 1).stressed()
+
     def _linearise(self, i: int) -> Discretisation:
         """The same, with the factor of the stiffness there."""
         self._visit(i)

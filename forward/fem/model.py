@@ -409,6 +409,13 @@ class FiniteElementSolution:
         """Undeformed places (m) and pressures (Pa), (n, 4), at the vertices under each tool; collective."""
         return self._model.visit(self).touched()
 
+    def stressed(self) -> FloatArray | None:
+        """Cauchy stresses (Pa) and Green–Lagrange strains (2, N, 6) at all nodes in canonical order; collective.
+
+        On the first rank only. Components xx, yy, zz, xy, yz, xz; averages over the cells that meet at a node.
+        """
+        return self._model.visit(self).stressed()
+
     @cached_property
     def _right_sides(self) -> FloatArray:
         return self._model.visit(self).right_sides()

@@ -166,6 +166,10 @@ class PathSolution:
         """What each tool touches at the last step, as of `FiniteElementSolution`; collective."""
         return self.steps[-1].touched()
 
+    def stressed(self) -> FloatArray | None:
+        """Stresses and strains at the last step, as of `FiniteElementSolution`; collective."""
+        return self.steps[-1].stressed()
+
     @property
     def work(self) -> Work:
         """Cost of all steps so far."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.machine import write_whole
+from forward.words import per
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
 from workflows.results.tools import tool_grid, tools_of
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 
 ROUNDING = 2.0**-52
 TETRAHEDRON = 10  # of VTK
+AXES = 3
+# Of arrays that are not numbers, other than displacements and their derivatives.
+UNITS = {"stress": "Pa", "von_mises": "Pa", "moved": "m", "indicator by volume": "1/m³"}
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 
@@ -134,12 +139,20 @@ def mesh_grid(dataset: xr.Dataset) -> Grid:
     return Grid(points, cells, TETRAHEDRON, {}, {"indicator": shares, "indicator by volume": by_volume})
 
 
-def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
+def write_fields(
+    directory: Path, dataset: xr.Dataset, units_of: Callable[[str], Mapping[str, str]] = lambda _: {}
+) -> Path | None:
     """Write the fields of the results on the undeformed mesh, for ParaView; nothing if there are none.
 
     Displacements are in one file; what each data set says about the interior is in one file each, its
     points with what was measured and predicted there in another; a mesh that was
     refined is in one with what its cells add to errors; every tool is in one, at its depth.
+    Names of arrays end with their unit in parentheses.
+
+    Parameters
+    ----------
+    units_of
+        Returns the units of the parameters of a model, by its label.
     """
     grids: dict[str, Callable[[], Grid]] = {}
     if "cell_nodes" in dataset and "data_set" in dataset.dims:
@@ -156,19 +169,41 @@ def write_fields(directory: Path, dataset: xr.Dataset) -> Path | None:
     if "cell_nodes" in dataset:
         points = dataset["node_position"].to_numpy()
         grids = {f"tool-{tool.label}": partial(tool_grid, tool, points) for tool in tools_of(dataset)} | grids
+    of_parameters = units_of("/") if "field_derivative" in dataset else {}
     for name, grid in grids.items():
         directory.mkdir(exist_ok=True)
         path = directory / f"{name}.vtu"
-        write_whole(path, vtu(grid()))
+        write_whole(path, vtu(with_units(grid(), of_parameters)))
     return path
 
 
+def with_units(grid: Grid, of_parameters: Mapping[str, str]) -> Grid:
+    """Return a grid whose arrays have their units in their names; numbers have none."""
+
+    def named(name: str, values: NDArray[Any]) -> str:
+        first, _, parameter = name.partition(" ")
+        unit = UNITS.get(name, "1")
+        if first.startswith("derivative"):
+            unit = per("m", of_parameters.get(parameter, "1"))
+        elif unit == "1" and values.ndim > 1 and values.shape[1] == AXES:
+            unit = "m"
+        return name if unit == "1" else f"{name} ({unit})"
+
+    return replace(
+        grid,
+        point_data={named(name, values): values for name, values in grid.point_data.items()},
+        cell_data={named(name, values): values for name, values in grid.cell_data.items()},
+    )
+
+
 def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return the fields (n_nodes, 3) and numbers (n_nodes,) of the results, under descriptive names."""
+    """Return the fields (n_nodes, 3), tensors (n_nodes, 6) and numbers (n_nodes,) of the results, named in words."""
     arrays = {}
     for name, variable in dataset.data_vars.items():
         if set(variable.dims) == {"node", "component"}:
             arrays[str(name).removeprefix("field_")] = variable.to_numpy()
+        elif variable.dims == ("node", "tensor"):
+            arrays[str(name).removeprefix("node_")] = variable.to_numpy()
         elif variable.dims in {("parameter", "node", "component"), ("parameter", "node")}:
             short = str(name).removeprefix("field_").removeprefix("node_")
             for parameter in dataset.parameter.values:

@@ -152,7 +152,7 @@ def _run(study: StudyKind, name: str, directory: Path, *, quiet: bool, silent: b
         dataset = study.finished(dataset, evaluations)
         wall = time.monotonic() - begin
         summary = summarised(study, name, dataset, job, world.size, ensemble.rank_groups, wall)
-        _leave(directory, dataset, evaluations, summary, checkpoint, job)
+        _leave(directory, dataset, evaluations, summary, checkpoint, job, study.units_of)
         _tell(directory, "" if quiet else closing_words(dataset, summary), report=report)
         return exit_code(summary)
 
@@ -196,10 +196,11 @@ def _leave(
     summary: dict[str, Any],
     checkpoint: Checkpoint,
     job: Job,
+    units_of: Callable[[str], Mapping[str, str]],
 ) -> None:
     """Write all results, in an order that is safe against a kill."""
     write_dataset(directory / "results.nc", dataset, job.arviz_groups(dataset))
-    write_fields(directory / "fields", dataset)
+    write_fields(directory / "fields", dataset, units_of)
     for name, text in job.texts(dataset).items():
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         write_text(directory / name, text)

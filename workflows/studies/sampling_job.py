@@ -24,6 +24,7 @@ from workflows.results.norms import node_volumes
 from workflows.studies.contact import touched, with_contact
 from workflows.studies.findings_solves import measured
 from workflows.studies.job import Job, MethodJob
+from workflows.studies.stresses import stressed, with_stresses
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -76,6 +77,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
     locking = measured(study, model) if ensemble.index == 0 else []
     pressed = touched(study, model) if ensemble.index == 0 else {}
+    tensors = stressed(study, model) if ensemble.index == 0 else None
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
@@ -84,7 +86,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         if "step" in found.coords:
             once_for_steps(found)
         found = with_contact(with_regions(found, model.spec.body.regions, regions), pressed)
-        return with_random_fields(found, factors, model.space.variance_kept)
+        return with_random_fields(with_stresses(found, tensors), factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)
     before = named("workflows.studies.tolerance:meshes_before")(directory) if study.accuracy.tolerance else ()

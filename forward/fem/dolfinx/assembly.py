@@ -116,13 +116,21 @@ class FacetValues:
         return np.asarray(values[self._rows, self._columns])
 
 
-class NodalGradients:
-    """Deformation gradients at the nodes: averages over the cells that meet there."""
+class NodalAverages:
+    """An expression of a space of displacements at its nodes: averages over the cells that meet there.
 
-    def __init__(self, F: Any, space: Any, comm: Any) -> None:
+    Parameters
+    ----------
+    expression
+        UFL expression.
+    shape
+        Its shape.
+    """
+
+    def __init__(self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any) -> None:
         nodes = cell_element(space).points
-        self._comm = comm
-        self._values = PointValues(F, nodes, space, comm)
+        self._comm, self._shape = comm, shape
+        self._values = PointValues(expression, nodes, space, comm)
         self._count = space.dofmap.index_map.size_local + space.dofmap.index_map.num_ghosts
         self._nodes = version.nodes_of_cells(space, len(nodes))[: owned_cells(space.mesh)].ravel()
         self._carrier = fem.Function(space)
@@ -137,11 +145,12 @@ class NodalGradients:
         return np.asarray(sum_ghosts(self._carrier).reshape(-1, 3).T)
 
     def __call__(self) -> FloatArray:
-        """Return F (3, 3, n_owned) at this rank's nodes, for the current state."""
-        values = self._values().reshape(-1, 9).T
+        """Return the values (*shape, n_owned) at this rank's nodes, for the current state."""
+        count = int(np.prod(self._shape))
+        values = self._values().reshape(-1, count).T
         sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
-        F = np.array([self._owned(rows) for rows in sums.reshape(3, 3, -1)])
-        return np.asarray(F / self._meeting)
+        found = np.concatenate([self._owned(rows) for rows in sums.reshape(-1, 3, self._count)])
+        return np.asarray((found / self._meeting).reshape(*self._shape, -1))
 
 
 def trilinear_elements(body: Body) -> tuple[Any, list[csr_matrix]]:

@@ -13,6 +13,7 @@ from forward.fem.dolfinx import meshes, spaces
 from forward.fem.layout import Layout
 from workflows.results.directory import label, with_random_fields, write_fields
 
+UNITS = {"material.C1": "Pa", "loads.gravity.density": "kg/m³"}
 SIZE = (2.0, 1.0, 0.5)
 
 
@@ -57,8 +58,8 @@ def test_errors_that_are_not_known_do_not_spoil_the_file(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         grid = pyvista.read(path)
-    assert "mean_error" not in grid.point_data
-    assert np.isnan(grid["std_error"][1:]).all()
+    assert "mean_error (m)" not in grid.point_data
+    assert np.isnan(grid["std_error (m)"][1:]).all()
 
 
 @pytest.mark.parametrize(
@@ -73,22 +74,22 @@ def test_errors_that_are_not_known_do_not_spoil_the_file(tmp_path):
 def test_fields_are_read_again(tmp_path, cell, degree, kind):
     where = layout(cell, degree)
     dataset = results(where, degree)
-    path = write_fields(tmp_path / "fields", dataset)
+    path = write_fields(tmp_path / "fields", dataset, lambda label: UNITS)
     grid = pyvista.read(path)
     assert set(grid.celltypes) == {kind} or degree == 1
     assert grid.n_cells == 2 * (6 if cell == "tetrahedron" else 1)
     np.testing.assert_array_equal(grid.points, where.coordinates)
     assert set(grid.point_data) == {
-        "mean",
-        "std",
-        "derivative material.C1",
-        "derivative loads.gravity.density",
+        "mean (m)",
+        "std (m)",
+        "derivative material.C1 (m/Pa)",
+        "derivative loads.gravity.density (m/(kg/m³))",
         "sobol_first material.C1",
         "sobol_first loads.gravity.density",
         "dominating",
         "factor stiffness 0",
     }
-    np.testing.assert_array_equal(grid["mean"], dataset["field_mean"])
+    np.testing.assert_array_equal(grid["mean (m)"], dataset["field_mean"])
     np.testing.assert_array_equal(
         grid["sobol_first loads.gravity.density"], dataset["node_sobol_first"].sel(parameter="loads.gravity.density")
     )
@@ -97,8 +98,8 @@ def test_fields_are_read_again(tmp_path, cell, degree, kind):
     sampled = pyvista.PolyData(inside).sample(grid)
     found = np.asarray(sampled["vtkValidPointMask"]) > 0
     assert found.mean() > 0.9
-    np.testing.assert_allclose(sampled["mean"][found], polynomial(inside, degree)[found], atol=1e-6)
+    np.testing.assert_allclose(sampled["mean (m)"][found], polynomial(inside, degree)[found], atol=1e-6)
     volume = grid.compute_cell_sizes()["Volume"].sum() if degree == 1 else 1.0
     assert volume == pytest.approx(1.0)
-    warped = grid.warp_by_vector("mean")
-    np.testing.assert_allclose(warped.points, grid.points + grid["mean"])
+    warped = grid.warp_by_vector("mean (m)")
+    np.testing.assert_allclose(warped.points, grid.points + grid["mean (m)"])

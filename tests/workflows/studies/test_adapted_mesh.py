@@ -90,7 +90,7 @@ def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished):
     assert grid.n_cells == found.sizes["mesh_cell"] == found.sizes["cell"]
     assert grid.volume == pytest.approx(0.1875)
     assert grid.cell_data["indicator"].sum() == pytest.approx(1)
-    by_volume = grid.cell_data["indicator by volume"] * grid.compute_cell_sizes().cell_data["Volume"]
+    by_volume = grid.cell_data["indicator by volume (1/m³)"] * grid.compute_cell_sizes().cell_data["Volume"]
     np.testing.assert_allclose(by_volume, grid.cell_data["indicator"], rtol=1e-6)
     assert (finished / "fields" / "displacement.vtu").exists()
     page = (finished / "report.html").read_text()

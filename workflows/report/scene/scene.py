@@ -180,6 +180,8 @@ def _quantities(of: xr.Dataset, mean: str) -> Iterator[Quantity]:
     yield Quantity(name, _size(of[mean]), "m")
     if "field_std" in of:
         yield Quantity("Standard deviation of the displacement", _size(of["field_std"]), "m", "plasma", std=True)
+    if "von_mises" in of:
+        yield Quantity("Von Mises stress at the mean parameters", of["von_mises"].to_numpy(), "Pa", "plasma")
     if f"{mean}_mesh_error" in of:
         yield Quantity("Error of the mesh in the displacement", _size(of[f"{mean}_mesh_error"]), "m", "plasma")
     if "field_mean_error" in of:
