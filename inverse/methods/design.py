@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -204,26 +204,37 @@ class Design(Settings):
         ModelError
             As `run`.
         """
-        goals = np.zeros(len(values.names), dtype=bool)
-        for pattern in (*self.goals, *self.noises):
-            mine = values.matching(pattern)
-            if not mine.any():
-                message = f"'{pattern}' is the name of no value of the model, such as {', '.join(values.names[:3])}"
-                raise ModelError(message)
-            goals |= mine & (pattern in self.goals)
+        for name, message, _ in self.mistakes(values):
+            text = f"method.{name}: {message}"
+            raise ModelError(text)
+        goals = self._goals(values)
         found = Candidates.of(values, self.each, goals)
-        if len(found.names) < (self.number or 1):
-            message = f"{len(found.names)} candidates, expected at least number = {self.number or 1}"
-            raise ModelError(message)
+        return found, goals, found.numbers(self.costs)
+
+    def mistakes(self, values: Values) -> Iterator[tuple[str, str, object]]:
+        """Find what asks for more than there is among values (m,), or for names of none: the key, why, what is given."""
+        for key, patterns in (("goals", self.goals), ("noises", tuple(self.noises))):
+            for pattern in patterns:
+                if not values.matching(pattern).any():
+                    known = ", ".join(values.names[:3])
+                    yield key, f"'{pattern}' is the name of no value of the model, such as {known}", pattern
+        found = Candidates.of(values, self.each, self._goals(values))
+        most = len(found.names)
+        if self.number is not None and self.number > most:
+            yield "number", f"more than there are candidates, expected at most {most}", self.number
+        elif not most:
+            yield "goals", "nothing is left to be measured, expected values that are not predicted", list(self.goals)
         try:
             costs = found.numbers(self.costs)
         except ValueError as error:
-            message = f"method.costs: {error}"
-            raise ModelError(message) from None
-        if self.budget is not None and costs.min() > self.budget:
-            message = f"budget = {self.budget:g}, expected at least the cost of the cheapest candidate, {costs.min():g}"
-            raise ModelError(message)
-        return found, goals, costs
+            yield "costs", str(error), self.costs
+            return
+        if self.budget is not None and most and costs.min() > self.budget:
+            yield "budget", f"expected at least the cost of the cheapest candidate, {costs.min():g}", self.budget
+
+    def _goals(self, values: Values) -> NDArray[np.bool_]:
+        """Which values (m,) are predicted."""
+        return np.asarray(np.any([np.zeros(len(values.names), dtype=bool), *map(values.matching, self.goals)], axis=0))
 
     def sigma(self, values: Values, outputs: FloatArray) -> FloatArray:
         """Return standard deviations (m,) of errors, given outputs (draws, m).

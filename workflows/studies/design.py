@@ -13,7 +13,6 @@ from forward.model import Finding
 from forward.registry import OfKind, named
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
-from forward.specimen import Specimen
 from inverse.methods.design import Design
 from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.random_parameters import Inputs
@@ -22,6 +21,7 @@ from workflows.config.mistakes import refused
 from workflows.config.priors import findings_of_materials, mistakes_of_draws, mistakes_of_priors, ranges
 from workflows.config.report import Report
 from workflows.config.source import AVERAGED, KEPT, READER, Sourced
+from workflows.studies.design_values import mistakes
 from workflows.studies.inversion_plan import PRODUCT
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
@@ -209,23 +209,4 @@ class DesignStudy(Sourced, StudyKind):
         yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs)
         if self.draws is not None:
             yield from mistakes_of_draws(self.model.scalars, self.draws)
-        if isinstance(self.model, Specimen):
-            yield from self._mistakes_of_specimen(self.model)
-        else:
-            yield from self._mistakes_of_count(len(self.model.returned))
-
-    def _mistakes_of_specimen(self, model: Specimen) -> Iterator[Mistake]:
-        if not model.observed and not any(case.outputs for case in model.cases):
-            message = "nothing is observed, expected boundaries or points, or outputs of load cases"
-            yield ("model", "observed"), message, ()
-        elif self.method.each == "case":
-            yield from self._mistakes_of_count(len(model.cases))
-        elif all(item.on is None for item in model.observed):
-            yield from self._mistakes_of_count(len(model.outputs))
-
-    def _mistakes_of_count(self, most: int) -> Iterator[Mistake]:
-        """Find that there are fewer candidates than asked for: at most as many as this."""
-        wanted = self.method.number
-        if wanted is not None and wanted > most:
-            message = f"more than there are candidates, expected at most {most}"
-            yield ("method", "number"), message, wanted
+        yield from mistakes(self.method, self.model)

@@ -18,6 +18,7 @@ from inverse.designs.candidates import NEAR, Values
 from inverse.designs.fields import of_field
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.kept import KeptModel
+from workflows.studies.design_values import of_outputs
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.output_inversion import derivable
 
@@ -127,15 +128,8 @@ def _of_field(
 
 def values_of(spec: ModelSpec, model: Any) -> Values:
     """Say of each output of a model what it is and where it is measured."""
-    if isinstance(spec, Specimen):
-        return _of_specimen(spec, model)
-    axes, names = dict(spec.axes_of_outputs), tuple(output.name for output in spec.returned)
-    steps = [str(step) for step in axes["step"][1]] if "step" in axes else [""] * len(names)
-    parts = [str(part) for part in axes["output_of"][1]] if "output_of" in axes else list(names)
-    return Values(names, np.full((len(names), 3), np.nan), tuple(steps), tuple(parts))
-
-
-def _of_specimen(spec: Specimen, model: SpecimenModel) -> Values:
+    if not isinstance(spec, Specimen):
+        return of_outputs(spec)
     cases = [spec.cases[number] for number in model.cases]
     parts = [
         AXES[axis] if axis < len(AXES) else case.outputs[axis - len(AXES)].name

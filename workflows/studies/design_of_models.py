@@ -17,6 +17,7 @@ from workflows.config.blocks import Parallel
 from workflows.config.mistakes import refused
 from workflows.config.priors import ranges
 from workflows.config.report import Report
+from workflows.studies.design_values import mistakes
 from workflows.studies.model_selection import ModelCandidate, changed, described
 from workflows.studies.predictions import duration
 from workflows.studies.study import StudyKind
@@ -128,10 +129,14 @@ class DesignOfModels(StudyKind):
     def _mistakes(self) -> Iterator[Mistake]:
         if self.method.criterion != "models":
             yield ("method", "criterion"), "there are candidates, expected 'models'", self.method.criterion
-        for place, spec, mistakes in described(self.candidates, self.model, _SPEC.validate_python):
-            yield from mistakes
+        first = True
+        for place, spec, wrong in described(self.candidates, self.model, _SPEC.validate_python):
+            yield from wrong
             if spec is None:
                 continue
+            if first:  # which the others are observed like
+                yield from mistakes(self.method, spec)
+                first = False
             if self.parallel.ranks_per_model > 1 and not spec.shareable:
                 message = f"a model of kind '{spec.kind}' is not shared by ranks, expected 1"
                 yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model

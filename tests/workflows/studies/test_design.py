@@ -16,6 +16,8 @@ from tests.launch import run as on_ranks
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.run import run
+from workflows.studies.design_job import values_of
+from workflows.studies.design_values import known
 
 MODULE = """
 import numpy as np
@@ -210,8 +212,45 @@ def test_whole_load_cases_are_observations(folder):
     assert found["candidate"].values.tolist() == ["shear", "pull"]
     alone = found["candidate_information"].to_numpy()
     assert int(found["chosen"][0]) == int(alone.argmax())
-    with pytest.raises(Exception, match="candidates, expected at least number = 400"):
-        load(cube(folder, "number = 400")).run()
+
+
+@pytest.mark.fem
+@pytest.mark.parametrize(("cell", "degree"), [("hexahedron", 2), ("tetrahedron", 1)])
+def test_candidates_are_known_before_there_is_a_mesh(folder, cell, degree):
+    """Names and numbers of candidates, as those of the model: faces share edges, a point may be at several places."""
+    path = cube(folder, "number = 1")
+    text = path.read_text().replace("degree = 1", f'degree = {degree}, cell = "{cell}"')
+    more = '{ on = "y-min", components = "xz", cases = ["pull"] }, { at = [[0.01, 0.02, 0.03]], name = "inside" }'
+    path.write_text(text.replace('{ on = "z-max" }]', f'{{ on = "z-max" }}, {more}]'))
+    study = load(path)
+    model = study.spec.build(MPI.COMM_SELF, study.inputs.names)
+    made, before = values_of(study.spec, model), known(study.spec)
+    assert before.names == made.names
+    assert (before.case, before.part) == (made.case, made.part)
+    for each in ("value", "point", "place", "case", "output"):
+        method = study.method.model_copy(update={"each": each})
+        assert len(method.candidates(before)[0].names) == len(method.candidates(made)[0].names), each
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        ("number = 32", "method.number: more than there are candidates, expected at most 31; given 32"),
+        ('number = 16\neach = "place"', "method.number: more than there are candidates, expected at most 16"),
+        ('number = 3\neach = "case"', "method.number: more than there are candidates, expected at most 2; given 3"),
+        ("number = 2\ncosts = { 'pul.*' = 2 }", "method.costs: 'pul.*' is the name of no candidate, such as shear."),
+        ("number = 2\nnoises = { 'pull.gri' = { absolute = 2 } }", "method.noises: 'pull.gri' is the name of no value"),
+        ("number = 2\ncriterion = 'predictions'\ngoals = ['grip']", "method.goals: 'grip' is the name of no value"),
+        ("number = 2\ncriterion = 'predictions'\ngoals = ['*']", "method.number: more than there are candidates"),
+        ("budget = 1\ncosts = { '*' = 3 }", "method.budget: expected at least the cost of the cheapest candidate, 3"),
+    ],
+)
+def test_check_refuses_what_candidates_do_not_have(folder, method, said):
+    """Of a cube, by its cells, without a mesh."""
+    done = on_ranks(None, TISSUQ, "check", cube(folder, method.replace("number = 16", "number = 17")))
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
 
 
 BUMPS = """
@@ -507,14 +546,15 @@ def test_designs_that_cannot_be(folder, method, said):
     [
         ("number = 2\ncosts = { z = 2 }", "method.costs: 'z' is the name of no candidate, such as y0, y1, y2"),
         ("number = 2\nnoises = { z = { absolute = 2 } }", "'z' is the name of no value of the model, such as y0"),
-        ("budget = 0.5", "budget = 0.5, expected at least the cost of the cheapest candidate, 1"),
+        ("budget = 0.5", "method.budget: expected at least the cost of the cheapest candidate, 1; given 0.5"),
+        ("number = 1\ncriterion = 'predictions'\ngoals = ['*']", "method.number: more than there are candidates"),
     ],
 )
-def test_names_that_fit_nothing_end_in_one_line(folder, method, said):
-    done = on_ranks(None, TISSUQ, "run", line(folder, method), "--out", folder / "out", "--quiet")
-    assert done.returncode in (1, 2)
-    assert said in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+def test_names_that_fit_nothing_are_one_line(folder, method, said):
+    with pytest.raises(StudyError) as error:
+        load(line(folder, method))
+    assert len(error.value.args) == 1, error.value.args
+    assert said in error.value.args[0]
 
 
 def test_other_studies_do_not_import_designs():
