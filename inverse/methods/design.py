@@ -212,7 +212,7 @@ class Design(Settings):
         return found, goals, found.numbers(self.costs)
 
     def mistakes(self, values: Values) -> Iterator[tuple[str, str, object]]:
-        """Find what asks for more than there is among values (m,), or for names of none: the key, why, what is given."""
+        """Find what asks for more than values (m,) have, or for names that fit none: the key, why, what is given."""
         for key, patterns in (("goals", self.goals), ("noises", tuple(self.noises))):
             for pattern in patterns:
                 if not values.matching(pattern).any():
