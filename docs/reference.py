@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import importlib.metadata
 import io
 import json
 import re
@@ -38,6 +39,9 @@ def on_files(files: Any, config: Any) -> Any:
 
     for place, text in pages():
         files.append(File.generated(config, place, content=text))
+    package = importlib.metadata.distribution("sphinx-mathjax-offline")
+    script = package.locate_file(f"{package.name}/static/mathjax/tex-svg.js")
+    files.append(File.generated(config, "assets/mathjax.js", abs_src_path=str(script)))
     return files
 
 
