@@ -24,7 +24,7 @@ from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
 from forward.bodies.random_fields import RandomField
 from forward.fem.affordable import finer, own_estimate
-from forward.fem.cost import Estimate, Times, held_together, sum_of, times
+from forward.fem.cost import Estimate, Linear, Times, held_together, linear_solver, sum_of, times
 from forward.fem.locking import Decision, Formulation, Ranges, decide, of_locking
 from forward.materials.admissible import Materials, moduli
 from forward.materials.block import Material
@@ -42,6 +42,11 @@ from forward.terms.term import Load
 
 CONTRAST = "contrast"
 INCREMENTS = 10  # of a load with friction
+IN_WORDS = {  # what linear systems are solved with
+    Linear.FACTOR: "factors of the stiffness",
+    Linear.BOTH: "multigrid; a factor of the stiffness for the reference only",
+    Linear.MULTIGRID: "multigrid, without a factor of the stiffness",
+}
 
 
 class RegionNumbers(Settings):
@@ -223,6 +228,17 @@ class Hyperelastic(ModelSpec):
     def symmetric(self) -> bool:
         """Whether the stiffness is symmetric: no load follows the body, and no tool rubs on it."""
         return all(load.symmetric for load in self.loads)
+
+    @property
+    def linear(self) -> Linear:
+        """What its linear systems are solved with."""
+        if self.mixed or self.body.degree < 2 or self.frictional:
+            return Linear.FACTOR
+        if self.solver.linear != "auto":
+            return Linear(self.solver.linear)
+        if self.solver.kind == "newton" or self.touched or not self.symmetric:
+            return Linear.FACTOR
+        return linear_solver(self.body, symmetric=self.symmetric)
 
     @property
     def frictional(self) -> bool:
@@ -439,9 +455,18 @@ class Hyperelastic(ModelSpec):
         """Predict the cost of a solve; the factors of one solution and of one reference are kept."""
         predicted = self.solver.kind != "newton" and not self.frictional
         contact, mixed, symmetric = self.touched, self.mixed, self.symmetric
-        one = times(self.body, mixed=mixed, symmetric=symmetric, predicted=predicted, factors=factors, contact=contact)
+        one = times(
+            self.body,
+            mixed=mixed,
+            symmetric=symmetric,
+            predicted=predicted,
+            factors=factors,
+            contact=contact,
+            linear=self.linear,
+        )
         if self.increments == 1:
-            held = held_together(self.unknowns) if predicted and factors > 1 and not contact else 0
+            alone = contact or self.linear == Linear.MULTIGRID
+            held = held_together(self.unknowns) if predicted and factors > 1 and not alone else 0
             return replace(one, bytes=one.bytes + held)
         whole = sum_of([replace(one, contact=False)] * self.increments)  # each from the one before
         return replace(whole, setup=one.setup, bytes=one.bytes)
@@ -462,6 +487,7 @@ class Hyperelastic(ModelSpec):
         first = "at first " if self.unrefined else ""
         yield "unknowns", f"{first}{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
+        yield "linear", IN_WORDS[self.over(ranges).linear]
         if self.adapt is not None:
             yield "mesh", self.adapt.in_words(self)
 
@@ -546,6 +572,7 @@ class Hyperelastic(ModelSpec):
         yield from self._mistakes_of_fields()
         yield from self._mistakes_of_outputs()
         yield from self._mistakes_of_formulation()
+        yield from self._mistakes_of_linear_solver()
         yield from self._contradictions()
         yield from adaptive.mistakes(self)
         if self.adapt is not None and self.frictional:
@@ -634,6 +661,22 @@ class Hyperelastic(ModelSpec):
         if self.formulation == "mixed" and self.body.degree < 2:
             message = "a mixed form on cells of degree 1 is not stable, expected body.degree = 2"
             yield ("formulation",), message, self.formulation
+
+    def _mistakes_of_linear_solver(self) -> Iterator[Mistake]:
+        asked = self.solver.linear
+        if asked not in {"multigrid", "both"}:
+            return
+        objection = ""
+        if self.body.degree < 2:
+            objection = "multigrid needs cells of degree 2, between which and linear ones it goes to and fro"
+        elif self.formulation == "mixed":
+            objection = "multigrid solves for displacements only, and the form is mixed"
+        elif self.frictional:
+            objection = "multigrid is not available with friction"
+        elif self.solver.kind == "newton":
+            objection = "the textbook solver has a factor for every step"
+        if objection:
+            yield ("solver", "linear"), f"{objection}; expected 'factor' or 'auto'", asked
 
     def _contradictions(self) -> Iterator[Mistake]:
         """Boundaries that are both clamped and moved, and components that are prescribed twice."""

@@ -95,6 +95,27 @@ MOST_TOGETHER, BYTES_TOGETHER = 32, 2**27  # points, and what they hold: vectors
 HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, rotations
 
 
+# Linear systems by conjugate gradients with two levels (`forward.fem.dolfinx.multigrid`).
+PER_PRODUCT = 1.5e-9  # of the matrix times a vector, for each non-zero
+BYTES_PER_ENTRY_IN_BLOCKS = 9.0  # of the matrix
+PRODUCTS = 6.5  # an iteration, without the coarse level
+BOUNDING = 13  # products for the bound of the eigenvalues
+ROUGHLY_SOLVED = {True: 9, False: 6}  # iterations of a step of Newton's method, in bodies that are slender and others
+SOLVED = {True: 32, False: 20}  # of a derivative
+LANCZOS = 22  # to know that a state is stable
+COARSE = 0.5  # of an assembly, for the coarse level
+NEWTON_FROM_PREDICTION = 3
+WORTH, DERIVATIVES = 0.7, 4  # times a first solve and so many derivatives with factors, below which none are made
+
+
+class Linear(StrEnum):
+    """What linear systems are solved with."""
+
+    FACTOR = "factor"
+    BOTH = "both"
+    MULTIGRID = "multigrid"
+
+
 class Meshed(Protocol):
     """What a body must tell."""
 
@@ -157,6 +178,14 @@ class Times:
         Whether tools are pressed against it from afar, rather than a step at a time.
     bytes
         Memory of mesh, matrices and factors.
+    linear
+        What linear systems are solved with.
+    stepping
+        A step of Newton's method, without assembly: a factor and a back-substitution, or what takes their place.
+    counting
+        Finding out whether a state is stable, once its stiffness is prepared.
+    deriving
+        One derivative of a solution whose stiffness is prepared.
     """
 
     assembly: float
@@ -168,6 +197,10 @@ class Times:
     predicted: bool = True
     bytes: float = 0.0
     contact: bool = False
+    linear: Linear = Linear.FACTOR
+    stepping: float = 0.0
+    counting: float = 0.0
+    deriving: float = 0.0
 
     @property
     def sample(self) -> float:
@@ -178,7 +211,11 @@ class Times:
     def textbook(self) -> float:
         """A solve by Newton's method from zero."""
         count = NEWTON_IN_CONTACT if self.contact else NEWTON[self.slender]
-        return count * (self.assembly + self.factorisation + self.substitution + 2 * self.residual)
+        return count * self._newton_step + self.counting
+
+    @property
+    def _newton_step(self) -> float:
+        return self.assembly + self.stepping + 2 * self.residual
 
     @property
     def first(self) -> float:
@@ -188,6 +225,8 @@ class Times:
     @property
     def corrected(self) -> float:
         """A solve from a prediction with the factor of a reference, and the screen of its stability."""
+        if self.linear == Linear.MULTIGRID:  # Newton's method; the last step is for the test
+            return NEWTON_FROM_PREDICTION * self._newton_step + self.counting
         if self.contact:  # every other sample takes a factor of its own
             more = (self.assembly + self.factorisation) / 2 + CORRECTIONS_IN_CONTACT * self.residual
             return more + CORRECTIONS_IN_CONTACT * (self.substitution + self.residual)
@@ -196,25 +235,29 @@ class Times:
 
     def in_company(self, count: int) -> float:
         """A sample of `count` that are corrected together, with one pass through the factor for all of them."""
-        if not self.predicted or self.contact:
+        if not self.predicted or self.contact or self.linear == Linear.MULTIGRID:
             return self.sample
         saved = (1 - 1 / max(count, 1)) * (1 - IN_LOCKSTEP) * self.substitution
         return self.sample - (CORRECTIONS[self.slender] + 2) * saved
 
     def reference_factor(self, parameters: int) -> float:
         """The factor of a reference, and the vectors for the screen of stability."""
+        if self.linear == Linear.MULTIGRID:
+            return 0.0
         directions = min(parameters, DIRECTIONS)
         vectors = CHANGES * directions * self.residual + SUBSTITUTIONS * (1 + directions) * self.substitution
         return self.setup + self.assembly + self.factorisation + vectors
 
     def tangents(self, parameters: int) -> float:
         """All derivatives of outputs and state of a solution whose factor is available."""
-        return 15 * CALL + parameters * (2 * TOGETHER * self.substitution + self.residual)
+        return 15 * CALL + parameters * (self.deriving + self.residual)
 
     def tangents_of_sample(self, parameters: int) -> float:
         """All derivatives of the outputs of a solution that was found with the factor of a reference."""
+        if self.linear == Linear.MULTIGRID:
+            return self.tangents(parameters)
         if parameters > FEW:
-            return self.assembly + self.factorisation + self.tangents(parameters)
+            return self.assembly + self.stepping + self.tangents(parameters)
         return NEAR * parameters * (self.substitution + self.residual)
 
 
@@ -226,6 +269,7 @@ def times(
     predicted: bool = True,
     factors: int = 1,
     contact: bool = False,
+    linear: Linear = Linear.FACTOR,
 ) -> Times:
     """Predict the cost of solves of a body, with a given number of factors; `contact` as of `Times`.
 
@@ -233,19 +277,69 @@ def times(
     """
     extents = [high - low for low, high in body.bounds]
     kind, more = (body.cell, min(body.degree, HIGHEST)), OF_PRESSURES if mixed else 1.0
+    slender = max(extents) > SLENDER * min(extents)
     found = factor(body, mixed=mixed, symmetric=symmetric)
     size = found.bytes if symmetric else found.bytes + factor(body, mixed=mixed).bytes
+    assembly, setup = CALL + more * ASSEMBLY[kind] * body.cell_count, CALL + PER_NONZERO * found.nonzeros
+    factorisation = CALL + PER_ENTRY * found.entries + PER_OPERATION * found.operations
+    substitution = CALL + PER_ENTRY_SOLVED * found.entries
+    stepping, counting, deriving = factorisation + substitution, 0.0, 2 * TOGETHER * substitution
+    if linear != Linear.FACTOR:
+        below = factor(_Linear(body), mixed=False, symmetric=symmetric)
+        of_coarse = CALL + PER_NONZERO * below.nonzeros + PER_ENTRY * below.entries + PER_OPERATION * below.operations
+        product = CALL + PER_PRODUCT * found.nonzeros
+        iteration = PRODUCTS * product + CALL + PER_ENTRY_SOLVED * below.entries
+        preparing = COARSE * assembly + of_coarse + BOUNDING * product
+        stepping, counting = preparing + ROUGHLY_SOLVED[slender] * iteration, LANCZOS * iteration
+        deriving = SOLVED[slender] * iteration
+        own = BYTES_PER_ENTRY_IN_BLOCKS * found.nonzeros + below.bytes
+        size = own + (factors - 1) * size if linear == Linear.BOTH else own
+        factors = 1
+        if linear == Linear.MULTIGRID:
+            setup, factorisation, substitution = CALL, stepping, iteration
     return Times(
-        CALL + more * ASSEMBLY[kind] * body.cell_count,
+        assembly,
         CALL + RESIDUAL[kind] * body.cell_count,
-        CALL + PER_NONZERO * found.nonzeros,
-        CALL + PER_ENTRY * found.entries + PER_OPERATION * found.operations,
-        CALL + PER_ENTRY_SOLVED * found.entries,
-        max(extents) > SLENDER * min(extents),
+        setup,
+        factorisation,
+        substitution,
+        slender,
         predicted,
         BYTES_PER_UNKNOWN * (3 * body.nodes + (body.vertex_count if mixed else 0)) + factors * size,
         contact,
+        linear,
+        stepping,
+        counting,
+        deriving,
     )
+
+
+def linear_solver(body: Meshed, *, symmetric: bool) -> Linear:
+    """Choose what linear systems of displacements are solved with, by sizes only.
+
+    Both, where a first solve and a few derivatives take much less time than with factors; no factor of the whole
+    stiffness at all, where one takes more than `MOST_BYTES`.
+    """
+    if body.degree < 2:
+        return Linear.FACTOR  # there is no coarser space
+    if factor(body, mixed=False, symmetric=symmetric).bytes > MOST_BYTES:
+        return Linear.MULTIGRID
+    seconds = {}
+    for linear in (Linear.FACTOR, Linear.BOTH):
+        cost = times(body, mixed=False, symmetric=symmetric, linear=linear)
+        seconds[linear] = cost.textbook + DERIVATIVES * cost.deriving
+    return Linear.BOTH if seconds[Linear.BOTH] < WORTH * seconds[Linear.FACTOR] else Linear.FACTOR
+
+
+class _Linear:
+    """A body in linear elements."""
+
+    degree = 1
+
+    def __init__(self, body: Meshed) -> None:
+        self.cell, self.cell_count, self.bounds = body.cell, body.cell_count, body.bounds
+        self.nodes = self.vertex_count = body.vertex_count
+        self.cells = getattr(body, "cells", None)
 
 
 def together(unknowns: int) -> int:

@@ -11,13 +11,14 @@ import ufl
 
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
-from forward.fem.cost import factor
-from forward.fem.dolfinx import linear, spaces
+from forward.fem.cost import Linear, factor
+from forward.fem.dolfinx import linear, multigrid, spaces, unknowns
+from forward.fem.dolfinx.transfer import Transfer
 from forward.fem.forms import Forms
 from forward.fem.latest import Latest
 from forward.hyperelastic import Hyperelastic
 from forward.model import FloatArray, Work
-from forward.solvers.linear import LinearSolver
+from forward.solvers.linear import ROUGH, TIGHT, LinearSolver
 
 FEWER = {"hexahedron": 2, "tetrahedron": 0}  # degrees of quadrature, for what only preconditions
 
@@ -49,6 +50,8 @@ class Linearisation(Forms):
         self.latest = Latest()
         imbalance = self._imbalance_form()
         self._residual = self.vector(imbalance)
+        # Equations beside others are those of an estimate, which has ways of its own.
+        self.linear = spec.linear if beside is None else Linear.FACTOR
         self._prescribe()
         self._of_stiffness = self.stiffness_form(imbalance)
         if beside is None:
@@ -60,11 +63,27 @@ class Linearisation(Forms):
 
     @cached_property
     def _matrix(self) -> linear.StiffnessMatrix:
-        return self._new_matrix(self._stiffness, symmetric=self.symmetric)
+        blocked = self.linear != Linear.FACTOR
+        return self._new_matrix(self._stiffness, symmetric=self.symmetric, blocked=blocked)
 
     @cached_property
     def _solver(self) -> LinearSolver:
-        return linear.DirectSolver(self._matrix)
+        return self._solver_of(self._matrix, self._of_stiffness)
+
+    def _solver_of(self, matrix: linear.StiffnessMatrix, form: Any) -> LinearSolver:
+        """Return what solves with a matrix, of a form in UFL, at many states."""
+        if self.linear == Linear.FACTOR:
+            return linear.DirectSolver(matrix)
+        below = unknowns.Unknowns(self.mesh, 1, mixed=False)
+        marks, held = self._held(below)
+        ours, theirs = (self._variation, ufl.TrialFunction(self.unknowns.whole)), (below.test, below.trial)
+        form = self._bilinear(ufl.replace(form, dict(zip(ours, theirs, strict=True))))
+        body = self.spec.body.model_copy(update={"degree": 1})
+        expected = factor(body, mixed=False, symmetric=matrix.symmetric)
+        coarse = linear.StiffnessMatrix(form, marks, below, self.comm, symmetric=matrix.symmetric, expected=expected)
+        fixed = np.array([3 * n + a for n, a in sorted(held) if 3 * n < below.size], dtype=np.int64)
+        transfer = Transfer(below.displacement, self.space)
+        return multigrid.MultigridSolver(matrix, linear.DirectSolver(coarse), transfer, self.fixed, fixed)
 
     @cached_property
     def _nodal_blocks(self) -> linear.NodalBlocks:
@@ -100,19 +119,7 @@ class Linearisation(Forms):
 
     def _prescribe(self) -> None:
         """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""
-        moved: dict[tuple[int, int], str] = {}
-        self._constraints = []
-        for displacement in self.spec.displacements:
-            nodes = spaces.boundary_nodes(self.space, self.facets[displacement.on])
-            for axis in displacement.components:
-                a = AXES.index(axis)
-                self._constraints.append(self.unknowns.constraint(a, nodes))
-                moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
-        for boundary in self.spec.clamp:
-            nodes = spaces.boundary_nodes(self.space, self.facets[boundary])
-            for a in range(3):
-                self._constraints.append(self.unknowns.constraint(a, nodes))
-                moved |= {(int(n), a): "" for n in nodes}
+        self._constraints, moved = self._held(self.unknowns)
         owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
         self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
         paths = [path for _, path in owned]
@@ -123,6 +130,23 @@ class Linearisation(Forms):
         }
         self._targets = np.zeros(len(self.fixed))
         self._moves = False
+
+    def _held(self, of: unknowns.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
+        """Marks for assembly of prescribed unknowns, and the path that moves each (if any), by node and axis."""
+        moved: dict[tuple[int, int], str] = {}
+        marks = []
+        for displacement in self.spec.displacements:
+            nodes = spaces.boundary_nodes(of.displacement, self.facets[displacement.on])
+            for axis in displacement.components:
+                a = AXES.index(axis)
+                marks.append(of.constraint(a, nodes))
+                moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
+        for boundary in self.spec.clamp:
+            nodes = spaces.boundary_nodes(of.displacement, self.facets[boundary])
+            for a in range(3):
+                marks.append(of.constraint(a, nodes))
+                moved |= {(int(n), a): "" for n in nodes}
+        return marks, moved
 
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
@@ -167,13 +191,13 @@ class Linearisation(Forms):
         return free
 
     @cached_property
-    def _symmetric_stiffness(self) -> Any:
-        """The symmetric part of the stiffness, compiled; the stiffness itself if it is symmetric.
+    def _symmetric_form(self) -> Any:
+        """The symmetric part of the stiffness, in UFL; the stiffness itself if it is symmetric.
 
         That of friction is the stiffness at pressures that stay: what slides has no other resistance along the tool.
         """
         if self.symmetric:
-            return self._stiffness
+            return self._of_stiffness
         trial = ufl.TrialFunction(self.unknowns.whole)
         works = list(zip(self.spec.loads, self._loads, strict=True))
         rest = sum((work for load, work in works if load.symmetric), self._variation_of(self._potential) * self.dx)
@@ -186,20 +210,25 @@ class Linearisation(Forms):
         if followers:
             of_followers = self.derivative(sum(followers[1:], followers[0]), trial)
             found += 0.5 * of_followers + 0.5 * ufl.adjoint(of_followers)
-        return self._bilinear(found)
+        return found
 
-    def new_solver(self) -> LinearSolver:
-        """Return a solver for the stiffness, with a matrix of its own."""
+    @cached_property
+    def _symmetric_stiffness(self) -> Any:
+        return self._stiffness if self.symmetric else self._bilinear(self._symmetric_form)
+
+    def new_factor(self) -> LinearSolver:
+        """Return a solver for the stiffness that makes a factor, with a matrix of its own."""
         return linear.DirectSolver(self._new_matrix(self._stiffness, symmetric=self.symmetric))
 
     def new_symmetric_solver(self) -> LinearSolver:
         """Return a solver for the symmetric part of the stiffness, with a matrix of its own."""
-        return linear.DirectSolver(self._new_matrix(self._symmetric_stiffness, symmetric=True))
+        matrix = self._new_matrix(self._symmetric_stiffness, symmetric=True, blocked=self.linear != Linear.FACTOR)
+        return self._solver_of(matrix, self._symmetric_form)
 
-    def _new_matrix(self, form: Any, *, symmetric: bool) -> linear.StiffnessMatrix:
+    def _new_matrix(self, form: Any, *, symmetric: bool, blocked: bool = False) -> linear.StiffnessMatrix:
         expected = factor(self.spec.body, mixed=self.spec.mixed, symmetric=symmetric)
         return linear.StiffnessMatrix(
-            form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected
+            form, self._constraints, self.unknowns, self.comm, symmetric=symmetric, expected=expected, blocked=blocked
         )
 
     @cached_property
@@ -236,12 +265,15 @@ class Linearisation(Forms):
                 self.set_state(self.latest.factorised_at)
                 right = right - self.stiffness_times(w)
                 right[self.fixed] = known
-        return self.back_substitute(right)
+        return self.back_substitute(right, tolerance=ROUGH)
 
-    def back_substitute(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
-        """Solve with K, or with Kᵀ, whose prescribed rows and columns are those of the identity; (n,) or (k, n)."""
+    def back_substitute(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
+        """Solve with K, or with Kᵀ, whose prescribed rows and columns are those of the identity; (n,) or (k, n).
+
+        The tolerance is that of `LinearSolver.solve`.
+        """
         self.work.back_substitutions += 1 if right.ndim == 1 else len(right)
-        return self._solver.solve(right, transpose=transpose)
+        return self._solver.solve(right, transpose=transpose, tolerance=tolerance)
 
     def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Product of the stiffness of all unknowns (or its transpose) with w (U_local,), at the state that is set."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from forward.fem.affordable import allowance, richer
-from forward.fem.cost import MOST_BYTES, estimate, together
+from forward.fem.cost import MOST_BYTES, Linear, estimate, together
 from forward.fem.enriched import Enriched, EnrichedState
 from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
@@ -144,7 +144,9 @@ class HyperelasticModel(OneByOne):
 
     def way(self, parameters: FloatArray, guess: Guess) -> _Way | None:
         """Return the path from the reference of a guess, whose factor is computed if it is another's; None without."""
-        if self.spec.solver.kind == "newton" or guess.state is None or guess.reference is None:
+        if self.spec.solver.kind == "newton" or self.equations.linear == Linear.MULTIGRID:
+            return None
+        if guess.state is None or guess.reference is None:
             return None
         self.reference.prepare(guess.reference)
         screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()
@@ -162,6 +164,7 @@ class HyperelasticModel(OneByOne):
         """How many points `solve_many` corrects together; 1 where each needs the equations for itself."""
         solver = self.spec.solver
         alone = self.equations.contact or solver.kind == "newton" or solver.solve_seconds is not None
+        alone = alone or self.equations.linear == Linear.MULTIGRID
         return 1 if alone else together(self.equations.layout.size)
 
     def solve_many(

@@ -26,7 +26,7 @@ class ReferenceFactor:
 
     def __init__(self, equations: Discretisation) -> None:
         self._equations = equations
-        self._solver = equations.new_solver()
+        self._solver = equations.new_factor()
         self._rotations = np.empty((3, 3, 0))
         self._reference: ReferenceSolution | None = None
         self._slopes: FloatArray | None = None

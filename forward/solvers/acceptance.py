@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from forward.model import FloatArray, SolveError, Stability
+from forward.solvers.linear import NoConvergence
 from forward.solvers.settings import SolverSettings
 from forward.solvers.stability import NOT_SCREENED
 from forward.solvers.steps import Steps
@@ -88,7 +91,9 @@ def check_jacobian(system: System, u: FloatArray) -> None:
 
 def instability(system: System) -> str:
     """Say what the last factor tells about a failure; empty if it shows no negative eigenvalue."""
-    negative = system.inertia()
+    negative = None
+    with suppress(NoConvergence):  # that is not what has failed
+        negative = system.inertia()
     if negative is None or negative <= 0:
         return ""
     return f"; the last stiffness has {_counted(negative)} (unstable, or far from equilibrium)"

@@ -7,6 +7,7 @@ import numpy as np
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.acceptance import Diverged, Unstable, accepted, converged, instability
 from forward.solvers.corrections import mix
+from forward.solvers.linear import NoConvergence
 from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import finish, plain
 from forward.solvers.system import Found, Residual, System
@@ -75,6 +76,9 @@ def newton(
     system.at_load(load)
     try:
         return _iterate(system, settings, u, history, load)
+    except NoConvergence as stop:
+        history.append(f"load {load:.6g}: {stop.reason}")
+        raise Diverged(stop.reason) from None
     except Diverged as stop:
         history.append(f"load {load:.6g}: {stop}")
         raise

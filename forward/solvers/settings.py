@@ -35,6 +35,12 @@ class SolverSettings(Settings):
     solve_seconds
         Longest wall-clock time (s) of one solve, after which it has failed; no limit by default. It is checked between
         iterations. Whether a solve of about this length fails depends on the machine.
+    linear
+        What linear systems are solved with. "factor": LDLᵀ, or LU, of every stiffness. "multigrid": conjugate
+        gradients with two levels, quadratic and linear elements, and no factor of the whole stiffness; samples then
+        take steps of Newton's method from their predictions, with stiffnesses of their own. "both": these for Newton's
+        method and derivatives, and a factor for the reference that corrects predictions. "auto" chooses by predicted
+        time and memory; the textbook solver and the mixed form have factors.
     accept_unstable
         Whether an equilibrium counts even if the stiffness has negative eigenvalues (the body has buckled). These are
         then not looked for.
@@ -48,4 +54,5 @@ class SolverSettings(Settings):
     minimum_damping: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     minimum_load_step: Annotated[float, Field(gt=0, le=1)] = 1 / 8192
     solve_seconds: Annotated[float, Field(gt=0)] | None = None
+    linear: Literal["auto", "factor", "multigrid", "both"] = "auto"
     accept_unstable: bool = False

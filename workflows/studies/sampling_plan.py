@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple
 
-from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START
+from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Linear
 from forward.machine import MIB, compiled_forms
 from uq.evaluation.evaluate import OWN, company_of
 from workflows.config.priors import ranges
@@ -75,7 +75,7 @@ def parts(study: Study) -> list[Part]:
     found = [times_of(mesh) for mesh in study.meshes]
     samples = study.planned - len(found)
     seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
-    corrected = samples > 0 and found[0].predicted
+    corrected = samples > 0 and found[0].predicted and found[0].linear != Linear.MULTIGRID
     each = found[0].in_company(company_of(samples))
     seconds *= each / found[0].sample
     further = f"{samples:,} further solves, {each:.2g} s each"

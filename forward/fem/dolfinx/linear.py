@@ -16,6 +16,7 @@ from forward.fem.dolfinx.spaces import owned_nodes
 from forward.fem.dolfinx.unknowns import Unknowns
 from forward.machine import StopError, headroom, require
 from forward.model import FloatArray, SolveError
+from forward.solvers.linear import TIGHT
 
 ROOM = 60  # for what pivoting adds to the factor, in per cent of MUMPS's own estimate
 MOST_ROOM = 4000
@@ -42,6 +43,8 @@ class StiffnessMatrix:
         Whether the form is.
     expected
         Expected size of its factor.
+    blocked
+        Whether the matrix is stored by blocks of the components, which takes half the memory and suits no factor.
 
     Attributes
     ----------
@@ -63,12 +66,13 @@ class StiffnessMatrix:
         *,
         symmetric: bool,
         expected: Factor,
+        blocked: bool = False,
     ) -> None:
         require(2 * BYTES_PER_NONZERO * expected.nonzeros / comm.size + SPARE, "the stiffness matrix")
         self.unknowns, self.comm, self.symmetric, self.expected = unknowns, comm, symmetric, expected
         self._form = form
         self._constraints = constraints
-        self.matrix = fem.petsc.create_matrix(form)
+        self.matrix = fem.petsc.create_matrix(form, *(["baij"] if blocked else []))
         if symmetric:
             self.matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
 
@@ -285,8 +289,9 @@ class DirectSolver:
         self._ksp = self._new_ksp(self._stiffness.comm)
         self._analysed = False
 
-    def solve(self, right: FloatArray, *, transpose: bool = False) -> FloatArray:
-        """Solve with the factor at hand, or with its transpose, for one (n,) or several (k, n) right-hand sides."""
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
+        """Solve to rounding with the factor at hand, or with its transpose, for (n,) or (k, n) right-hand sides."""
+        del tolerance
         transpose = transpose and not self._symmetric
         if right.ndim == 1:
             self._right.array[:] = self._unknowns.reorder(right)

@@ -37,7 +37,7 @@ def test_without_symmetry_two_triangles_are_foreseen_and_a_factor_of_the_symmetr
     assert following.cost().bytes - dead.cost().bytes == pytest.approx(2 * whole.bytes)
     equations = following.build(MPI.COMM_SELF, ()).equations
     found = {}
-    for solver, expected in ((equations.new_solver(), whole), (equations.new_symmetric_solver(), half)):
+    for solver, expected in ((equations.new_factor(), whole), (equations.new_symmetric_solver(), half)):
         assert solver._stiffness.expected == expected  # what is asked for before it is made
         solver.factorise()
         found[expected] = solver._ksp.pc.getFactorMatrix().getMumpsInfog(29)  # entries, by MUMPS

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward.fem.cost import CORRECTIONS
+from forward.fem import cost
+from forward.fem.cost import CORRECTIONS, Linear
 from workflows.config.study import load
 from workflows.run.plan import plan
 from workflows.studies.sampling_plan import parts
@@ -23,6 +24,7 @@ def test_predicted_times_grow_with_the_body(cell, form):
     found = []
     for n in (1, 2, 8, 30):
         changes = [f"model.body.cells=[{n}, {n}, {n}]", f"model.body.cell={cell}", f"model.formulation={form}"]
+        changes.append("model.solver.linear=factor")
         study = load(CONFIGS / "tiny.toml", [*changes, "accuracy.memory=1e6"])
         found.append([part.seconds for part in parts(study)])
     assert np.isfinite(found).all()
@@ -131,3 +133,31 @@ def test_many_samples_share_passes_through_the_factor():
         each.append(float(line.split()[-3]))
     assert each[1] == pytest.approx(cost.in_company(16), rel=0.05)
     assert each[0] == pytest.approx(cost.sample, rel=0.05)
+
+
+def test_a_million_unknowns_fit_into_the_memory_of_one_machine():
+    study = load(CONFIGS / "beam-million.toml")
+    assert study.spec.unknowns > 1e6
+    said = {part.what: part.seconds for part in parts(study)}
+    assert study.memory < 12 * 2**30
+    assert "reference factor" not in said
+    assert 60 < sum(said.values()) < 4 * 3600
+    factors = load(CONFIGS / "beam-million.toml", ["model.solver.linear=factor"])
+    assert factors.memory > 24 * 2**30
+    (line,) = (words for what, words in study.model.described({}) if what == "linear")
+    assert line == "multigrid, without a factor of the stiffness"
+
+
+def test_what_takes_the_place_of_factors_is_cheaper_where_it_is_chosen():
+    """And takes less memory; smaller bodies have factors."""
+    body = load(CONFIGS / "beam-million.toml").spec.body
+    few = body.model_copy(update={"cells": (20, 2, 7)})
+    some = body.model_copy(update={"cells": (44, 6, 16)})
+    assert cost.linear_solver(few, symmetric=True) == Linear.FACTOR
+    assert cost.linear_solver(some, symmetric=True) == Linear.BOTH
+    assert cost.linear_solver(body, symmetric=True) == Linear.MULTIGRID
+    for one in (some, body):
+        factor, both, alone = (cost.times(one, mixed=False, factors=2, linear=linear) for linear in Linear)
+        assert alone.bytes < both.bytes < factor.bytes
+        assert both.first < factor.first
+        assert both.factorisation == factor.factorisation

@@ -1,0 +1,180 @@
+"""A linear solver for large bodies: conjugate gradients with two levels (`forward.solvers.multigrid`)."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from forward.fem.dolfinx.linear import StiffnessMatrix
+from forward.fem.dolfinx.transfer import Transfer
+from forward.model import FloatArray, SolveError
+from forward.solvers import multigrid
+from forward.solvers.linear import TIGHT, LinearSolver, NoConvergence
+from forward.solvers.multigrid import MARGIN, Levels
+from forward.solvers.smoothing import minimised
+
+ITERATIONS = 400  # of conjugate gradients
+RESIDUALS = 100  # of generalised conjugate residuals, which remember all directions
+
+
+class MultigridSolver:
+    """A `LinearSolver` that makes no factor of the stiffness, but one of its restriction to linear elements.
+
+    Where conjugate gradients meet a direction of negative energy, or the stiffness is not symmetric, generalised
+    conjugate residuals take their place.
+
+    Parameters
+    ----------
+    stiffness
+        The matrix K of displacements, stored by blocks.
+    coarse
+        Solver for the same form with test and trial functions that are linear.
+    transfer
+        From linear elements into those of the body.
+    fixed, coarse_fixed
+        Prescribed unknowns of this rank in both.
+    """
+
+    def __init__(
+        self,
+        stiffness: StiffnessMatrix,
+        coarse: LinearSolver,
+        transfer: Transfer,
+        fixed: NDArray[np.int64],
+        coarse_fixed: NDArray[np.int64],
+    ) -> None:
+        self._stiffness, self._coarse, self._transfer = stiffness, coarse, transfer
+        self._fixed, self._coarse_fixed = fixed, coarse_fixed
+        self._in, self._out = stiffness.matrix.createVecs()
+        self._levels: Levels | None = None
+
+    def factorise(self) -> None:
+        """Assemble both stiffnesses, and factorise the coarse one.
+
+        Raises
+        ------
+        SolveError
+            If that is singular, or a block on the diagonal, or entries are not finite.
+        StopError
+            If there is no memory for the coarse factor.
+        """
+        self._levels = None
+        self._stiffness.assemble()
+        self._coarse.factorise()
+        # PETSc has a block's entries by columns.
+        found = self._stiffness.matrix.invertBlockDiagonal()
+        blocks = np.ascontiguousarray(np.asarray(found).reshape(-1, 3, 3).swapaxes(1, 2))
+
+        def smooth(r: FloatArray) -> FloatArray:
+            return np.asarray(np.einsum("nij,nj->ni", blocks, r.reshape(-1, 3)).ravel())
+
+        bound = self._total(np.array([0.0 if np.isfinite(blocks).all() else 1.0]))[0]
+        if bound:
+            message = "a block on the diagonal of the stiffness is singular or not finite"
+            raise SolveError(message)
+        largest = MARGIN * multigrid.largest_eigenvalue(self._multiply, smooth, self._random, self._total)
+        self._levels = Levels(self._multiply, smooth, self._on_coarse, self._total, largest)
+
+    @cached_property
+    def _random(self) -> FloatArray:
+        random = np.random.default_rng(self._stiffness.comm.rank)
+        forces = random.standard_normal(self._stiffness.unknowns.size)
+        forces[self._fixed] = 0
+        return forces
+
+    def _total(self, values: FloatArray) -> FloatArray:
+        comm = self._stiffness.comm
+        return values if comm.size == 1 else np.asarray(comm.allreduce(values))
+
+    def _multiply(self, x: FloatArray) -> FloatArray:
+        self._in.array[:] = x
+        self._stiffness.matrix.mult(self._in, self._out)
+        return np.array(self._out.array_r)
+
+    def _multiply_transposed(self, x: FloatArray) -> FloatArray:
+        self._in.array[:] = x
+        self._stiffness.matrix.multTranspose(self._in, self._out)
+        return np.array(self._out.array_r)
+
+    def _on_coarse(self, r: FloatArray) -> FloatArray:
+        below = self._transfer.transposed(r)
+        below[self._coarse_fixed] = 0
+        z = self._transfer(self._coarse.solve(below))
+        z[self._fixed] = 0
+        return z
+
+    def solve(self, right: FloatArray, *, transpose: bool = False, tolerance: float = TIGHT) -> FloatArray:
+        """Solve with K, or with Kᵀ, for one (n,) or several (k, n) right-hand sides.
+
+        Raises
+        ------
+        NoConvergence
+            If it does not.
+        """
+        if right.ndim == 2:
+            rows = [self.solve(row, transpose=transpose, tolerance=tolerance) for row in right]
+            return np.array(rows).reshape(right.shape)
+        assert self._levels is not None, "factorise comes first"
+        levels, free = self._levels, np.array(right)
+        free[self._fixed] = 0  # rows and columns of the identity: nothing else depends on them
+        if self._stiffness.symmetric:
+            found = multigrid.conjugate_gradients(
+                levels.multiply, levels.cycle, free, self._total, tolerance, ITERATIONS
+            )
+            x, converged = found.x, found.converged
+            if not found.definite:
+                x, converged = self._minimised(levels, free, tolerance, transpose=False)
+        else:
+            x, converged = self._minimised(levels, free, tolerance, transpose=transpose)
+        if not converged:
+            message = f"the linear solver did not converge to {tolerance:g}"
+            raise NoConvergence(message)
+        x[self._fixed] = right[self._fixed]
+        return x
+
+    def _minimised(
+        self, levels: Levels, right: FloatArray, tolerance: float, *, transpose: bool
+    ) -> tuple[FloatArray, bool]:
+        multiply = self._multiply_transposed if transpose else self._multiply
+        x, _, converged = minimised(multiply, levels.cycle, right, self._scale, self._total, tolerance, RESIDUALS)
+        return x, converged
+
+    @property
+    def _scale(self) -> FloatArray:
+        """One over the roots of the diagonal, which makes forces comparable."""
+        return np.asarray(1 / np.sqrt(np.abs(self._stiffness.matrix.getDiagonal().array_r)))
+
+    def release(self) -> None:
+        """Free the coarse factor."""
+        self._coarse.release()
+        self._levels = None
+
+    def negative_eigenvalues(self) -> int | None:
+        """Return how many negative eigenvalues are found, 0 only if there are none; None if unknown.
+
+        Raises
+        ------
+        NoConvergence
+            If the lowest eigenvalue cannot be told from zero.
+        """
+        if not self._stiffness.symmetric or self._levels is None:
+            return None
+        below = self._coarse.negative_eigenvalues()
+        if below:
+            return below
+        levels, size = self._levels, self._stiffness.matrix.getSize()[0]
+        found = multigrid.negative_eigenvalues(levels.multiply, levels.cycle, self._random, self._total, size)
+        if found is None:
+            message = "the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero"
+            raise NoConvergence(message)
+        return found
+
+    def memory(self) -> int:
+        """Return the bytes of the matrix and of the coarse factor on all ranks; 0 before `factorise`."""
+        if self._levels is None:
+            return 0
+        entries = self._stiffness.matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
+        return int(8 * entries) + self._coarse.memory()
