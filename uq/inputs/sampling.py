@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -66,17 +67,25 @@ def sobol_points(seed: int, scramble: int, start: int, stop: int, dimension: int
     return points[start:stop] * 2.0**-BITS + 2.0 ** -(BITS + 1)
 
 
-def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
-    """Return the first direction numbers (count, d) of Sobol' points, of `BITS` bits.
+@cache
+def _table() -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+    """Return primitive polynomials (D,) and first numbers (D, k) of each, as scipy ships them.
 
-    S. Joe, F. Y. Kuo, SIAM J. Sci. Comput. 30 (2008) 2635–2654, whose primitive polynomials and first numbers scipy
-    ships; to import scipy.stats takes longer than many a study. scipy has no more dimensions either.
+    To import scipy.stats takes longer than many a study, and to unpack the table longer than most solves of a point.
     """
     scipy = find_spec("scipy")
     assert scipy is not None
     assert scipy.origin is not None
     with np.load(Path(scipy.origin).parent / "stats" / "_sobol_direction_numbers.npz") as table:
-        polynomials, firsts = (table[name].astype(np.uint64) for name in ("poly", "vinit"))
+        return table["poly"].astype(np.uint64), table["vinit"].astype(np.uint64)
+
+
+def _directions(dimension: int, count: int) -> NDArray[np.uint64]:
+    """Return the first direction numbers (count, d) of Sobol' points, of `BITS` bits.
+
+    S. Joe, F. Y. Kuo, SIAM J. Sci. Comput. 30 (2008) 2635–2654. scipy has no more dimensions either.
+    """
+    polynomials, firsts = _table()
     if dimension > len(polynomials):
         message = f"{dimension} dimensions, expected at most {len(polynomials)} for Sobol' points"
         raise ValueError(message)
