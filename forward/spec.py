@@ -250,6 +250,7 @@ MODELS = Kinds(
         "hyperelastic": "forward.hyperelastic:Hyperelastic",
         "path": "forward.path:Path",
         "specimen": "forward.specimen:Specimen",
+        "reduced": "forward.reduced.spec:Reduced",
         "python": "forward.external.models:PythonModel",
         "um-bridge": "forward.external.models:UmBridgeModel",
     },

@@ -1,4 +1,4 @@
-"""The command line: tissuq check | run | report | serve | init | schema | completion."""
+"""The command line: tissuq check | run | report | reduce | serve | init | schema | completion."""
 
 from __future__ import annotations
 
@@ -73,8 +73,13 @@ def _say(text: str) -> None:
     """Print errors once, on the first rank of the job, one line each."""
     from forward.settings import one_line
 
-    if next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0":
+    if _first():
         sys.stderr.write("".join(f"{one_line(line)}\n" for line in text.split("\n")))
+
+
+def _first() -> bool:
+    """Whether this is the first rank of the job."""
+    return next((os.environ[name] for name in _RANK if name in os.environ), "0") == "0"
 
 
 def _world() -> Any:
@@ -104,8 +109,11 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run a study, or continue it (under mpirun for several ranks)")
     report = commands.add_parser("report", help="rebuild the report of results; several are compared side by side")
     serve = commands.add_parser("serve", help="serve the model of a study to other programs by UM-Bridge")
+    reduce = commands.add_parser(
+        "reduce", help="make a reduced model of the body of a study, over its random parameters"
+    )
     init = commands.add_parser("init", help="print a commented starter study")
-    for command in (check, run, serve):
+    for command in (check, run, reduce, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
         command.add_argument(
             "--set",
@@ -114,11 +122,15 @@ def _parser() -> argparse.ArgumentParser:
             metavar="KEY=VALUE",
             help="change one value, such as method.samples=512",
         )
-    run.add_argument("--out", type=Path, metavar="DIR", help="results directory (default: results/STUDY)")
-    run.add_argument(
-        "--quiet", action="store_true", help="print only errors and, off the terminal, progress once a minute"
-    )
-    run.add_argument("--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it")
+    for command, name in ((run, "STUDY"), (reduce, "STUDY-reduced")):
+        command.add_argument("--out", type=Path, metavar="DIR", help=f"results directory (default: results/{name})")
+        command.add_argument(
+            "--quiet", action="store_true", help="print only errors and, off the terminal, progress once a minute"
+        )
+        command.add_argument(
+            "--no-report", action="store_true", help="leave report.html out; `tissuq report DIR` writes it"
+        )
+    reduce.add_argument("--output", type=Path, metavar="FILE", help="copy the model there (default: DIR/reduced.npz)")
     serve.add_argument("--port", type=int, default=4242, help="0: any free one (default: 4242)")
     serve.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts requests from other machines too")
     serve.add_argument("--quiet", action="store_true", help="print nothing but errors")
@@ -130,6 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     init.add_argument("kind", metavar="KIND", help="a method.kind, such as chaos; `tissuq init list` names them all")
     check.set_defaults(command=_check)
     run.set_defaults(command=_run)
+    reduce.set_defaults(command=_reduce)
     report.set_defaults(command=_report)
     serve.set_defaults(command=_serve)
     init.set_defaults(command=_init)
@@ -165,7 +178,26 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    study = _load(options)
+    return _run_study(options, _load(options), options.study.stem)
+
+
+def _reduce(options: argparse.Namespace) -> int:
+    from workflows.config.study import kind_of
+    from workflows.studies.reduction import FILE, OTHER_METHOD
+
+    if kind_of(options.study) != "reduce":  # a study that samples the body says over which parameters
+        options.set = [OTHER_METHOD, *options.set]
+    name = f"{options.study.stem}-reduced"
+    code = _run_study(options, _load(options), name)
+    if code != FAILED and options.output is not None and _first():
+        from forward.machine import write_whole
+
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(options.output, ((options.out or Path("results") / name) / FILE).read_bytes())
+    return code
+
+
+def _run_study(options: argparse.Namespace, study: StudyKind, name: str) -> int:
     from forward.machine import SHARED_BY_RANKS, require_files
     from workflows.run.run import run
     from workflows.run.signals import heed
@@ -173,10 +205,10 @@ def _run(options: argparse.Namespace) -> int:
     if "mpi4py.MPI" not in sys.modules:  # or else it has its file
         require_files(SHARED_BY_RANKS, "MPI")
     heed()
-    out = options.out or Path("results") / options.study.stem
+    out = options.out or Path("results") / name
     return run(
         study,
-        options.study.stem,
+        name,
         out,
         quiet=options.quiet,
         report=not options.no_report,

@@ -202,8 +202,16 @@ class Forms:
 
     def at_points(self, expression: Any) -> assembly.PointValues:
         """Compile an expression for evaluation at the quadrature points."""
-        points = spaces.quadrature_points(self.space, self.spec.body.quadrature)
+        return self.at(expression, spaces.quadrature_points(self.space, self.spec.body.quadrature))
+
+    def at(self, expression: Any, points: FloatArray) -> assembly.PointValues:
+        """Compile an expression for evaluation at points (q, 3) of the reference cell."""
         return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
+
+    @property
+    def size_of_value(self) -> int:
+        """Number of values that a state has at a point: 3, in the mixed form 4."""
+        return 3 if self.p is None else 4
 
     def on_facets(self, expression: Any, boundary: str, degree: int) -> assembly.FacetValues:
         """Compile an expression for evaluation at the quadrature points of a boundary."""
@@ -237,6 +245,29 @@ class Forms:
                 work = self._load * self._out_of_balance(load, numbers)
             works.append(work)
         return works
+
+    @property
+    def virtual_work_of_energy(self) -> Any:
+        """Form of the virtual work of the stresses."""
+        return self._variation_of(self._potential) * self.dx
+
+    @property
+    def virtual_works(self) -> tuple[Any, ...]:
+        """Forms of the virtual works of the loads, in their order, with the sign of the imbalance."""
+        return tuple(self._loads)
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """The numbers of the model in forms, by their paths."""
+        return self._constants
+
+    def is_dead(self, work: Any, paths: Collection[str]) -> bool:
+        """Whether the virtual work of a load is a sum of its numbers, each times a force that never changes."""
+        if self._state in work.coefficients() or any(
+            field.inside(one.integrand()) for field in self.fields for one in work.integrals()
+        ):
+            return False
+        return _linear(work, [self._variables[path] for path in paths])
 
     def place(self, numbers: dict[str, Any], label: str = "") -> Place:
         """Return what a load with these numbers, a tool of this name, is written with."""

@@ -148,6 +148,11 @@ class Linearisation(Forms):
                 moved |= {(int(n), a): "" for n in nodes}
         return marks, moved
 
+    @property
+    def movers(self) -> dict[str, FloatArray]:
+        """Which prescribed unknowns each number of a prescribed displacement moves: 1, or 0, by its path."""
+        return self._movers
+
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
         self.latest.moved()

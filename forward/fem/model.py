@@ -25,6 +25,7 @@ from forward.fem.saturation import factors, typical
 from forward.fem.space import BodySpace
 from forward.fem.together import find_together, from_one_reference
 from forward.hyperelastic import Hyperelastic
+from forward.materials.admissible import Admission
 from forward.model import (
     FloatArray,
     Guess,
@@ -73,16 +74,16 @@ class HyperelasticModel(OneByOne):
     """
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...]) -> None:
-        self._scalars = spec.scalars
+        scalars = spec.scalars
         coefficients = set(spec.coefficients)
         for path in parameters:
-            if path not in self._scalars and path not in coefficients:
-                known = [*self._scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
+            if path not in scalars and path not in coefficients:
+                known = [*scalars, *(f"fields.{field.label}.0" for field in spec.fields)]
                 message = f"'{path}' is not a number of the model, expected one of: {', '.join(known)}"
                 raise ValueError(message)
         self.spec = spec
         self.parameters = parameters
-        self._materials = spec.materials(parameters)
+        self._admission = Admission(spec, parameters)
         self.outputs = tuple(output.name for output in spec.outputs)
         self._extent = max(high - low for low, high in spec.body.bounds)
         self.equations = Discretisation(spec, comm, parameters)
@@ -208,18 +209,7 @@ class HyperelasticModel(OneByOne):
 
     def require_admissible(self, parameters: FloatArray) -> None:
         """Refuse parameters (d,) for which there is no model."""
-        for path, value in zip(self.parameters, parameters, strict=True):
-            scalar = self._scalars.get(path)
-            if scalar is not None:
-                objection = scalar.objection(float(value))
-            else:
-                objection = None if np.isfinite(value) else "input should be a finite number"
-            if objection is not None:
-                message = f"{path} = {value:.6g} is not admissible: {objection}"
-                raise InadmissibleError(message)
-        objection = self._materials.objection(dict(zip(self.parameters, map(float, parameters), strict=True)))
-        if objection is not None:
-            raise InadmissibleError(objection)
+        self._admission.require(parameters)
 
     def _kept_out(self, found: Found, parameters: FloatArray) -> tuple[Found, float]:
         """Raise the stiffness of the tools until the body enters none too far; return its factor too.

@@ -19,7 +19,7 @@ from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from forward.materials.material import Energy, constants, energy_of, incompressible, small_strain_moduli, unfit_at_rest
-from forward.model import FloatArray
+from forward.model import FloatArray, InadmissibleError
 
 Values = Mapping[str, Any]  # of constants by name: numbers, or arrays (n,)
 
@@ -159,3 +159,39 @@ class Materials:
     def _at(self, values: Values) -> Iterator[tuple[str, dict[str, Any]]]:
         for place, own in self.constants.items():
             yield place, {name: values[value] if isinstance(value, str) else value for name, value in own.items()}
+
+
+class Admission:
+    """Which parameters a body has a model for.
+
+    Parameters
+    ----------
+    spec
+        The body.
+    parameters
+        Paths of its parameters; those that are no numbers of it are coefficients of random fields.
+    """
+
+    def __init__(self, spec: Any, parameters: tuple[str, ...]) -> None:
+        self._scalars, self._materials, self._parameters = spec.scalars, spec.materials(parameters), parameters
+
+    def require(self, values: FloatArray) -> None:
+        """Refuse parameters (d,) for which there is no model.
+
+        Raises
+        ------
+        InadmissibleError
+            With the number and the reason.
+        """
+        for path, value in zip(self._parameters, values, strict=True):
+            scalar = self._scalars.get(path)
+            if scalar is not None:
+                objection = scalar.objection(float(value))
+            else:
+                objection = None if np.isfinite(value) else "input should be a finite number"
+            if objection is not None:
+                message = f"{path} = {value:.6g} is not admissible: {objection}"
+                raise InadmissibleError(message)
+        objection = self._materials.objection(dict(zip(self._parameters, map(float, values), strict=True)))
+        if objection is not None:
+            raise InadmissibleError(objection)

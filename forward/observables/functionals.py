@@ -37,10 +37,10 @@ class Integral:
 
     def __init__(self, equations: Equations, density: Any, size: float = 1.0, measure: Any | None = None) -> None:
         self._equations = equations
-        self._density = density
+        self.density = density
         self.size = size
-        self._measure = equations.dx if measure is None else measure
-        self._value = equations.scalar(density * self._measure)
+        self.measure = equations.dx if measure is None else measure
+        self._value = equations.scalar(density * self.measure)
 
     def value(self) -> float:
         """Return ψ."""
@@ -49,11 +49,11 @@ class Integral:
     # Compiled forms live as long as the output that they belong to.
     @cached_property
     def _gradient(self) -> Any:
-        return self._equations.vector(self._equations.derivative(self._density * self._measure))
+        return self._equations.vector(self._equations.derivative(self.density * self.measure))
 
     @cached_property
     def _partial(self) -> Any:
-        return self._equations.scalar(self._equations.along_parameters(self._density) * self._measure)
+        return self._equations.scalar(self._equations.along_parameters(self.density) * self.measure)
 
     @cached_property
     def _by_fields(self) -> tuple[tuple[Any, Any], ...]:
@@ -62,10 +62,10 @@ class Integral:
         return tuple(
             (
                 field,
-                equations.by_vertices(field.test * ufl.diff(self._density, field.log) * self._measure),
+                equations.by_vertices(field.test * ufl.diff(self.density, field.log) * self.measure),
             )
             for field in equations.fields
-            if field.inside(self._density)
+            if field.inside(self.density)
         )
 
     def gradient(self) -> FloatArray:
@@ -74,7 +74,7 @@ class Integral:
 
     @cached_property
     def _gradient_before(self) -> Any:
-        return self._equations.derivative_before(self._density * self._measure)
+        return self._equations.derivative_before(self.density * self.measure)
 
     def gradient_before(self) -> FloatArray:
         """Return ∂ψ/∂u (U_local,) by the state at the end of the increment before."""
@@ -85,7 +85,7 @@ class Integral:
         """Return ∂ψ/∂ω (d,)."""
         equations = self._equations
         slopes = np.zeros(len(equations.parameters))
-        if equations.along_parameters(self._density) is None:
+        if equations.along_parameters(self.density) is None:
             return slopes
         if len(equations.scalars):
             slopes[equations.scalars] = [self._partial() for _ in equations.unit_directions()]

@@ -46,7 +46,7 @@ class _MaxVonMises:
         degree = equations.spec.body.quadrature
         self._values = equations.at_points(stress)
         self._selector = spaces.function(spaces.quadrature_space(equations.mesh, degree))
-        self._stress = stress
+        self.stress = stress
 
     def value(self) -> float:
         from forward.fem import ranks
@@ -70,7 +70,7 @@ class _MaxVonMises:
     def _selected(self) -> Integral:
         from forward.observables.functionals import Integral
 
-        return Integral(self._equations, self._selector * self._stress)
+        return Integral(self._equations, self._selector * self.stress)
 
     @cached_property
     def _weight(self) -> Any:

@@ -201,6 +201,7 @@ LOADS = Kinds(
         "gravity": "forward.terms.gravity:Gravity",
         "traction": "forward.terms.traction:Traction",
         "pressure": "forward.terms.pressure:Pressure",
+        "spot": "forward.terms.spot:Spot",
         "indenter": "forward.terms.indenter:Indenter",
     },
     Term,

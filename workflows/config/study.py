@@ -92,9 +92,9 @@ def _beyond(place: str, value: Any) -> Iterator[str]:
 
 
 def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Give the full paths of a mesh, and of another study and its results, which are relative to the study's folder.
+    """Give the full paths of a mesh, a reduced model, another study and its results, relative to the study's folder.
 
-    Another study and results may be in the working directory too.
+    What is not a mesh may be in the working directory too.
     """
     method, model = blocks.get("method"), blocks.get("model")
     for key in ("source", "study"):
@@ -103,6 +103,10 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
             place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
             blocks = blocks | {"method": {**blocks["method"], key: str(place.resolve())}}
     blocks = _with_draws(blocks, folder)
+    reduced = model.get("file") if isinstance(model, Mapping) and model.get("kind") == "reduced" else None
+    if isinstance(reduced, str) and isinstance(model, Mapping):
+        place = next((path for path in (folder / reduced, Path(reduced)) if path.exists()), folder / reduced)
+        return blocks | {"model": {**model, "file": str(place.resolve())}}
     body = model.get("body") if isinstance(model, Mapping) else None
     file = body.get("file") if isinstance(body, Mapping) else None
     if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
@@ -126,9 +130,20 @@ def _with_draws(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
     """Read a study from a TOML file; overrides and errors as in `parse`."""
+    return parse(_document(path), overrides, path.parent)
+
+
+def kind_of(path: Path) -> str:
+    """Return the kind of the method of a study in a TOML file; empty without one."""
+    method = _document(path).get("method")
+    return str(method.get("kind", "")) if isinstance(method, Mapping) else ""
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """Read the blocks of a TOML file."""
     try:
         # Editors on Windows begin files with a byte order mark.
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
         message = f"{path}: lists or tables are nested too deeply"
         raise StudyError(message) from None
@@ -144,7 +159,6 @@ def load(path: Path, overrides: Sequence[str] = ()) -> StudyKind:
     except OSError as error:
         message = f"{path}: cannot be read: {error.strerror}"
         raise StudyError(message) from None
-    return parse(document, overrides, path.parent)
 
 
 def schema() -> dict[str, Any]:
@@ -207,7 +221,11 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 # Files that count by their contents, not their path.
-_FILES = {"model.body.contents.digest": "model.body.file", "parameters.from.digest": "parameters.from.file"}
+_FILES = {
+    "model.body.contents.digest": "model.body.file",
+    "model.digest": "model.file",
+    "parameters.from.digest": "parameters.from.file",
+}
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:

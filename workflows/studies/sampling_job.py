@@ -61,7 +61,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
     }
     function = study.spec.build(ensemble.group, inputs.names)
-    if not study.spec.meshed:
+    if function.space is None:
 
         def described(found: xr.Dataset) -> xr.Dataset:
             found = label(_without_nodes(found), units, None, None, 0)
@@ -75,9 +75,10 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     cells, kind = model.space.cells()
     regions = model.space.regions()
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
-    locking = measured(study, model) if ensemble.index == 0 else []
-    pressed = touched(study, model) if ensemble.index == 0 else {}
-    tensors = stressed(study, model) if ensemble.index == 0 else None
+    of_body = ensemble.index == 0 and study.spec.meshed
+    locking = measured(study, model) if of_body else []
+    pressed = touched(study, model) if of_body else {}
+    tensors = stressed(study, model) if of_body else None
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)

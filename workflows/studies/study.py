@@ -193,6 +193,7 @@ STUDIES = Kinds(
         "synthesize": "workflows.studies.synthesis:SynthesisStudy",
         "population": "workflows.studies.population:PopulationStudy",
         "design": "workflows.studies.design:DesignStudy",
+        "reduce": "workflows.studies.reduction:ReductionStudy",
     },
     objection=_objection,
 )

@@ -83,6 +83,8 @@ class FacetValues:
         The cell (n,) of each of the n points.
     local
         Their places (n, 3) in the reference cell.
+    outward
+        Vectors (n, 3) along the outer normals in the reference cell, as long as the areas that the points represent.
     """
 
     def __init__(self, expression: Any, facets: NDArray[np.int32], degree: int, space: Any, comm: Any) -> None:
@@ -95,7 +97,7 @@ class FacetValues:
         which = np.array([np.flatnonzero(to_facets.links(cell) == facet)[0] for cell, facet in own], dtype=int)
         corners, sides = basix.geometry(kind), basix.topology(kind)[2]
         flat = basix.CellType.triangle if len(sides[0]) == 3 else basix.CellType.quadrilateral
-        inside, _ = basix.make_quadrature(flat, degree)
+        inside, weights = basix.make_quadrature(flat, degree)
         points = np.concatenate(
             [corners[side[0]] + inside @ (corners[[side[1], side[2]]] - corners[side[0]]) for side in sides]
         )
@@ -107,6 +109,10 @@ class FacetValues:
         self._count = len(points)
         self.cells = self._every.cells[self._rows]
         self.local = points[self._columns]
+        spans = np.array([np.cross(*(corners[side[1:3]] - corners[side[0]])) for side in sides])
+        out = np.array([corners[side].mean(axis=0) for side in sides]) - corners.mean(axis=0)
+        spans *= np.sign(np.einsum("ij,ij->i", spans, out))[:, None]
+        self.outward = (spans[which][:, None] * weights[:, None]).reshape(-1, 3) if len(which) else np.zeros((0, 3))
 
     def __call__(self) -> FloatArray:
         """Return the values (n, size of the expression) at the current state."""

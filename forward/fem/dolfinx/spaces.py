@@ -121,6 +121,12 @@ def quadrature_points(space: Any, degree: int) -> FloatArray:
     return np.asarray(points)
 
 
+def quadrature_weights(space: Any, degree: int) -> FloatArray:
+    """Weights (q,) of these points."""
+    _, weights = basix.make_quadrature(version.cell_type(space), degree)
+    return np.asarray(weights)
+
+
 def constant(msh: Any, value: Any) -> Any:
     """A constant in forms whose value can change without compiling again."""
     return fem.Constant(msh, np.asarray(value, dtype=PETSc.ScalarType))

@@ -1,0 +1,248 @@
+"""What a reduced model consists of, and the file that holds it.
+
+A state is Σ_k c_k φ_k: coordinates c begin with what prescribed displacements move (`lifts`), then fields that only
+test (`tests`, virtual displacements whose work is an output; their c is 0), then the modes, of which a smaller model
+takes the first. Integrals know the values of these fields where they are evaluated, so nothing depends on the mesh.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.machine import write_whole
+from forward.model import FloatArray, ModelError
+from forward.reduced.graph import Tape, from_arrays, to_arrays
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Where an integrand is evaluated.
+
+    Attributes
+    ----------
+    weights
+        Weights (n,) of the points; volumes or areas with those of a rule.
+    fields
+        Values (m, n, N) of the m components that the integrand takes of each of the N coordinate fields.
+    given
+        What else it takes there (g, n): places, normals, indicators of regions.
+    logs
+        For each random field that it depends on: its number, the logarithm (n,) without coefficients and the change
+        (n, k) by each coefficient.
+    """
+
+    weights: FloatArray
+    fields: FloatArray
+    given: FloatArray
+    logs: tuple[tuple[int, FloatArray, FloatArray], ...] = ()
+
+    def some(self, chosen: NDArray[np.int64], weights: FloatArray, coordinates: int) -> Points:
+        """Return some of the points with other weights, and the first coordinates."""
+        return Points(
+            weights,
+            np.ascontiguousarray(self.fields[:, chosen, :coordinates]),
+            self.given[:, chosen],
+            tuple((number, log[chosen], slopes[chosen]) for number, log, slopes in self.logs),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """An integrand as operations at a point.
+
+    Attributes
+    ----------
+    tape
+        Its inputs are the m components of the state, what is given, the logarithms of random fields, and the numbers of
+        the model. Of a virtual work, its outputs (m,) are what works on the m components; of a density, its value.
+    """
+
+    tape: Tape
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """An output.
+
+    Attributes
+    ----------
+    kind
+        "linear": `row` · c. "work": that of all forces on the test field number `which`. "integral": of a density, over
+        the points that a level has for integral number `which`, divided by `size`. "peak": the largest value of a
+        density over `points`. "largest": the largest displacement over the nodes along axis `which`, or its length if
+        that is 3.
+    """
+
+    name: str
+    unit: str
+    kind: str
+    row: FloatArray | None = None
+    which: int = 0
+    size: float = 1.0
+    density: Written | None = None
+    points: Points | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LevelData:
+    """Equations of so many modes: virtual works with their points, and points of the outputs that are integrals."""
+
+    modes: int
+    works: tuple[Points, ...]
+    integrals: tuple[Points, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedData:
+    """A reduced model.
+
+    Attributes
+    ----------
+    spec
+        The body that was reduced, as a table.
+    parameters
+        Paths of its parameters, in the order of the arrays.
+    nominal, spread, lower, upper
+        Means, standard deviations, and smallest and largest values in the snapshots, of the parameters (d,).
+    numbers
+        Which parameters (p,) integrands depend on, in the order of the numbers of tapes.
+    coefficients
+        For each random field, its label and which parameters (k,) are its coefficients.
+    lifts
+        For each field that prescribed displacements move: its parameter (−1: none) and its value otherwise.
+    tests
+        How many test fields there are.
+    dead
+        Loads that are proportional to a number: its parameter (−1: none), its value otherwise, and the works (N,) on
+        the coordinate fields.
+    works
+        Virtual works whose integrands are evaluated at points.
+    levels
+        The model, and the nested larger one with which its errors are estimated.
+    outputs
+        Outputs.
+    fields
+        The coordinate fields (N, U), at the nodes.
+    places, cells, cell_kind, regions
+        Nodes (n, 3), cells and regions as in `NodalSpace`.
+    factors
+        Of each random field at the nodes: logarithm (n,) without coefficients, slopes (n, k), variance that is kept.
+    snapshots, coordinates
+        Parameters (s, d) of the snapshots and their coordinates (s, N).
+    about
+        How it was made, and the errors that it has on unseen samples; read by people.
+    """
+
+    spec: dict[str, Any]
+    parameters: tuple[str, ...]
+    nominal: FloatArray
+    spread: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    numbers: NDArray[np.int64]
+    coefficients: tuple[tuple[str, NDArray[np.int64]], ...]
+    lifts: tuple[tuple[int, float], ...]
+    tests: int
+    dead: tuple[tuple[int, float, FloatArray], ...]
+    works: tuple[Written, ...]
+    levels: tuple[LevelData, ...]
+    outputs: tuple[Output, ...]
+    fields: FloatArray
+    places: FloatArray
+    cells: NDArray[np.int64]
+    cell_kind: int
+    regions: NDArray[np.int64] | None
+    factors: tuple[tuple[FloatArray, FloatArray, float], ...]
+    snapshots: FloatArray
+    coordinates: FloatArray
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def before(self) -> int:
+        """How many coordinates come before the modes."""
+        return len(self.lifts) + self.tests
+
+
+def save(data: ReducedData, path: Path) -> None:
+    """Write a reduced model to one file: arrays of NumPy, and a table that says what they are."""
+    import io
+
+    arrays: dict[str, NDArray[Any]] = {}
+    table = _packed(data, "", arrays)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, table=np.array(json.dumps({"format": FORMAT, "model": table})), **arrays)
+    write_whole(path, buffer.getvalue())
+
+
+def load(path: Path) -> ReducedData:
+    """Read a reduced model.
+
+    Raises
+    ------
+    ModelError
+        If the file is not there, or holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            table = json.loads(str(file["table"]))
+            if table["format"] != FORMAT:
+                message = f"{path}: made by another version, expected format {FORMAT}; run `tissuq reduce` again"
+                raise ModelError(message)
+            found: ReducedData = _unpacked(table["model"], file)
+    except OSError as error:
+        message = f"{path}: cannot be read: {error.strerror or 'it is not a reduced model'}"
+        raise ModelError(message) from None
+    except (KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        if isinstance(error, ModelError):
+            raise
+        message = f"{path}: is not a reduced model, expected a file that `tissuq reduce` has made"
+        raise ModelError(message) from None
+    return found
+
+
+_CLASSES = (Points, Written, Output, LevelData, ReducedData)
+
+
+def _packed(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return a value as a table; arrays go to `arrays`, by their place."""
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, Tape):
+        return {"tape": {key: _packed(one, f"{name}.{key}", arrays) for key, one in to_arrays(value).items()}}
+    if isinstance(value, _CLASSES):
+        parts = {key: _packed(one, f"{name}.{key}", arrays) for key, one in vars(value).items()}
+        return {"class": type(value).__name__, "parts": parts}
+    if isinstance(value, tuple):
+        return {"tuple": [_packed(one, f"{name}.{i}", arrays) for i, one in enumerate(value)]}
+    if isinstance(value, dict):
+        return {"table": value}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _unpacked(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    if not isinstance(value, dict):
+        return value
+    (kind, *_) = value
+    match kind:
+        case "array":
+            return arrays[value["array"]]
+        case "tape":
+            return from_arrays({key: _unpacked(one, arrays) for key, one in value["tape"].items()})
+        case "class":
+            (made,) = (one for one in _CLASSES if one.__name__ == value["class"])
+            return made(**{key: _unpacked(one, arrays) for key, one in value["parts"].items()})
+        case "tuple":
+            return tuple(_unpacked(one, arrays) for one in value["tuple"])
+        case _:
+            return value["table"]

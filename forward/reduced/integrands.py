@@ -1,0 +1,242 @@
+"""The integrands of a body with their points: read from its forms, evaluated by finite elements once and for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+
+from forward.fem.dolfinx import spaces
+from forward.fem.equations import Discretisation
+from forward.model import FloatArray
+from forward.reduced.data import Points, Written
+from forward.reduced.graph import Graph, Node, Tape
+from forward.reduced.written import Reader
+
+GIVEN = 24  # inputs that what is given may take while it is not known how many there are
+LOGS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Integrand:
+    """What is integrated, or evaluated, over the cells or over a boundary.
+
+    Attributes
+    ----------
+    written
+        As operations at a point.
+    boundary, degree
+        Name of the boundary, None for the body; degree of quadrature.
+    components
+        Which components (m,) of the state it takes: those of the values and then those of the gradient.
+    given
+        What it takes besides, as UFL; normals are asked for as such.
+    fields
+        Numbers of the random fields that it takes.
+    """
+
+    written: Written
+    boundary: str | None
+    degree: int
+    components: tuple[int, ...]
+    given: tuple[tuple[Any, tuple[int, ...]], ...]
+    fields: tuple[int, ...]
+
+
+def of_form(equations: Discretisation, form: Any, numbers: tuple[str, ...]) -> list[Integrand]:
+    """Read a virtual work: for each of its measures, what works on the components of the virtual displacement."""
+    whole = _expanded(equations, form)
+    found: dict[tuple[str | None, int], list[Any]] = {}
+    for integral in whole.integrals():
+        found.setdefault(_measure(equations, integral), []).append(integral.integrand())
+    return [
+        _read(equations, sum(parts[1:], parts[0]), *measure, numbers, virtual=True) for measure, parts in found.items()
+    ]
+
+
+def of_density(equations: Discretisation, density: Any, measure: Any, numbers: tuple[str, ...]) -> Integrand:
+    """Read a density over a measure."""
+    (integral,) = _expanded(equations, density * measure).integrals()
+    return _read(equations, integral.integrand(), *_measure(equations, integral), numbers, virtual=False)
+
+
+def _expanded(equations: Discretisation, form: Any) -> Any:
+    expand = ufl.algorithms.expand_derivatives
+    return expand(expand(equations._invariants.inserted(form)))
+
+
+def _measure(equations: Discretisation, integral: Any) -> tuple[str | None, int]:
+    degree = int(integral.metadata()["quadrature_degree"])
+    if integral.integral_type() == "cell":
+        return None, degree
+    names = {tag: name for name, tag in equations._tags.items()}
+    number = integral.subdomain_id()
+    return names[number[0] if isinstance(number, tuple) else number], degree
+
+
+def _read(
+    equations: Discretisation,
+    integrand: Any,
+    boundary: str | None,
+    degree: int,
+    numbers: tuple[str, ...],
+    *,
+    virtual: bool,
+) -> Integrand:
+    values = equations.size_of_value
+    count = 4 * values  # components of values and gradients
+    first = {"given": 2 * count, "logs": 2 * count + GIVEN, "numbers": 2 * count + GIVEN + LOGS}
+    graph = Graph(first["numbers"] + len(numbers))
+    given: list[tuple[Any, tuple[int, ...]]] = []
+    fields: list[int] = []
+    paths = {id(constant): path for path, constant in equations._constants.items()}
+    logs = {id(field._function): i for i, field in enumerate(equations.fields)}
+
+    def known(e: Any, component: tuple[int, ...]) -> Node:
+        gradient = type(e).__name__ == "Grad"
+        what = e.ufl_operands[0] if gradient else e
+        kind = type(what).__name__
+        own = values + 3 * component[0] + component[1] if gradient else (component or (0,))[0]
+        if what is equations._state:
+            return own
+        if isinstance(what, ufl.Argument):
+            return count + own
+        if gradient:
+            message = f"reduced models cannot read the gradient of {what}"
+            raise NotImplementedError(message)
+        if id(what) in paths and paths[id(what)] in numbers:
+            return first["numbers"] + numbers.index(paths[id(what)])
+        if id(what) in logs:
+            number = logs[id(what)]
+            if number not in fields:
+                fields.append(number)
+            return first["logs"] + fields.index(number)
+        if isinstance(what, ufl.Constant):
+            return graph.constant(float(np.asarray(what.value)[component]))
+        if isinstance(what, ufl.Coefficient) or kind in {"SpatialCoordinate", "FacetNormal"}:
+            if (what, component) not in given:
+                given.append((what, component))
+            return first["given"] + given.index((what, component))
+        message = f"reduced models cannot read {kind}"
+        raise NotImplementedError(message)
+
+    node = Reader(graph, known)(integrand)
+    if virtual:
+        works = [graph.tangent([node], count + k)[0] for k in range(count)]
+        tape = graph.tape(works)
+        acting = {k for k, one in enumerate(works) if graph.value(one) != 0}
+    else:
+        tape, acting, works = graph.tape([node]), set[int](), [node]
+    used = {int(i) for i in tape.arguments.ravel() if 0 <= i < count} | {int(i) for i in tape.outputs if i < count}
+    components = tuple(sorted(used | acting))
+    if virtual:
+        tape = graph.tape([works[k] for k in components])
+    kept = [*components, *(first["given"] + np.arange(len(given))), *(first["logs"] + np.arange(len(fields)))]
+    kept += [*(first["numbers"] + np.arange(len(numbers)))]
+    return Integrand(Written(_with_inputs(tape, kept)), boundary, degree, components, tuple(given), tuple(fields))
+
+
+def _with_inputs(tape: Tape, kept: list[int]) -> Tape:
+    """Return a tape that has some of its inputs only, in another order."""
+    places = np.full(tape.inputs + len(tape.constants) + len(tape.codes), -1, dtype=np.int64)
+    places[kept] = np.arange(len(kept))
+    places[tape.inputs :] = len(kept) + np.arange(len(places) - tape.inputs)
+    arguments = np.where(tape.arguments >= 0, places[tape.arguments], -1)
+    return Tape(len(kept), tape.constants, tape.codes, arguments, places[tape.outputs])
+
+
+class Sampler:
+    """Values of functions of a body at the points of an integrand, of a part of them if that is enough.
+
+    Parameters
+    ----------
+    equations
+        The body, in one process.
+    integrand
+        What is evaluated.
+    """
+
+    def __init__(self, equations: Discretisation, integrand: Integrand) -> None:
+        self._equations, self.integrand = equations, integrand
+        shape = ufl.grad(equations._state)
+        values = equations.size_of_value
+        parts = [
+            _component(equations._state, (k,)) if k < values else shape[(k - values) // 3, (k - values) % 3]
+            for k in integrand.components
+        ]
+        self._state = self._at(ufl.as_vector(parts)) if parts else None
+        self.weights, self._normals = self._areas()
+        self.count = len(self.weights)
+
+    def _at(self, expression: Any) -> Callable[[], FloatArray]:
+        """Compile a vector: a function that returns its values (n, k) at all points."""
+        equations, size = self._equations, int(np.prod(expression.ufl_shape))
+        if self.integrand.boundary is not None:
+            return equations.on_facets(expression, self.integrand.boundary, self.integrand.degree)
+        points = spaces.quadrature_points(equations.space, self.integrand.degree)
+        values = equations.at(expression, points)
+        return lambda: values().reshape(-1, size)
+
+    def _areas(self) -> tuple[FloatArray, FloatArray]:
+        """Weights (n,) of the points and, on a boundary, unit normals (n, 3)."""
+        equations = self._equations
+        jacobian = ufl.Jacobian(equations.mesh)
+        at = self._at(ufl.as_vector([jacobian[i, j] for i in range(3) for j in range(3)]))
+        J = at().reshape(-1, 3, 3)
+        if self.integrand.boundary is None:
+            weights = spaces.quadrature_weights(equations.space, self.integrand.degree)
+            return np.abs(np.linalg.det(J)) * np.tile(weights, len(J) // len(weights)), np.zeros((len(J), 3))
+        outward = np.einsum("nji,nj->ni", np.linalg.inv(J), at.outward)  # type: ignore[attr-defined]
+        areas = np.linalg.norm(outward, axis=1)
+        return np.abs(np.linalg.det(J)) * areas, outward / areas[:, None]
+
+    def components(self, state: FloatArray) -> FloatArray:
+        """Return the components (m, n) that the integrand takes of a state (U_local,)."""
+        if self._state is None:
+            return np.zeros((0, self.count))
+        self._equations.set_state(state)
+        return np.ascontiguousarray(self._state().T)
+
+    def points(self, rows: FloatArray, chosen: NDArray[np.int64] | None = None) -> Points:
+        """Return the points with the values of fields (N, U_local) there."""
+        chosen = np.arange(self.count) if chosen is None else chosen
+        m = len(self.integrand.components)
+        fields = np.empty((m, len(chosen), len(rows)))
+        for k, row in enumerate(rows):
+            fields[:, :, k] = self.components(row)[:, chosen]
+        return Points(self.weights[chosen], fields, self._given()[:, chosen], self._logs(chosen))
+
+    def _given(self) -> FloatArray:
+        rows = []
+        for what, component in self.integrand.given:
+            if type(what).__name__ == "FacetNormal":
+                rows.append(self._normals[:, component[0]])
+            else:
+                rows.append(self._at(ufl.as_vector([_component(what, component)]))()[:, 0])
+        return np.array(rows).reshape(len(rows), self.count)
+
+    def _logs(self, chosen: NDArray[np.int64]) -> tuple[tuple[int, FloatArray, FloatArray], ...]:
+        equations, found = self._equations, []
+        for number in self.integrand.fields:
+            field = equations.fields[number]
+            at = self._at(ufl.as_vector([field._function]))
+            coefficients = np.zeros(len(equations.parameters))
+            field.set(coefficients)
+            base = at()[chosen, 0]
+            slopes = np.empty((len(chosen), len(field.positions)))
+            for k, position in enumerate(field.positions):
+                coefficients[:] = 0
+                coefficients[position] = 1.0
+                field.set(coefficients)
+                slopes[:, k] = at()[chosen, 0] - base
+            equations.latest.forget_parameters()
+            found.append((number, base, slopes))
+        return tuple(found)
+
+
+def _component(what: Any, component: tuple[int, ...]) -> Any:
+    return what[component] if what.ufl_shape else what

@@ -1,0 +1,161 @@
+"""Tapes at many points at once: compiled by the C compiler where there is one, by NumPy elsewhere.
+
+What depends on numbers alone is calculated once, the rest in one loop over the points. Compiled code is kept, by a hash
+of its source, in the folder of compiled forms.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forward.machine import compiled_forms
+from forward.model import FloatArray
+from forward.reduced.graph import CODES, SELECT, Tape
+
+# NaN and infinity keep their meaning, unlike with -ffast-math.
+_FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fPIC", "-shared")
+_INFIX = {"add": "+", "mul": "*", "div": "/"}
+_NAMES = {"ln": "log", "abs": "fabs"}
+
+# out[i, q, :] = Σ_j H[i, j, q] B[j, q, :]: the derivative of what acts at the points along each mode.
+_SPREAD = """
+void spread(long rows, long columns, long n, long modes, const double *H, const double *B, double *out)
+{
+  for (long i = 0; i < rows; ++i)
+    for (long q = 0; q < n; ++q) {
+      double *restrict o = out + (i * n + q) * modes;
+      for (long k = 0; k < modes; ++k) o[k] = 0.0;
+      for (long j = 0; j < columns; ++j) {
+        const double h = H[(i * columns + j) * n + q];
+        const double *restrict b = B + (j * n + q) * modes;
+        if (h != 0.0) for (long k = 0; k < modes; ++k) o[k] += h * b[k];
+      }
+    }
+}
+"""
+
+
+class Kernel:
+    """A tape whose first inputs vary from point to point and whose others are the same at all of them.
+
+    Parameters
+    ----------
+    tape
+        The operations.
+    varying
+        How many of its inputs vary.
+    """
+
+    def __init__(self, tape: Tape, varying: int) -> None:
+        self.tape, self._varying = tape, varying
+        self.size = len(tape.outputs)
+        self._function = _compiled(_source(tape, varying), "at_points")
+
+    def __call__(self, points: FloatArray, numbers: FloatArray) -> FloatArray:
+        """Return the outputs (m, n) at points (varying, n) and numbers (the other inputs,)."""
+        n = points.shape[1]
+        if self._function is None:
+            found = self.tape([*points, *numbers.tolist()])
+            return np.array([np.broadcast_to(one, (n,)) for one in found], dtype=float).reshape(self.size, n)
+        points, numbers = np.ascontiguousarray(points), np.ascontiguousarray(numbers)
+        out = np.empty((self.size, n))
+        self._function(n, points.ctypes.data, numbers.ctypes.data, out.ctypes.data)
+        return out
+
+
+def spread(H: FloatArray, B: FloatArray) -> FloatArray:
+    """Return Σ_j H[i, j, q] B[j, q, :], (m, n, modes), of H (m, k, n) and B (k, n, modes), both contiguous."""
+    function = _spread()
+    if function is None:
+        return np.asarray(np.einsum("ijq,jqk->iqk", H, B))
+    rows, columns, n = H.shape
+    out = np.empty((rows, n, B.shape[2]))
+    function(rows, columns, n, B.shape[2], H.ctypes.data, B.ctypes.data, out.ctypes.data)
+    return out
+
+
+_found: dict[str, Any] = {}
+
+
+def _spread() -> Any | None:
+    if "spread" not in _found:
+        _found["spread"] = _compiled(_SPREAD, "spread")
+    return _found["spread"]
+
+
+def _source(tape: Tape, varying: int) -> str:
+    """Return C for a tape."""
+    first = tape.inputs + len(tape.constants)
+    moving = {*range(varying)}  # nodes that vary
+    names = [f"p[{i} * n + q]" if i < varying else f"c[{i - varying}]" for i in range(tape.inputs)]
+    names += [
+        f"({value!r})" if np.isfinite(value) else f"({'-' * (value < 0)}INFINITY)" for value in tape.constants.tolist()
+    ]
+    outside: list[str] = []
+    inside: list[str] = []
+    used = {int(i) for row in tape.arguments for i in row if 0 <= i < varying}
+    used |= {int(i) for i in tape.outputs if i < varying}
+    for i in sorted(used):
+        inside.append(f"const double x{i} = {names[i]};")
+        names[i] = f"x{i}"
+    for k, (code, row) in enumerate(zip(tape.codes.tolist(), tape.arguments.tolist(), strict=True)):
+        given = [i for i in row if i >= 0]
+        text = [names[i] for i in given]
+        name = CODES[code]
+        if name == SELECT:
+            value = f"{text[0]} < {text[1]} ? {text[2]} : {text[3]}"
+        elif name in _INFIX:
+            value = f"{text[0]} {_INFIX[name]} {text[1]}"
+        else:
+            value = f"{_NAMES.get(name, name)}({', '.join(text)})"
+        varies = any(i in moving for i in given)
+        if varies:
+            moving.add(first + k)
+        (inside if varies else outside).append(f"const double t{k} = {value};")
+        names.append(f"t{k}")
+    inside += [f"out[{m} * n + q] = {names[i]};" for m, i in enumerate(tape.outputs.tolist())]
+    head = "void at_points(long n, const double *restrict p, const double *restrict c, double *restrict out)"
+    lines = ["#include <math.h>", head, "{", *outside, "for (long q = 0; q < n; ++q) {", *inside, "}", "}"]
+    return "\n".join(lines) + "\n"
+
+
+def _compiled(source: str, name: str) -> Any | None:
+    """Return a function of C, compiled or as it was kept; None without a compiler, or if it fails."""
+    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc")
+    processor = ""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next(line for line in lines if line.startswith("flags"))
+    key = hashlib.sha256("\n".join([source, processor, *_FLAGS]).encode()).hexdigest()[:24]
+    folder = compiled_forms() / "kernels"
+    kept = folder / f"{key}.so"
+    if not kept.exists():
+        if compiler is None:
+            return None
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder) as place:
+                (Path(place) / "kernel.c").write_text(source, encoding="ascii")
+                command = [*compiler.split(), *_FLAGS, "-o", f"{place}/kernel.so", f"{place}/kernel.c", "-lm"]
+                subprocess.run(command, check=True, capture_output=True)
+                (Path(place) / "kernel.so").rename(kept)
+        except (OSError, subprocess.CalledProcessError):
+            return None
+    try:
+        function = getattr(ctypes.CDLL(str(kept)), name)
+    except OSError:
+        return None
+    longs = 4 if name == "spread" else 1
+    function.argtypes = [ctypes.c_long] * longs + [ctypes.c_void_p] * 3
+    function.restype = None
+    return function

@@ -1,0 +1,334 @@
+"""The equations of a body in few coordinates: forces, stiffness, and derivatives by parameters and of outputs.
+
+With a state Σ c_k φ_k, the forces are R_i = Σ_q w_q T_q · φ_i(q) + Σ loads, T what works on the components of a virtual
+displacement at a point; K = ∂R/∂c. All are the derivatives of one energy where there is one, whatever the points are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from forward.model import FloatArray
+from forward.reduced.data import LevelData, Output, Points, ReducedData, Written
+from forward.reduced.kernels import Kernel, spread
+
+LENGTH = 3  # in place of an axis
+
+
+class Integrand:
+    """An integrand at points, and its derivatives by what it takes."""
+
+    def __init__(self, written: Written, points: Points, numbers: int) -> None:
+        self._written, self.points = written, points
+        m, n, count = points.fields.shape
+        self.components, self._varying = m, m + len(points.given) + len(points.logs)
+        self.fields = points.fields
+        self._flat = points.fields.reshape(m * n, count)
+        self.weighted = np.ascontiguousarray((points.weights[:, None] * points.fields).reshape(m * n, count))
+        self._numbers = numbers
+
+    def _derived(self, along: Sequence[int]) -> Kernel:
+        """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
+        graph, outputs = self._written.tape.graph()
+        slopes = [graph.tangent(outputs, i) for i in along]
+        by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
+        return Kernel(graph.tape([*outputs, *by_output]), self._varying)
+
+    @cached_property
+    def _values(self) -> Kernel:
+        return self._derived(())
+
+    @cached_property
+    def _by_state(self) -> Kernel:
+        return self._derived(range(self.components))
+
+    @cached_property
+    def _by_parameters(self) -> Kernel:
+        first = self.components + len(self.points.given)
+        return self._derived(range(first, first + len(self.points.logs) + self._numbers))
+
+    def inputs(self, c: FloatArray, coefficients: Sequence[FloatArray]) -> FloatArray:
+        """Return what the integrand takes (varying, n) at coordinates, with the coefficients of all random fields."""
+        n = len(self.points.weights)
+        found = np.empty((self._varying, n))
+        found[: self.components] = (self._flat @ c).reshape(self.components, n)
+        found[self.components : self.components + len(self.points.given)] = self.points.given
+        for row, (number, log, slopes) in zip(
+            found[self._varying - len(self.points.logs) :], self.points.logs, strict=True
+        ):
+            row[:] = log + slopes @ coefficients[number]
+        return found
+
+    def values(self, inputs: FloatArray, numbers: FloatArray) -> FloatArray:
+        """Return its outputs (k, n)."""
+        return self._values(inputs, numbers)
+
+    def by_state(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return its outputs (k, n), and their derivatives (k, m, n) by the components of the state."""
+        found = self._by_state(inputs, numbers)
+        k = len(found) // (1 + self.components)
+        return found[:k], found[k:].reshape(k, self.components, -1)
+
+    def by_parameters(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives (k, f, n) of its outputs by the logarithms of its fields, and (k, p, n) by numbers."""
+        found = self._by_parameters(inputs, numbers)
+        logs = len(self.points.logs)
+        k = len(found) // (1 + logs + self._numbers)
+        slopes = found[k:].reshape(k, logs + self._numbers, -1)
+        return slopes[:, :logs], slopes[:, logs:]
+
+
+class Level:
+    """A reduced model with so many modes at its points.
+
+    Parameters
+    ----------
+    data
+        The model.
+    level
+        Which of its levels.
+    """
+
+    def __init__(self, data: ReducedData, level: LevelData) -> None:
+        self.integrals = level.integrals
+        self.data, self.modes = data, level.modes
+        self.before = data.before
+        self.count = self.before + level.modes
+        p = len(data.numbers)
+        self.works = [Integrand(written, points, p) for written, points in zip(data.works, level.works, strict=True)]
+        self._outputs = [_of_output(output, self, p) for output in data.outputs]
+        self.free = slice(self.before, self.count)
+
+    def coordinates(self, parameters: FloatArray, modes: FloatArray) -> FloatArray:
+        """Return all coordinates (N,) from the parameters (d,) and those of the modes."""
+        c = np.zeros(self.count)
+        for k, (number, value) in enumerate(self.data.lifts):
+            c[k] = value if number < 0 else parameters[number]
+        c[self.free] = modes
+        return c
+
+    def numbers(self, parameters: FloatArray) -> FloatArray:
+        """Return the numbers that integrands take."""
+        return parameters[self.data.numbers]
+
+    def coefficients(self, parameters: FloatArray) -> list[FloatArray]:
+        """Return the coefficients of each random field."""
+        return [parameters[which] for _, which in self.data.coefficients]
+
+    def forces(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, float]:
+        """Return the forces (N,) on all coordinates, and the size that they would have if they did not cancel."""
+        R, numbers, coefficients = self._dead(parameters), self.numbers(parameters), self.coefficients(parameters)
+        size = float(np.abs(R[self.free]).max(initial=0.0))
+        for work in self.works:
+            part = work.values(work.inputs(c, coefficients), numbers).ravel() @ work.weighted
+            size = max(size, float(np.abs(part[self.free]).max(initial=0.0)))
+            R += part
+        return R, max(size, float(np.abs(R[: self.before]).max(initial=0.0)))
+
+    def stiffness(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the forces (N,) and their derivative (N, N) by all coordinates."""
+        R, numbers, coefficients = self._dead(parameters), self.numbers(parameters), self.coefficients(parameters)
+        K = np.zeros((self.count, self.count))
+        for work in self.works:
+            T, H = work.by_state(work.inputs(c, coefficients), numbers)
+            R += T.ravel() @ work.weighted
+            K += work.weighted.T @ spread(H, work.fields).reshape(-1, self.count)
+        return R, K
+
+    def by_parameters(self, c: FloatArray, parameters: FloatArray, K: FloatArray) -> FloatArray:
+        """Return the derivatives (N, d) of the forces by the parameters at coordinates of the modes that stay."""
+        numbers, coefficients = self.numbers(parameters), self.coefficients(parameters)
+        slopes = np.zeros((self.count, len(parameters)))
+        for work in self.works:
+            by_logs, by_numbers = work.by_parameters(work.inputs(c, coefficients), numbers)
+            np.add.at(
+                slopes.T, self.data.numbers, np.einsum("kpn->pkn", by_numbers).reshape(len(numbers), -1) @ work.weighted
+            )
+            for i, (number, _, change) in enumerate(work.points.logs):
+                moved = (by_logs[:, i, :, None] * change).reshape(-1, change.shape[1])
+                slopes[:, self.data.coefficients[number][1]] += work.weighted.T @ moved
+        for number, _, row in self.data.dead:
+            if number >= 0:
+                slopes[:, number] += row[: self.count]
+        for k, (number, _) in enumerate(self.data.lifts):
+            if number >= 0:
+                slopes[:, number] += K[:, k]
+        return slopes
+
+    def _dead(self, parameters: FloatArray) -> FloatArray:
+        R = np.zeros(self.count)
+        for number, value, row in self.data.dead:
+            R += (value if number < 0 else parameters[number]) * row[: self.count]
+        return R
+
+    def outputs(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the outputs (m,)."""
+        return np.array([output.value(c, parameters) for output in self._outputs])
+
+    def output_slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives of the outputs by the coordinates (m, N) and by the parameters (m, d).
+
+        Parameters
+        ----------
+        c, parameters
+            Where.
+        K, F
+            Derivatives of the forces by the coordinates and by the parameters there.
+        """
+        pairs = [output.slopes(c, parameters, K, F) for output in self._outputs]
+        by_state = np.array([one for one, _ in pairs]).reshape(-1, self.count)
+        by_parameters = np.array([other for _, other in pairs]).reshape(-1, len(parameters))
+        for k, (number, _) in enumerate(self.data.lifts):
+            if number >= 0:
+                by_parameters[:, number] += [
+                    0.0 if output.whole else row[k] for output, row in zip(self._outputs, by_state, strict=True)
+                ]
+        return by_state, by_parameters
+
+
+class _Output:
+    """An output of a level; `whole` if its derivatives by parameters know what prescribed displacements move."""
+
+    whole = False
+
+    def __init__(self, output: Output, level: Level) -> None:
+        self.output, self.level = output, level
+
+    def value(self, c: FloatArray, parameters: FloatArray) -> float:
+        raise NotImplementedError
+
+    def slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        raise NotImplementedError
+
+
+class _Linear(_Output):
+    """ψ = row · c."""
+
+    def _row(self) -> FloatArray:
+        assert self.output.row is not None
+        return self.output.row[: self.level.count]
+
+    def value(self, c: FloatArray, parameters: FloatArray) -> float:
+        return float(self._row() @ c)
+
+    def slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        return self._row(), np.zeros(len(parameters))
+
+
+class _Work(_Output):
+    """ψ = the work of all forces on a test field."""
+
+    whole = True
+
+    @property
+    def _place(self) -> int:
+        return len(self.level.data.lifts) + self.output.which
+
+    def value(self, c: FloatArray, parameters: FloatArray) -> float:
+        return float(self.level.forces(c, parameters)[0][self._place])
+
+    def slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        return K[self._place], F[self._place].copy()
+
+
+class _Largest(_Output):
+    """ψ = the largest displacement over the nodes; of those that are equal the first counts."""
+
+    @cached_property
+    def _rows(self) -> FloatArray:
+        axes = range(3) if self.output.which == LENGTH else (self.output.which,)
+        n = 3 * len(self.level.data.places)
+        return np.ascontiguousarray([self.level.data.fields[: self.level.count, axis:n:3].T for axis in axes])
+
+    def _there(self, c: FloatArray) -> tuple[int, FloatArray]:
+        u = self._rows @ c
+        sizes = np.sqrt((u**2).sum(axis=0))
+        node = int(np.flatnonzero(sizes >= sizes.max() * (1 - 1e-10))[0])
+        return node, u[:, node]
+
+    def value(self, c: FloatArray, parameters: FloatArray) -> float:
+        return float(np.linalg.norm(self._there(c)[1]))
+
+    def slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        node, u = self._there(c)
+        size = float(np.linalg.norm(u))
+        row = (u / size) @ self._rows[:, node] if size else np.zeros(self.level.count)
+        return row, np.zeros(len(parameters))
+
+
+class _OfDensity(_Output):
+    """An output of values at points: their weighted sum, or the largest."""
+
+    def __init__(self, output: Output, level: Level, points: Points, numbers: int) -> None:
+        super().__init__(output, level)
+        assert output.density is not None
+        self._density = Integrand(output.density, points, numbers)
+
+    def _weights(self, values: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def value(self, c: FloatArray, parameters: FloatArray) -> float:
+        level = self.level
+        inputs = self._density.inputs(c, level.coefficients(parameters))
+        values = self._density.values(inputs, level.numbers(parameters))[0]
+        return float(self._weights(values) @ values)
+
+    def slopes(
+        self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        level, density = self.level, self._density
+        inputs, numbers = density.inputs(c, level.coefficients(parameters)), level.numbers(parameters)
+        values, by_state = density.by_state(inputs, numbers)
+        weights = self._weights(values[0])
+        by_logs, by_numbers = density.by_parameters(inputs, numbers)
+        slopes = np.zeros(len(parameters))
+        np.add.at(slopes, level.data.numbers, by_numbers[0] @ weights)
+        for i, (number, _, change) in enumerate(density.points.logs):
+            slopes[level.data.coefficients[number][1]] += (weights * by_logs[0, i]) @ change
+        row: FloatArray = (by_state[0] * weights).ravel() @ density.fields.reshape(-1, density.fields.shape[2])
+        return row, slopes
+
+
+class _Integral(_OfDensity):
+    def _weights(self, values: FloatArray) -> FloatArray:
+        return self._density.points.weights / self.output.size
+
+
+class _Peak(_OfDensity):
+    def _weights(self, values: FloatArray) -> FloatArray:
+        weights = np.zeros(len(values))
+        weights[int(np.argmax(values))] = 1.0
+        return weights
+
+
+def _of_output(output: Output, level: Level, numbers: int) -> _Output:
+    match output.kind:
+        case "linear":
+            return _Linear(output, level)
+        case "work":
+            return _Work(output, level)
+        case "largest":
+            return _Largest(output, level)
+        case "integral":
+            return _Integral(output, level, level.integrals[output.which], numbers)
+        case "peak":
+            points = output.points
+            assert points is not None
+            every = np.arange(len(points.weights))
+            return _Peak(output, level, points.some(every, points.weights, level.count), numbers)
+        case _:
+            message = f"the file has an output of the unknown kind '{output.kind}'"
+            raise ValueError(message)

@@ -1,0 +1,373 @@
+"""A reduced model as a `ForwardModel`: Newton's method in few coordinates, exact derivatives, estimates of its errors.
+
+No FEniCSx, unless the full model is asked where an estimate exceeds the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.hyperelastic import Hyperelastic
+from forward.materials.admissible import Admission
+from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, Work
+from forward.reduced.data import ReducedData
+from forward.reduced.level import Level
+
+ITERATIONS = 25
+TOLERANCE = 1e-12  # of the forces, relative to what they would be if they did not cancel
+ROUNDING = 1e-13  # changes of the coordinates, relative to them, below which nothing changes any more
+STEPS = (1, 2, 4, 8, 16, 32)  # into which the way from the nearest snapshot is cut
+GROWTH = 2.0  # of the forces in a step of Newton's method, above which it is shortened
+
+
+class Estimate(NamedTuple):
+    """What the nested larger model says of a solution.
+
+    Attributes
+    ----------
+    outputs
+        Errors (m,) of the outputs, with their signs: added to these they correct them.
+    state
+        Norm of the error of the state in the inner product of the modes, relative to the state.
+    work
+        What it has cost.
+    """
+
+    outputs: FloatArray
+    state: float
+    work: Work
+
+
+class ReducedModel(OneByOne):
+    """A reduced model.
+
+    Parameters
+    ----------
+    data
+        What it consists of.
+    parameters
+        Paths of the parameters of its vectors; the others keep their means.
+    outputs
+        Which of its outputs, by name, in this order; None for all.
+    tolerance
+        Estimated error of any output, relative to its spread in the snapshots, above which the full model is asked;
+        None: never.
+    full
+        Makes the full model.
+    """
+
+    def __init__(
+        self,
+        data: ReducedData,
+        parameters: tuple[str, ...],
+        outputs: tuple[str, ...] | None = None,
+        tolerance: float | None = None,
+        full: Callable[[], ForwardModel] | None = None,
+    ) -> None:
+        self.data, self.parameters = data, parameters
+        names = [output.name for output in data.outputs]
+        self.outputs = tuple(names) if outputs is None else outputs
+        self.which = np.array([names.index(name) for name in self.outputs], dtype=np.int64)
+        self.places = np.array([data.parameters.index(path) for path in parameters], dtype=np.int64)
+        self.level = Level(data, data.levels[0])
+        self.spec = Hyperelastic.model_validate(data.spec)
+        self.space = ReducedSpace(data, self.places)
+        self.differentiable = True
+        self.asked = 0  # how often the full model was asked
+        self.tested = not self.spec.solver.accept_unstable
+        self._admission = Admission(self.spec, data.parameters)
+        self._tolerance, self._full = tolerance, full
+
+    @property
+    def together(self) -> int:
+        """Points are solved one by one."""
+        return 1
+
+    @cached_property
+    def larger(self) -> Level:
+        """The nested larger model."""
+        return Level(self.data, self.data.levels[-1])
+
+    @cached_property
+    def full(self) -> ForwardModel:
+        """The model that was reduced; needs FEniCSx."""
+        assert self._full is not None
+        return self._full()
+
+    def whole(self, parameters: FloatArray) -> FloatArray:
+        """Return all parameters (d,) of the reduced model."""
+        found = self.data.nominal.copy()
+        found[self.places] = parameters
+        return found
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
+        """Find the equilibrium at `parameters` (d,); the snapshots know where to begin.
+
+        Raises
+        ------
+        SolveError
+            Where Newton's method finds none, or the reduced stiffness is not positive definite.
+        """
+        found = self.reduced(np.array(parameters, dtype=float))
+        if self._tolerance is None:
+            return found
+        spread = np.array(self.data.about["spread"])[self.which]
+        if (np.abs(found.estimate.outputs) <= self._tolerance * spread).all():
+            return found
+        self.asked += 1
+        return self.full.solve(np.array(parameters, dtype=float), None)
+
+    def reduced(self, parameters: FloatArray, start: FloatArray | None = None) -> ReducedSolution:
+        """Find the equilibrium of the reduced model, whatever its error; `start` are coordinates of the modes."""
+        whole = self.whole(parameters)
+        self._admission.require(whole)
+        work = Work()
+        found = self._newton(whole, self.first(whole) if start is None else start, work)
+        if found is None:
+            found = self._in_steps(whole, work)
+        return ReducedSolution(self, parameters, whole, *found, work)
+
+    def first(self, whole: FloatArray) -> FloatArray:
+        """Return what the snapshots say of the coordinates of the modes at parameters (d,)."""
+        return self._predictor(whole)
+
+    @cached_property
+    def _predictor(self) -> Callable[[FloatArray], FloatArray]:
+        """Interpolate the snapshots by |r|³ and linear functions (M. D. Buhmann, Radial Basis Functions, 2003)."""
+        data = self.data
+        varied = data.spread > 0
+        scale = data.spread[varied]
+        x = (data.snapshots[:, varied] - data.nominal[varied]) / scale
+        y = data.coordinates[:, self.level.free]
+        distances = np.linalg.norm(x[:, None] - x[None], axis=2)
+        linear = np.column_stack([np.ones(len(x)), x])
+        k = linear.shape[1]
+        matrix = np.block([[distances**3, linear], [linear.T, np.zeros((k, k))]])
+        weights = np.linalg.lstsq(matrix, np.vstack([y, np.zeros((k, y.shape[1]))]), rcond=1e-10)[0]
+
+        def at(whole: FloatArray) -> FloatArray:
+            z = (whole[varied] - data.nominal[varied]) / scale
+            basis = np.concatenate([np.sqrt(((x - z) ** 2).sum(axis=1)) ** 3, [1.0], z])
+            return np.asarray(basis @ weights)
+
+        return at
+
+    def _newton(self, whole: FloatArray, modes: FloatArray, work: Work) -> tuple[FloatArray, FloatArray] | None:
+        """Return the coordinates of the equilibrium and the stiffness there; None where there is no way."""
+        level, free = self.level, self.level.free
+        c = level.coordinates(whole, modes)
+        step, before, still = np.zeros(level.modes), np.inf, False
+        for _ in range(ITERATIONS):
+            R, K = level.stiffness(c, whole)
+            work.assemblies += 1
+            size = float(np.abs(R[free]).max(initial=0.0))
+            shortened = 0
+            while not np.isfinite(K).all() or not size <= GROWTH * before:
+                if shortened == 10 or not step.any():
+                    return None
+                step = step / 2
+                c[free] -= step
+                R, K = level.stiffness(c, whole)
+                work.assemblies += 1
+                size = float(np.abs(R[free]).max(initial=0.0))
+                shortened += 1
+            _, scale = level.forces(c, whole)
+            work.residuals += 1
+            if size <= TOLERANCE * scale or still:
+                return c, K
+            before = size
+            try:
+                step = -np.linalg.solve(K[free, free], R[free])
+            except np.linalg.LinAlgError:
+                return None
+            work.factorisations += 1
+            work.back_substitutions += 1
+            c[free] += step
+            still = bool(np.abs(step).max() <= ROUNDING * np.abs(c[free]).max())
+        return None
+
+    def _in_steps(self, whole: FloatArray, work: Work) -> tuple[FloatArray, FloatArray]:
+        """Go from the nearest snapshot to the parameters, in more and more steps."""
+        data = self.data
+        scale = np.where(data.spread > 0, data.spread, 1.0)
+        near = int(np.argmin((((data.snapshots - whole) / scale) ** 2).sum(axis=1)))
+        for steps in STEPS:
+            modes = data.coordinates[near, self.level.free]
+            for k in range(1, steps + 1):
+                at = data.snapshots[near] + k / steps * (whole - data.snapshots[near])
+                found = self._newton(at, modes, work)
+                if found is None:
+                    break
+                work.load_steps += 1
+                modes = found[0][self.level.free]
+            else:
+                assert found is not None
+                return found
+        outside = outside_of(data, whole)
+        hint = f"; {outside}" if outside else ""
+        message = f"the reduced model finds no equilibrium, though it went there in {STEPS[-1]} steps{hint}"
+        raise SolveError(message, work=work)
+
+
+def outside_of(data: ReducedData, whole: FloatArray) -> str:
+    """Say which parameters (d,) lie outside the snapshots; empty if none does."""
+    found = [
+        f"{path} = {value:.4g} (trained from {low:.4g} to {high:.4g})"
+        for path, value, low, high in zip(data.parameters, whole, data.lower, data.upper, strict=True)
+        if value < low - 1e-9 * abs(low) or value > high + 1e-9 * abs(high)
+    ]
+    return f"outside the trained range: {', '.join(found[:3])}" if found else ""
+
+
+class ReducedSpace:
+    """The `NodalSpace` of a reduced model: every rank has all of it."""
+
+    def __init__(self, data: ReducedData, places: NDArray[np.int64]) -> None:
+        self._data, self._places = data, places
+        self.coordinates = data.places
+        self.displacements = data.places.size
+
+    def cells(self) -> tuple[NDArray[np.int64], int]:
+        """Return all cells as nodes, and VTK's number of their type."""
+        return self._data.cells, self._data.cell_kind
+
+    def regions(self) -> NDArray[np.int64] | None:
+        """Return the region of each cell; None without regions."""
+        return self._data.regions
+
+    def gather(self, rows: FloatArray) -> FloatArray:
+        """Return the rows: they are whole."""
+        return rows
+
+    def scatter(self, rows: FloatArray) -> FloatArray:
+        """Return the rows: they are whole."""
+        return rows
+
+    def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
+        """Return the factors (n, N) of each random field at parameters (n, d), at the nodes."""
+        whole = np.tile(self._data.nominal, (len(points), 1))
+        whole[:, self._places] = points
+        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
+        return {label: np.exp(log + whole[:, which] @ slopes.T) for (label, which), (log, slopes, _) in pairs}
+
+    @property
+    def variance_kept(self) -> dict[str, float]:
+        """Fraction of the variance of each random field that its modes make."""
+        pairs = zip(self._data.coefficients, self._data.factors, strict=True)
+        return {label: kept for (label, _), (_, _, kept) in pairs}
+
+
+class ReducedSolution:
+    """An equilibrium of a reduced model, with its linearisation and an estimate of its error."""
+
+    residual, converged = 0.0, True
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        parameters: FloatArray,
+        whole: FloatArray,
+        c: FloatArray,
+        K: FloatArray,
+        work: Work,
+    ) -> None:
+        self._model, self._whole, self._K, self.work = model, whole, K, work
+        self.parameters, self.c = np.array(parameters), c
+        self.outputs = model.level.outputs(c, whole)[model.which]
+        self.stability = self._stability()
+        for array in (self.parameters, self.c, self.outputs):
+            array.flags.writeable = False
+
+    def _stability(self) -> Stability:
+        """Test the symmetric part of the stiffness: where it is indefinite, so is that of all unknowns."""
+        free = self._model.level.free
+        if not self._model.tested:
+            return Stability.NOT_TESTED
+        K = self._K[free, free]
+        try:
+            np.linalg.cholesky((K + K.T) / 2)
+        except np.linalg.LinAlgError:
+            message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
+            raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
+        return Stability.SCREENED
+
+    @cached_property
+    def state(self) -> FloatArray:
+        """Displacements (U,) of the nodes."""
+        found = self.c @ self._model.data.fields[: len(self.c)]
+        found.flags.writeable = False
+        return np.asarray(found)
+
+    @cached_property
+    def _F(self) -> FloatArray:
+        return self._model.level.by_parameters(self.c, self._whole, self._K)
+
+    @cached_property
+    def _slopes(self) -> FloatArray:
+        """Derivatives (N, d) of the coordinates by the parameters of the model."""
+        level, places = self._model.level, self._model.places
+        slopes = np.zeros((level.count, len(self._whole)))
+        for k, (number, _) in enumerate(self._model.data.lifts):
+            if number >= 0:
+                slopes[k, number] = 1.0
+        slopes[level.free] = -np.linalg.solve(self._K[level.free, level.free], self._F[level.free])
+        self.work.factorisations += 1
+        self.work.back_substitutions += slopes.shape[1]
+        return slopes[:, places]
+
+    @cached_property
+    def _jacobian(self) -> FloatArray:
+        """Derivatives (m, d) of the outputs."""
+        model = self._model
+        by_state, directly = model.level.output_slopes(self.c, self._whole, self._K, self._F)
+        free = model.level.free
+        found = by_state[:, free] @ self._slopes[free] + directly[:, model.places]
+        return np.asarray(found[model.which])
+
+    def tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
+        return np.asarray(direction) @ self._jacobian.T
+
+    def adjoint(self, weights: FloatArray) -> FloatArray:
+        """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
+        return np.asarray(weights) @ self._jacobian
+
+    def state_tangent(self, direction: FloatArray) -> FloatArray:
+        """Return the derivative of the state (U,) along a `direction` (d,), or (k, U) for k of them."""
+        return np.asarray(direction) @ self._slopes.T @ self._model.data.fields[: len(self.c)]
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """Estimate the errors of outputs and state by one step of Newton's method in the nested larger model.
+
+        Of an output that is the dual-weighted residual −zᵀR with the adjoint z in the larger model, Kᵀz = ∂ψ/∂u, which
+        holds a basis of adjoints; the output is evaluated whole, so that curved ones are corrected too (R. Becker,
+        R. Rannacher, Acta Numerica 10 (2001) 1–102).
+        """
+        model, larger = self._model, self._model.larger
+        modes = np.zeros(larger.modes)
+        modes[: model.level.modes] = self.c[model.level.free]
+        c = larger.coordinates(self._whole, modes)
+        R, K = larger.stiffness(c, self._whole)
+        try:
+            change = -np.linalg.solve(K[larger.free, larger.free], R[larger.free])
+        except np.linalg.LinAlgError:
+            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
+        c[larger.free] += change
+        errors = larger.outputs(c, self._whole)[model.which] - self.outputs
+        size = float(np.linalg.norm(c[larger.free])) or 1.0
+        return Estimate(errors, float(np.linalg.norm(change)) / size, Work(0, 1, 1, 1, 0))
+
+    def mesh_error(self) -> None:
+        """No mesh that could be refined."""
+        return
+
+    def saturation(self, spare: float = math.inf) -> None:
+        """No mesh that could be refined."""
+        return

@@ -1,0 +1,199 @@
+"""The specification of a reduced model: the file that `tissuq reduce` has made, read without FEniCSx."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from forward.hyperelastic import Hyperelastic
+from forward.model import Finding, FloatArray, ModelError
+from forward.registry import named
+from forward.scalars import Scalar
+from forward.spec import ModelSpec
+
+if TYPE_CHECKING:
+    from forward.fem.locking import Ranges
+    from forward.materials.admissible import Materials
+
+LETTERS = 16  # of a hash
+BEYOND = 0.05  # of the trained range, and half a standard deviation: farther out is a finding
+DOUBTFUL = 0.05  # error on unseen samples, relative to the spread of an output, above which it is one
+
+
+class _About(NamedTuple):
+    """What a study needs to know of a file."""
+
+    body: Hyperelastic
+    parameters: tuple[str, ...]
+    nominal: FloatArray
+    spread: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    told: dict[str, Any]
+    digest: str
+
+
+class Reduced(ModelSpec):
+    """A reduced model of a body: few modes at few points, with estimates of its errors.
+
+    Its parameters are those that were random when it was made; those that a study does not name keep their means.
+
+    Parameters
+    ----------
+    file
+        What `tissuq reduce` has made.
+    tolerance
+        Estimated error of any output, relative to the standard deviation that it has in the snapshots, above which the
+        full model is asked instead; none by default. Needs FEniCSx.
+    digest
+        Hash of the file, kept with results: another file of the same name is refused.
+    """
+
+    kind: Literal["reduced"] = "reduced"
+    file: str
+    tolerance: Annotated[float, Field(gt=0)] | None = None
+    digest: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Reduced:
+        try:
+            about = self._about
+        except ModelError as error:
+            raise PydanticCustomError("model", "{message}", {"message": str(error)}) from None
+        if self.digest is not None and self.digest != about.digest:
+            message = f"{self.file} has changed since the study was begun: hash {self.digest} → {about.digest}"
+            raise PydanticCustomError("model", "{message}", {"message": message})
+        object.__setattr__(self, "digest", about.digest)
+        return self
+
+    @cached_property
+    def _about(self) -> _About:
+        path = Path(self.file)
+        try:
+            content = path.read_bytes()
+            with np.load(path, allow_pickle=False) as file:
+                parts = json.loads(str(file["table"]))["model"]["parts"]
+                told, body = parts["about"]["table"], parts["spec"]["table"]
+                names = tuple(parts["parameters"]["tuple"])
+                arrays = [file[f".{name}"] for name in ("nominal", "spread", "lower", "upper")]
+        except OSError as error:
+            message = f"{self.file}: cannot be read: {error.strerror or 'it is no reduced model'}"
+            raise ModelError(message) from None
+        except (KeyError, ValueError, TypeError):
+            message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
+            raise ModelError(message) from None
+        nominal, spread, lower, upper = arrays
+        digest = sha256(content).hexdigest()[:LETTERS]
+        return _About(Hyperelastic.model_validate(body), names, nominal, spread, lower, upper, told, digest)
+
+    @property
+    def outputs(self) -> Sequence[Any]:
+        """The outputs of the body."""
+        return self._about.body.outputs
+
+    @property
+    def scalars(self) -> Mapping[str, Scalar]:
+        """Its parameters that are numbers of the body, with their means."""
+        about, known = self._about, self._about.body.scalars
+        pairs = zip(about.parameters, about.nominal, strict=True)
+        return {path: known[path]._replace(value=float(value)) for path, value in pairs if path in known}
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Its parameters that are coefficients of random fields."""
+        return tuple(path for path in self._about.parameters if path not in self._about.body.scalars)
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """Numbers of the body that were not random when it was made."""
+        others = set(self._about.body.scalars) - set(self._about.parameters)
+        why = "kept its value when the model was reduced; make it random in that study"
+        return dict.fromkeys(others, why)
+
+    def materials(self, parameters: Collection[str] = ()) -> Materials:
+        """Return the materials of the body as functions of some of its numbers, by their paths."""
+        return self._about.body.materials(parameters)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the stiffness of the body is symmetric."""
+        return self._about.body.symmetric
+
+    @property
+    def description(self) -> str:
+        """The model in words."""
+        told = self._about.told
+        size = f"{told['modes']} modes, {told['points']} points, from {told['snapshots']} snapshots"
+        return f"reduced model of a body of {told['unknowns']:,} unknowns: {size}"
+
+    def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
+        """Say how large it is, and what errors it has on samples that it was not made of."""
+        yield "model", self.description
+        errors = self._about.told.get("errors")
+        if errors:
+            each = ", ".join(f"{name} {100 * error:.2g} %" for name, error in errors.items())
+            yield "errors", f"{each} of the spread (root mean square of {self._about.told['unseen']} unseen samples)"
+
+    def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
+        """Say where a study goes beyond the snapshots, and which outputs have large errors."""
+        return (*self._outside(ranges), *self._of_errors())
+
+    def _outside(self, ranges: Ranges) -> Iterator[Finding]:
+        about = self._about
+        rows = zip(about.parameters, about.lower, about.upper, about.spread, strict=True)
+        for path, low, high, spread in rows:
+            if path not in ranges:
+                continue
+            margin = max(BEYOND * (high - low), 0.5 * spread)
+            first, last = ranges[path]
+            if first < low - margin or last > high + margin:
+                yield Finding(
+                    "warning",
+                    f"{path} goes from {first:.4g} to {last:.4g}, but the reduced model was trained from {low:.4g} to "
+                    f"{high:.4g}: beyond, it is an extrapolation; reduce the body over the range that is needed.",
+                )
+
+    def _of_errors(self) -> Iterator[Finding]:
+        errors = self._about.told.get("errors", {})
+        large = [f"{name} {100 * error:.2g} %" for name, error in errors.items() if error > DOUBTFUL]
+        if large:
+            yield Finding(
+                "warning",
+                f"On unseen samples the reduced model errs by {', '.join(large)} of the spread of these outputs (root "
+                "mean square): more snapshots or modes help, or model.tolerance: then the full model is asked where "
+                "estimates are large.",
+            )
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that results depend on; the file counts by its hash, not by its path."""
+        found = super().identity()
+        found.pop("file")
+        return found
+
+    def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
+        """Load it; every rank has all of it.
+
+        Raises
+        ------
+        ModelError
+            If the full model is to be asked for parameters other than those of the file.
+        """
+        data = named("forward.reduced.data:load")(Path(self.file))
+        if self.tolerance is not None and set(parameters) != set(data.parameters):
+            missing = ", ".join(path for path in data.parameters if path not in parameters)
+            message = (
+                f"model.tolerance asks the full model, for which all its parameters are random; missing: {missing}"
+            )
+            raise ModelError(message)
+        body = self._about.body
+        return named("forward.reduced.model:ReducedModel")(
+            data, parameters, tolerance=self.tolerance, full=lambda: body.build(comm, parameters)
+        )

@@ -1,0 +1,140 @@
+"""Studies that make reduced models, and studies that use them."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from forward.reduced.data import load as load_model
+from tests import launch
+from workflows.__main__ import main
+from workflows.config.mistakes import StudyError
+from workflows.config.study import load
+
+pytestmark = pytest.mark.fem
+
+BODY = """
+[model]
+kind = "hyperelastic"
+formulation = "displacement"
+body = { kind = "box", size = [0.1, 0.05, 0.03], cells = [2, 1, 1], cell = "hexahedron", degree = 1 }
+material = { kind = "neo-hookean", C1 = 1000, D1 = 3000 }
+clamp = ["x-min"]
+loads = [{ kind = "gravity", density = 1000 }]
+outputs = [{ name = "u_max", kind = "max-displacement" }, { name = "energy", kind = "strain-energy" }]
+[parameters]
+"material.C1" = { kind = "uniform", lower = 800, upper = 1200 }
+"loads.gravity.density" = { kind = "uniform", lower = 900, upper = 1100 }
+"""
+SAMPLED = BODY + '[method]\nkind = "monte-carlo"\nsamples = 16\n'
+USED = """
+[model]
+kind = "reduced"
+file = "model.npz"
+{more}
+[parameters]
+"material.C1" = {{ kind = "uniform", lower = 800, upper = {upper} }}
+"loads.gravity.density" = {{ kind = "uniform", lower = 900, upper = 1100 }}
+[method]
+kind = "quasi-monte-carlo"
+samples = 32
+scrambles = 4
+"""
+SIZES = ["--set", "method.snapshots=12", "--set", "method.unseen=6", "--set", "method.rounds=2", "--set", "method.modes=6"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study that samples a body, reduced by the command."""
+    place = tmp_path_factory.mktemp("reduction")
+    (place / "body.toml").write_text(SAMPLED)
+    reduced = ["reduce", place / "body.toml", *SIZES, "--out", place / "made", "--output", place / "model.npz"]
+    assert main([*map(str, reduced), "--quiet"]) == 0
+    return place
+
+
+def test_the_command_makes_a_model_with_known_errors(folder):
+    told = json.loads((folder / "made" / "summary.json").read_text())["reduced"]
+    assert told["snapshots"] == 12
+    assert told["unseen"] == 6
+    assert all(error < 1e-2 for error in told["errors"].values())
+    assert set(told["effectivity"]) == {"u_max", "energy"}
+    assert (folder / "made" / "reduced.npz").read_bytes() == (folder / "model.npz").read_bytes()
+    assert (folder / "made" / "report.html").exists()
+    found = xr.load_dataset(folder / "made" / "results.nc")
+    assert found.reduced_error.shape == (6, 2)
+    assert np.abs(found.reduced_error - found.reduced_estimate).max() < np.abs(found.reduced_error).max()
+
+
+def test_a_study_of_it_gives_what_the_body_gives(folder):
+    (folder / "used.toml").write_text(USED.format(upper=1200, more=""))
+    assert main(["run", str(folder / "used.toml"), "--out", str(folder / "used"), "--quiet"]) == 0
+    (folder / "direct.toml").write_text(BODY + '[method]\nkind = "quasi-monte-carlo"\nsamples = 32\nscrambles = 4\n')
+    assert main(["run", str(folder / "direct.toml"), "--out", str(folder / "direct"), "--quiet", "--no-report"]) == 0
+    found, body = (xr.load_dataset(folder / name / "results.nc") for name in ("used", "direct"))
+    for name in ("mean", "std"):
+        np.testing.assert_allclose(found[name], body[name], rtol=5e-3)
+    np.testing.assert_allclose(found.field_mean, body.field_mean, atol=5e-3 * float(np.abs(body.field_mean).max()))
+    assert (folder / "used" / "report.html").exists()
+
+
+def test_beyond_the_snapshots_it_says_so_before_anything_is_solved(folder):
+    (folder / "beyond.toml").write_text(USED.format(upper=2000, more=""))
+    said = [one.text for one in load(folder / "beyond.toml").findings]
+    assert any("material.C1 goes from 800 to 2000" in text and "was trained from" in text for text in said)
+    within = folder / "within.toml"
+    within.write_text(USED.format(upper=1200, more=""))
+    assert not any("trained" in one.text for one in load(within).findings)
+
+
+def test_the_full_model_is_asked_above_a_tolerance(folder):
+    (folder / "asked.toml").write_text(USED.format(upper=1200, more="tolerance = 1e-12").replace("32", "8"))
+    assert main(["run", str(folder / "asked.toml"), "--out", str(folder / "asked"), "--quiet", "--no-report"]) == 0
+    assert json.loads((folder / "asked" / "summary.json").read_text())["work"]["factorisations"] > 0
+
+
+def test_a_number_that_was_kept_is_no_parameter(folder):
+    text = USED.format(upper=1200, more="").replace("loads.gravity.density", "material.D1")
+    text = text.replace("900, upper = 1100", "1e3, upper = 2e3")
+    (folder / "kept.toml").write_text(text)
+    with pytest.raises(StudyError, match="kept its value when the model was reduced"):
+        load(folder / "kept.toml")
+
+
+def test_another_file_under_the_same_name_is_refused(folder):
+    study = load(folder / "used.toml") if (folder / "used.toml").exists() else None
+    (folder / "used2.toml").write_text(USED.format(upper=1200, more=f'digest = "{"0" * 16}"'))
+    with pytest.raises(StudyError, match="has changed since the study was begun"):
+        load(folder / "used2.toml")
+    assert study is None or study.identity()["model"]["digest"] != "0" * 16
+
+
+def test_bodies_that_cannot_be_reduced_are_refused_in_one_line(tmp_path):
+    mixed = SAMPLED.replace('formulation = "displacement"', 'formulation = "mixed"').replace("degree = 1", "degree = 2")
+    (tmp_path / "mixed.toml").write_text(mixed)
+    with pytest.raises(StudyError, match="no mixed form yet"):
+        load(tmp_path / "mixed.toml", ["method={ kind = 'reduce' }"])
+
+
+@pytest.mark.mpi
+def test_on_ranks_and_after_a_kill_it_is_the_same_model(folder):
+    out = folder / "ranks"
+    made = launch.run(2, launch.TISSUQ, "reduce", folder / "body.toml", *SIZES, "--out", out, "--no-report")
+    assert made.returncode == 0, made.stderr
+    one, other = load_model(folder / "model.npz"), load_model(out / "reduced.npz")
+    assert (folder / "model.npz").read_bytes() == (out / "reduced.npz").read_bytes(), (one.about, other.about)
+
+
+def test_studies_without_it_import_nothing_of_it(tmp_path):
+    import subprocess
+    import sys
+
+    (tmp_path / "body.toml").write_text(SAMPLED)
+    script = (
+        "import sys; from workflows.__main__ import main\n"
+        f"main(['run', {str(tmp_path / 'body.toml')!r}, '--out', {str(tmp_path / 'out')!r}, '--quiet'])\n"
+        "print([name for name in sys.modules if 'reduc' in name and name.startswith(('forward', 'workflows'))])"
+    )
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert out.splitlines()[-1] == "[]"

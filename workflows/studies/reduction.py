@@ -1,0 +1,134 @@
+"""Studies that make a reduced model: snapshots of a body over its random parameters, and errors on unseen samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from forward.model import Finding
+from forward.registry import named
+from forward.scalars import Mistake
+from uq.inputs.random_parameters import Inputs
+from uq.methods.method import Method
+from workflows.config.priors import ranges
+from workflows.studies.predictions import duration, times_of
+from workflows.studies.sampling import Study
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.spec import ModelSpec
+    from uq.evaluation.checkpoint import Checkpoint
+    from uq.evaluation.ensemble import Ensemble
+    from uq.evaluation.evaluate import Evaluate
+    from workflows.studies.job import Job
+
+FILE = "reduced.npz"
+OTHER_METHOD = "method={ kind = 'reduce' }"  # an assignment that makes such a study of one that samples
+
+
+class Reduce(Method):
+    """Make a reduced model of a body.
+
+    Parameters
+    ----------
+    snapshots
+        Solves of which it is made. Half of them fill the distribution evenly; the others are, round by round, those of
+        many candidates at which the estimated error of any output is largest.
+    rounds
+        In how many rounds those are drawn.
+    modes
+        Number of modes; by default as many as `truncation` needs.
+    truncation
+        What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
+    cubature
+        What the points may miss of the forces of the snapshots, relative.
+    unseen
+        Further solves, at random samples, on which its errors are measured.
+    seed
+        Of all points.
+    """
+
+    kind: Literal["reduce"] = "reduce"
+    snapshots: Annotated[int, Field(ge=4)] = 96
+    rounds: Annotated[int, Field(ge=0)] = 3
+    modes: Annotated[int, Field(ge=1)] | None = None
+    truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
+    cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    unseen: Annotated[int, Field(ge=0)] = 32
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def planned(self, dimension: int) -> int:
+        """Snapshots, unseen samples, and the solve at the mean."""
+        return self.snapshots + self.unseen + 1
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Refuse: states are needed, which an evaluation does not return."""
+        message = "method.kind = 'reduce' is run by a study of its own"
+        raise ValueError(message)
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what of a model cannot be reduced."""
+        if spec.kind != "hyperelastic":
+            yield ("model", "kind"), "only a body can be reduced, expected 'hyperelastic'", spec.kind
+            return
+        for said in named("forward.reduced.limits:mistakes")(spec):
+            yield ("model",), said, spec.kind
+
+
+class ReductionStudy(Study):
+    """What is reduced, over which parameters, and how.
+
+    Parameters
+    ----------
+    model
+        A body.
+    parameters
+        Distributions by the paths of the numbers of the model that become parameters of the reduced one.
+    source, correlations, accuracy, parallel, report
+        As in studies that sample a model.
+    method
+        How it is reduced.
+    """
+
+    stopped: ClassVar[str] = "a reduced model"
+
+    method: Reduce
+
+    @property
+    def estimates(self) -> int:
+        """The mesh is that of the body; its error is not estimated here."""
+        return 0
+
+    def _of_estimates(self) -> Iterator[Finding]:
+        yield from ()
+
+    def plan(self, rank_groups: int) -> list[str]:
+        """Say what is reduced, from how many solves, and how long these take."""
+        method, times = self.method, times_of(self.spec)
+        modes = "as many modes as are needed" if method.modes is None else f"{method.modes} modes"
+        seconds = times.first + (self.planned - 1) * times.sample / rank_groups
+        return [
+            f"method      {method.kind}: {modes}",
+            *(f"{what:10}  {words}" for what, words in self.model.described(ranges(self.given))),
+            f"parameters  {', '.join(self.inputs.names)}",
+            f"outputs     {', '.join(output.name for output in self.spec.returned)}",
+            f"solves      {method.snapshots} snapshots, {method.unseen} unseen samples",
+            f"time        about {duration(seconds)} for the solves on {rank_groups} core{'s' * (rank_groups > 1)}",
+        ]
+
+    def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
+        """Make the body; collective."""
+        made: Job = named("workflows.studies.reduction_job:job")(self, ensemble, directory)
+        return made
+
+    def finished(self, dataset: xr.Dataset, evaluations: Any) -> xr.Dataset:
+        """Results are complete."""
+        return dataset
+
+    def summary(self, job: Job) -> dict[str, Any]:
+        """Return how large it is, its errors, and where it is."""
+        return {"reduced": job.told}  # type: ignore[attr-defined]

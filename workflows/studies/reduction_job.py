@@ -1,0 +1,228 @@
+"""The job of a study that makes a reduced model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import xarray as xr
+
+from forward.model import Finding, SolveError
+from forward.reduced.data import ReducedData, save
+from forward.reduced.model import ReducedModel
+from forward.reduced.reduction import Reduction, Sizes, Snapshots, adjoint_states, directions
+from uq.evaluation.evaluate import Evaluate, Recorder, Request
+from uq.findings import add
+from uq.inputs.sampling import random_points, sobol_points
+from uq.surrogates.linearisation import linearise
+from workflows.results.directory import label
+from workflows.studies.job import Job, MethodJob
+
+if TYPE_CHECKING:
+    from forward.fem.model import HyperelasticModel
+    from forward.model import FloatArray, ForwardModel, Solution
+    from uq.evaluation.ensemble import Ensemble
+    from uq.inputs.random_parameters import Inputs
+    from workflows.studies.reduction import Reduce, ReductionStudy
+
+CANDIDATES = 8  # for each snapshot that is drawn where errors are large
+UNSEEN = 10_000  # number of the first random point at which errors are measured
+EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
+TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be taken for the errors
+
+
+@dataclass(frozen=True)
+class KeptStates:
+    """Keep the state of each point and, where its parameters spread, adjoint states and changes of the state there."""
+
+    spread: FloatArray | None
+
+    def on(self, model: ForwardModel) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (1 + m + k, U_local)."""
+        spread, body = self.spread, cast("HyperelasticModel", model)
+        if spread is None:
+            return lambda solution, _: np.asarray(solution.state)[None]
+
+        def rows(solution: Solution, point: FloatArray) -> FloatArray:
+            tangents = solution.state_tangent(directions(spread, point))
+            return np.vstack([solution.state, adjoint_states(body, solution), tangents])
+
+        return rows
+
+    def total(self, points: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return nothing worth keeping: there is no sum."""
+        return np.zeros((1, 1))
+
+    def sketch(self, rows: FloatArray) -> FloatArray:
+        """Return all rows (n, 1 + m, U)."""
+        return rows
+
+
+@dataclass(frozen=True)
+class ReductionJob(MethodJob):
+    """A job that remembers what it has made."""
+
+    told: dict[str, Any] = field(default_factory=dict)
+
+
+def job(study: ReductionStudy, ensemble: Ensemble, directory: Path) -> Job:
+    """Make the body on every group; collective over the group."""
+    inputs = study.inputs
+    model = cast("HyperelasticModel", study.spec.build(ensemble.group, inputs.names))
+    recorders: dict[str, Recorder] = {}
+    told: dict[str, Any] = {}
+
+    def alone() -> HyperelasticModel:
+        from mpi4py import MPI
+
+        if ensemble.group.size == 1:
+            return model
+        return cast("HyperelasticModel", study.spec.build(MPI.COMM_SELF, inputs.names))
+
+    def task(evaluate: Evaluate) -> xr.Dataset:
+        recorders["/"] = Recorder(evaluate)
+        made = _Making(study.method, inputs, recorders["/"], alone(), ensemble.say)
+        data, found = made.run()
+        from workflows.studies.reduction import FILE
+
+        save(data, directory / FILE)
+        kept = {key: value for key, value in data.about.items() if key != "spread"}
+        told.update(kept | {"seconds": made.seconds, "file": FILE})
+        return found
+
+    units = {output.name: output.unit for output in study.spec.returned}
+    return ReductionJob(model, {}, task, recorders, lambda found: label(found, units, None, None, 0), told=told)
+
+
+class _Making:
+    """Snapshots, round by round, and what errors the model that they make has."""
+
+    def __init__(
+        self,
+        method: Reduce,
+        inputs: Inputs,
+        evaluate: Recorder,
+        model: HyperelasticModel,
+        say: Callable[[str], None],
+    ) -> None:
+        self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
+        self._start = linearise(inputs, evaluate).prediction
+        self._sizes = Sizes(method.modes, method.truncation, method.cubature)
+        self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
+
+    def run(self) -> tuple[ReducedData, xr.Dataset]:
+        """Return the reduced model, and its errors on unseen samples."""
+        method, inputs, d = self._method, self._inputs, len(self._inputs.names)
+        in_rounds = method.snapshots // 2 if method.rounds else 0
+        first = method.snapshots - in_rounds
+        snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
+        reduction = Reduction(self._model, inputs.mean, inputs.std)
+        seconds = 0.0
+        for number in range(method.rounds):
+            few = in_rounds // method.rounds + (number < in_rounds % method.rounds)
+            if few == 0:
+                continue
+            begin = time.process_time()
+            candidates = inputs.points(sobol_points(method.seed, 1 + number, 0, CANDIDATES * few, d))
+            worst = self._worst(reduction.reduced(snapshots, self._sizes), candidates, few)
+            seconds += time.process_time() - begin
+            snapshots = snapshots.with_others(self._solved(worst))
+        begin = time.process_time()
+        data = reduction.reduced(snapshots, self._sizes)
+        seconds += time.process_time() - begin
+        solving = float(sum(one.seconds.sum() for one in self._evaluate.log))
+        self.seconds = {"snapshots": solving, "reduction": seconds}
+        return data, self._measured(data)
+
+    def _solved(self, points: FloatArray) -> Snapshots:
+        """Solve at points (n, d); those without an answer are left out."""
+        found = self._evaluate(Request(points, fields=KeptStates(self._inputs.std), start=self._start))
+        rows, ok = found.sketches, found.ok
+        if rows is None or not ok.any():
+            reason = found.failures[0].reason if found.failures else "none was solved"
+            message = f"no snapshot has an answer: {reason}"
+            raise SolveError(message)
+        m, size = found.outputs.shape[1], rows.shape[2]
+        adjoints, tangents = rows[:, 1 : 1 + m].reshape(-1, size), rows[:, 1 + m :].reshape(-1, size)
+        return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
+
+    def _worst(self, data: ReducedData, candidates: FloatArray, few: int) -> FloatArray:
+        """Return the candidates (few, d) at which the estimated error of any output is largest."""
+        model = ReducedModel(data, data.parameters)
+        spread = np.array(data.about["spread"])
+        sizes = np.full(len(candidates), np.inf)  # where there is no reduced answer either
+        for i, point in enumerate(candidates):
+            try:
+                sizes[i] = np.nan_to_num(np.abs(model.reduced(point).estimate.outputs / spread).max(), nan=np.inf)
+            except SolveError:
+                continue
+        chosen = np.argsort(-sizes, kind="stable")[:few]
+        said = f"{len(data.snapshots)} snapshots, {data.about['modes']} modes, {data.about['points']} points"
+        finite = sizes[np.isfinite(sizes)]
+        if len(finite):
+            self._say(f"reduced: {said}; estimated errors up to {100 * finite.max():.2g} % of the spread of an output")
+        return candidates[np.sort(chosen)]
+
+    def _measured(self, data: ReducedData) -> xr.Dataset:
+        """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
+        method, inputs, names = self._method, self._inputs, list(self._model.outputs)
+        found = xr.Dataset(coords={"output": names, "parameter": list(inputs.names)})
+        found["mode_energy"] = ("mode", (data.coordinates[:, data.before :] ** 2).mean(axis=0))
+        if not method.unseen:
+            return found
+        first = UNSEEN
+        points = inputs.points(random_points((method.seed, 1), first, first + method.unseen, len(inputs.names)))
+        full = self._evaluate(Request(points, fields=KeptStates(None), start=self._start))
+        ok = full.ok
+        states = iter(np.zeros((0, 1)) if full.sketches is None else full.sketches[:, 0])
+        model = ReducedModel(data, data.parameters)
+        n, m = method.unseen, len(names)
+        errors, estimates, of_state = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
+        estimated_state = np.full(n, np.nan)
+        for i, point in enumerate(points):
+            state = next(states) if ok[i] else None
+            try:
+                solution = model.reduced(point)
+            except SolveError:
+                continue
+            if state is not None:
+                errors[i], estimates[i] = full.outputs[i] - solution.outputs, solution.estimate.outputs
+                of_state[i] = np.linalg.norm(state - solution.state) / np.linalg.norm(state)
+                estimated_state[i] = solution.estimate.state
+        good = np.isfinite(errors).all(axis=1) & np.isfinite(estimates).all(axis=1)
+        e, x, spread = errors[good], estimates[good], np.array(data.about["spread"])
+        told: dict[str, Any] = {"unseen": int(good.sum())}
+        if good.any():
+            rms, left = np.sqrt((e**2).mean(axis=0)), np.sqrt(((e - x) ** 2).mean(axis=0))
+            effectivity = (x * e).sum(axis=0) / np.maximum((e**2).sum(axis=0), 1e-300)
+            told |= {
+                "errors": dict(zip(names, (rms / spread).tolist(), strict=True)),
+                "errors after correction": dict(zip(names, (left / spread).tolist(), strict=True)),
+                "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),
+                "error of the state": float(np.sqrt((of_state[good] ** 2).mean())),
+            }
+            found["reduced_effectivity"] = ("output", effectivity)
+            self._warn(found, names, effectivity, rms / spread)
+        data.about.update(told)
+        found["reduced_error"] = (("sample", "output"), errors)
+        found["reduced_estimate"] = (("sample", "output"), estimates)
+        found["reduced_state_error"] = ("sample", of_state)
+        found["points"] = (("sample", "parameter"), points)
+        return found
+
+    @staticmethod
+    def _warn(found: xr.Dataset, names: list[str], effectivity: FloatArray, errors: FloatArray) -> None:
+        """Say which estimates cannot be taken for the errors."""
+        low, high = TRUSTED
+        rows = zip(names, effectivity, errors, strict=True)
+        off = [f"{name} {e:.2g}" for name, e, error in rows if not low <= e <= high and error > EXACT]
+        if off:
+            text = (
+                f"Estimated errors of the reduced model are not its errors: estimated over true, on unseen samples, "
+                f"{', '.join(off)}. Their sizes on these samples are what can be trusted."
+            )
+            add(found, Finding("warning", text))
