@@ -41,7 +41,16 @@ kind = "quasi-monte-carlo"
 samples = 32
 scrambles = 4
 """
-SIZES = ["--set", "method.snapshots=12", "--set", "method.unseen=6", "--set", "method.rounds=2", "--set", "method.modes=6"]
+SIZES = [
+    "--set",
+    "method.snapshots=12",
+    "--set",
+    "method.unseen=6",
+    "--set",
+    "method.rounds=2",
+    "--set",
+    "method.modes=6",
+]
 
 
 @pytest.fixture(scope="module")
