@@ -2,45 +2,93 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from forward.model import FloatArray, SolveError
+from uq.evaluation.evaluate import Evaluate, Evaluations, Prediction, Request
+from uq.inputs.random_parameters import Inputs
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from workflows.studies.sampling import Study
+    from forward.model import FloatArray, Solution
 
 
-def touched(study: Study, model: Any) -> dict[str, FloatArray]:
-    """Solve at the mean of the inputs; collective over the model's ranks.
+@dataclass(frozen=True)
+class Touched:
+    """What each tool touches as rows (tools, U): of a node the pressure (Pa), and 1 if it is a vertex that may touch.
 
-    Returns
-    -------
-    dict
-        Undeformed places (m) and pressures (Pa), (n, 4), of the vertices under each tool; empty where no tool touches
-        the body, or where there is no answer.
+    Attributes
+    ----------
+    tools
+        Labels of the tools.
     """
-    if not study.spec.touched:
-        return {}
-    try:
-        found: dict[str, FloatArray] = model.solve(study.inputs.mean).touched()
-    except SolveError:
-        return {}
-    return found
+
+    tools: tuple[str, ...]
+
+    def on(self, model: Any) -> Callable[[Solution, FloatArray], FloatArray]:
+        """Return the function (solution, parameters) → rows (tools, U_local), for one group's model."""
+        from scipy.spatial import cKDTree
+
+        nodes = cKDTree(model.space.coordinates)
+
+        def rows(solution: Any, _: FloatArray) -> FloatArray:
+            found = solution.touched()
+            whole = np.zeros((len(self.tools), model.equations.comm.allreduce(len(solution.state))))
+            for row, tool in zip(whole, self.tools, strict=True):
+                at = 3 * nodes.query(found[tool][:, :3])[1]
+                row[at], row[at + 1] = found[tool][:, 3], 1.0
+            return np.asarray(model.space.scatter(whole))
+
+        return rows
 
 
-def with_contact(dataset: xr.Dataset, found: dict[str, FloatArray]) -> xr.Dataset:
-    """Add the vertices under tools, with the pressures there."""
-    if not found:
+def with_contact(
+    dataset: xr.Dataset,
+    tools: tuple[str, ...],
+    places: FloatArray,
+    inputs: Inputs,
+    evaluate: Evaluate,
+    first: Evaluations | None,
+) -> xr.Dataset:
+    """Add the vertices under tools, with the pressures there, at the mean of the inputs.
+
+    Parameters
+    ----------
+    dataset
+        Results of a method.
+    tools
+        Their labels.
+    places
+        Coordinates (N, 3) of the nodes.
+    inputs
+        The inputs.
+    evaluate
+        The model.
+    first
+        What the method evaluated first: where that is the mean with its state, the map begins there.
+    """
+    found = evaluate(Request(inputs.mean[None], fields=Touched(tools), start=at_mean(inputs, first)))
+    if found.failures:
         return dataset
-    labels = np.repeat(list(found), [len(rows) for rows in found.values()])
-    rows = np.concatenate(list(found.values()))
-    order = np.lexsort((*rows[:, :3].T, labels))  # whatever the number of ranks
+    of_nodes = found.fields[:, : places.size].reshape(len(tools), -1, 3)
+    tool, node = np.nonzero(of_nodes[:, :, 1])
+    order = np.lexsort((*places[node].T, np.array(tools)[tool]))
+    tool, node = tool[order], node[order]
     vertex = ("contact_vertex",)
-    return dataset.assign_coords(contact_tool=(vertex, labels[order])).assign(
-        contact_position=((*vertex, "axis"), rows[order, :3], {"units": "m"}),
-        contact_pressure=(vertex, rows[order, 3], {"units": "Pa"}),
+    return dataset.assign_coords(contact_tool=(vertex, np.array(tools)[tool])).assign(
+        contact_position=((*vertex, "axis"), places[node], {"units": "m"}),
+        contact_pressure=(vertex, of_nodes[tool, node, 0], {"units": "Pa"}),
     )
+
+
+def at_mean(inputs: Inputs, first: Evaluations | None) -> Prediction | None:
+    """Return the state at the mean of the inputs, if that is what was evaluated first and its state is known."""
+    if first is None or not np.array_equal(first.points, inputs.mean[None]) or not first.ok.all():
+        return None
+    if first.tangents is None or first.fields.size == 0:
+        return None
+    return Prediction(inputs.mean, first.fields[0], first.fields[:0], inputs.coordinates, inputs.std)

@@ -21,7 +21,6 @@ from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
-from workflows.studies.contact import touched, with_contact
 from workflows.studies.findings_solves import measured
 from workflows.studies.job import Job, MethodJob
 from workflows.studies.stresses import stressed, with_stresses
@@ -48,6 +47,15 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
+        found = sampled(evaluate)
+        if not (study.spec.meshed and study.spec.touched):
+            return found
+        from workflows.studies.contact import with_contact
+
+        tools = tuple(load.label for load in model.spec.loads if load.contact)
+        return with_contact(found, tools, model.space.coordinates, inputs, evaluate, recorders["/"].first)
+
+    def sampled(evaluate: Evaluate) -> xr.Dataset:
         method = study.method.with_sources(lambda place: read_dataset(Path(place)))
         if study.accuracy.tolerance is not None:
             within: Callable[..., xr.Dataset] = named("workflows.studies.within:within")
@@ -77,7 +85,6 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
     factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
     of_body = ensemble.index == 0 and study.spec.meshed
     locking = measured(study, model) if of_body else []
-    pressed = touched(study, model) if of_body else {}
     tensors = stressed(study, model) if of_body else None
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
@@ -86,7 +93,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         add(found, *locking)
         if "step" in found.coords:
             once_for_steps(found)
-        found = with_contact(with_regions(found, model.spec.body.regions, regions), pressed)
+        found = with_regions(found, model.spec.body.regions, regions)
         return with_random_fields(with_stresses(found, tensors), factors, model.space.variance_kept)
 
     volumes = partial(node_volumes, model.space.coordinates, cells)

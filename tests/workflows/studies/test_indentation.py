@@ -1,12 +1,19 @@
 """Studies of a body that a tool touches."""
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
 import xarray as xr
+from mpi4py import MPI
 
+from forward.model import WORK
 from tests.launch import TISSUQ, assert_same_bits, run
+from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.surrogates.linearisation import linearise
+from workflows.config.study import parse
+from workflows.studies.contact import with_contact
 
 STUDY = """
 [model]
@@ -60,3 +67,24 @@ def test_any_number_of_ranks(tmp_path):
         scale = np.abs(one[name].values).max()
         np.testing.assert_allclose(shared[name], one[name], atol=1e-8 * scale, err_msg=name)
     assert list(json.loads((tmp_path / "one" / "summary.json").read_text())["outputs"])[-1] == "pressure.2"
+
+
+@pytest.mark.fem
+def test_the_map_of_pressures_begins_where_the_mean_was_solved():
+    """Another solve at the mean would cost as much as the first; without its state the map is the same."""
+    study = parse(tomllib.loads(STUDY))
+    model = study.spec.build(MPI.COMM_SELF, study.inputs.names)
+    method = Recorder(SerialEvaluate(model))
+    linearise(study.inputs, method)
+    cost, maps = [], []
+    for first in (method.first, None):
+        asked = Recorder(method)
+        places = model.space.coordinates
+        maps.append(with_contact(xr.Dataset(), ("indenter",), places, study.inputs, asked, first))
+        cost.append(dict(zip(WORK, asked.log[0].work[0].tolist(), strict=True)))
+    assert cost[0]["factorisations"] <= 2  # one for each step, of its reference
+    assert cost[1]["factorisations"] >= 6
+    for name in ("contact_position", "contact_pressure"):
+        np.testing.assert_allclose(maps[0][name], maps[1][name], rtol=1e-6)
+    alone = {rows.shape for rows in model.solve(study.inputs.mean).touched().values()}
+    assert alone == {(maps[0].sizes["contact_vertex"], 4)}
