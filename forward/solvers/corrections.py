@@ -24,7 +24,9 @@ def predict_correct(
     """Correct a prediction with a reference factor, in several steps if one is too long; or raise `Diverged`.
 
     With s the slope of the prediction, the state after a fraction t of the path is ū + t s + t² q(t). The first step
-    takes q = 0; each state found gives a value of q, and the last two values predict the next.
+    takes q = 0; each state found gives a value of q, and the last two values predict the next. Where a tool touches the
+    body, there is one step only: as points come into contact and leave it, corrections of several steps take longer
+    than Newton's method.
     """
     slope = start - way.state
     known: list[tuple[float, FloatArray]] = []
@@ -46,7 +48,7 @@ def predict_correct(
         if close:
             known.append((target, ((u - way.state) / target - slope) / target))
             reached, target = target, 1.0
-        elif target - reached > SHORTEST:
+        elif target - reached > SHORTEST and not system.contact:
             target = (reached + target) / 2
         else:
             way.at(1.0)

@@ -98,6 +98,8 @@ def solving(
             history.append(f"{stop}: the equilibrium is looked for after all")
             failed(stop)
     from_zero = start is None or (settings.kind == "newton" and iterations is None)
+    if way is not None and start is not None and not from_zero and system.contact:
+        start = _closer(system, start, way.state)
     guesses = [zero] if start is None or from_zero else [start, zero]
     if way is not None and len(guesses) == 2:
         system.at_load(1.0)
@@ -120,6 +122,13 @@ def solving(
             message = f"{error.reason}; the equilibrium that was found at full load is unstable"
             raise SolveError(message, error.history, error.work, refused) from None
         raise
+
+
+def _closer(system: System, start: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the prediction, or the state of the reference if its residual is smaller, as where a tool moves far."""
+    system.at_load(1.0)
+    predicted, there = (system.residual(system.on_target(u)).size for u in (start, other))
+    return other if there < predicted or not np.isfinite(predicted) else start
 
 
 def _iterate_few(

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from benchmarks.half_spaces import CONTACT, TOOLS, Mesh, compared, half_space, pressed, textbook
 from forward.conformance import check_derivatives
 from forward.hyperelastic import Hyperelastic
-from forward.model import SolveError
+from forward.model import Guess, ReferenceSolution, SolveError
 from forward.terms import tools
 from forward.terms.indenter import Indenter
 from tests.bodies import energy_density
@@ -222,6 +222,34 @@ def test_tools_are_made_stiffer_until_the_body_stays_out():
     assert stiff.tangent(step)[0] == pytest.approx((ends[0] - ends[1]) / 2, rel=1e-4)
     with pytest.raises(SolveError, match=r"the body enters the tool 'indenter' by 0\.\d+ of its depth, where 0.001"):
         model.solve(1e4 * np.array([C1, D1]))
+
+
+@pytest.mark.fem
+def test_predictions_are_worth_no_more_than_newtons_method_takes():
+    """A prediction that errs more than the state of the reference is not begun from, and no path to it is divided."""
+    names = ("loads.indenter.depth", "material.C1")
+    model = body(tool()).build(MPI.COMM_SELF, names)
+    mean = np.array([1e-3, C1])
+    at_mean = model.solve(mean)
+    reference = ReferenceSolution(mean, at_mean.state)
+    slopes = at_mean.state_tangent(np.eye(2))
+    model.solve(mean, Guess(at_mean.state, reference))
+    far = np.array([1.5e-3, C1])
+    found = [
+        model.solve(far, Guess(state, near))
+        for state, near in (
+            (at_mean.state + (far - mean) @ slopes, reference),
+            (at_mean.state - (far - mean) @ slopes, reference),
+            (at_mean.state, reference),
+            (at_mean.state, None),
+        )
+    ]
+    good, bad, still, newton = (solution.work for solution in found)
+    assert bad.factorisations == still.factorisations <= newton.factorisations
+    assert bad.back_substitutions == still.back_substitutions
+    np.testing.assert_array_equal(found[1].state, found[2].state)
+    np.testing.assert_allclose(found[0].outputs, found[3].outputs, rtol=1e-6, atol=1e-9)
+    assert good.back_substitutions <= newton.back_substitutions + 20  # one series of corrections in vain
 
 
 @pytest.mark.fem
