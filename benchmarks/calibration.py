@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks import calibration_forces
+from benchmarks import calibration_forces, calibration_palpation
 from benchmarks.beams import CONFIG
 from forward.fem.specimen import SpecimenModel
 from forward.specimen import Specimen
@@ -88,15 +88,23 @@ def problem(cells: int = CELLS, noise: float = NOISE) -> Posterior:
 
 
 def main(given: Sequence[str] = ()) -> None:
-    """Print how uniform the ranks are; with --forces, how many intervals hold the truth, from curves of force."""
+    """Print how uniform the ranks are; with --forces or --palpation, which intervals hold the truth, from forces."""
     parser = ArgumentParser(prog="calibration")
     parser.add_argument("--forces", action="store_true", help="curves of force over depth, with data of another mesh")
-    parser.add_argument("--specimens", type=int, default=SPECIMENS)
+    parser.add_argument(
+        "--palpation", action="store_true", help="lumps felt below a surface, with data of another mesh"
+    )
+    parser.add_argument("--specimens", type=int, default=None, help=f"default: {SPECIMENS}, 100 of palpation")
+    parser.add_argument(
+        "--inverted", type=int, default=3, help="of palpation: how many are inverted as the shipped one"
+    )
     options = parser.parse_args(given)
-    if options.forces:
-        calibration_forces.main(options.specimens)
+    if options.palpation:
+        calibration_palpation.main(options.specimens or 100, options.inverted)
+    elif options.forces:
+        calibration_forces.main(options.specimens or SPECIMENS)
     else:
-        inclusions(options.specimens)
+        inclusions(options.specimens or SPECIMENS)
 
 
 def inclusions(specimens: int = SPECIMENS, samples: int = SAMPLES) -> None:

@@ -55,6 +55,7 @@ DIRECTIONS = 4  # of a field, of which the data say most
 NOISES = (0.01, 0.03)  # of the root mean square of the displacements of each load case
 LMBDA, WIDTH = 4e4, 0.15
 FOLDER = Path("results")
+INVERT = Invert(starts=1)
 WORDS: dict[Treatment, str] = {"correct": "corrected", "report": "left as it is"}
 HEAD = (
     "noise",
@@ -146,10 +147,10 @@ def made(model: SpecimenModel, name: str, truths: FloatArray, factors: Sequence[
     file = FOLDER / f"meshes-{name}.npz"
     found: list[FloatArray] = []
     if file.exists():
-        kept = np.load(file)
-        same = min(len(kept["truths"]), len(truths))
-        if np.allclose(kept["truths"][:same], truths[:same]):
-            found = list(kept["data"][:same])
+        there = np.load(file)
+        same = min(len(there["truths"]), len(truths))
+        if np.allclose(there["truths"][:same], truths[:same]):
+            found = list(there["data"][:same])
     cube, states = Cube(OVERKILL, 1.0), dict[str, FloatArray]()
     FOLDER.mkdir(parents=True, exist_ok=True)
     for k in range(len(found), len(truths)):
@@ -183,22 +184,22 @@ def main(options: Sequence[str] = ()) -> None:
     case = Case(inputs, model, solved_on(extrapolated(model, inputs.mean).observing(model)))
     truths, clean = balls(model, inputs, max(given.truths, given.inverted), given.seed)
     if given.truths:
-        _expect(case, truths[: given.truths], clean[: given.truths])
+        expect(case, [known(case, truth) for truth in truths[: given.truths]], clean[: given.truths])
     if given.inverted:
-        _invert(case, truths[: given.inverted], clean[: given.inverted], f"inverted-{mesh}")
+        invert(case, truths[: given.inverted], clean[: given.inverted], f"inverted-{mesh}")
     if given.fields:
         spec = specimen(given.cells, given.degree, field=True)
         _invert_fields(spec, given.fields, given.seed, f"field-{mesh}")
 
 
-def _expect(case: Case, truths: FloatArray, clean: FloatArray) -> None:
-    known = [_known(case, truth) for truth in truths]
-    _row(HEAD, first=True)
-    for noise in NOISES:
+def expect(case: Case, at: Sequence[Known], clean: FloatArray, noises: Sequence[float] = NOISES) -> None:
+    """Print how often intervals are expected to hold truths, of what is known there and their data (n, m)."""
+    row(HEAD, first=True)
+    for noise in noises:
         for treatment, words in WORDS.items():
-            rows = [_expected(case, *both, noise, treatment) for both in zip(known, clean, strict=True)]
+            rows = [expected(case, *both, noise, treatment) for both in zip(at, clean, strict=True)]
             size, held, shift = (np.array([row[k] for row in rows]) for k in range(3))
-            _row(
+            row(
                 (
                     f"{100 * noise:g} %",
                     words,
@@ -210,15 +211,23 @@ def _expect(case: Case, truths: FloatArray, clean: FloatArray) -> None:
             )
 
 
-def _invert(case: Case, truths: FloatArray, clean: FloatArray, name: str) -> None:
-    _row(INVERTED, first=True)
-    for noise in NOISES:
+def invert(
+    case: Case,
+    truths: FloatArray,
+    clean: FloatArray,
+    name: str,
+    noises: Sequence[float] = NOISES,
+    method: Invert = INVERT,
+) -> None:
+    """Print how many intervals of inversions hold truths (n, d), given their data (n, m)."""
+    row(INVERTED, first=True)
+    for noise in noises:
         rows = [
-            _kept(f"{name}-{k}-{noise:g}", truth, partial(_inverted, case, truth, clean[k], noise, k))
+            kept(f"{name}-{k}-{noise:g}", truth, partial(inverted, case, truth, clean[k], noise, k, method))
             for k, truth in enumerate(truths)
         ]
         held, gaps, seconds, trust = (np.array([row[name] for row in rows]) for name in rows[0])
-        _row(
+        row(
             (
                 f"{100 * noise:g} %",
                 f"{held.sum()} of {held.size} ({', '.join(str(one) for one in held.sum(axis=0))})",
@@ -230,7 +239,7 @@ def _invert(case: Case, truths: FloatArray, clean: FloatArray, name: str) -> Non
         )
 
 
-def _kept(name: str, truth: FloatArray, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def kept(name: str, truth: FloatArray, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what was found of a truth, from its file if it is there."""
     file = FOLDER / f"meshes-{name}.json"
     if file.exists():
@@ -243,7 +252,8 @@ def _kept(name: str, truth: FloatArray, make: Callable[[], dict[str, Any]]) -> d
     return found
 
 
-def _row(cells: Sequence[str], *, first: bool = False) -> None:
+def row(cells: Sequence[str], *, first: bool = False) -> None:
+    """Print a row of a table; the first with the line below its head."""
     print(f"{chr(10) if first else ''}| {' | '.join(cells)} |", flush=True)
     if first:
         print(f"|{'---|' * len(cells)}", flush=True)
@@ -265,14 +275,16 @@ class Known(NamedTuple):
     error: ApproximationError
 
 
-def _known(case: Case, truth: FloatArray) -> Known:
+def known(case: Case, truth: FloatArray) -> Known:
     """Solve at a truth (d,), on the mesh and on finer ones."""
     solution = case.model.solve(truth)
     look, why = case.finer.look(truth)
     if look is None:
         raise SolveError(why)
     places = Places(3 * case.model.cases + case.model.axes, case.model.places)
-    x = np.array([_coordinate(prior, value) for prior, value in zip(PRIORS.values(), truth, strict=True)])
+    x = np.array(
+        [_coordinate(prior, value) for prior, value in zip(case.inputs.marginals.values(), truth, strict=True)]
+    )
     slopes = solution.tangent(np.eye(len(truth))).T @ case.inputs.from_normals(x[None])[1][0]
     outputs = np.array(solution.outputs)
     return Known(outputs, slopes, error_of(look, outputs, truth, places))
@@ -285,7 +297,7 @@ def _coordinate(prior: Distribution, value: float) -> float:
     return float(brentq(lambda x: prior.from_normal(np.array([x]))[0][0] - value, -8, 8))
 
 
-def _expected(
+def expected(
     case: Case, known: Known, clean: FloatArray, noise: float, treatment: Treatment
 ) -> tuple[float, FloatArray, FloatArray]:
     """Error over the noise (rms), shares (d,) of data of a truth whose intervals hold it, and shifts (d,) of these.
@@ -315,12 +327,14 @@ def _sigma(model: SpecimenModel, clean: FloatArray, noise: float) -> FloatArray:
     return noise * sizes[model.cases]
 
 
-def _inverted(case: Case, truth: FloatArray, clean: FloatArray, noise: float, seed: int) -> dict[str, Any]:
+def inverted(
+    case: Case, truth: FloatArray, clean: FloatArray, noise: float, seed: int, method: Invert
+) -> dict[str, Any]:
     """Invert one data set."""
     begin = time.process_time()
     inputs, model, finer = case
     data = _measured(model, clean, noise, seed)
-    found = invert_by_group(inputs, model, data, Invert(starts=1), None, finer=finer)
+    found = invert_by_group(inputs, model, data, method, None, finer=finer)
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),
@@ -365,16 +379,16 @@ def _invert_fields(spec: Specimen, count: int, seed: int, name: str) -> None:
     clean = made(model, f"fields-{spec.body.vertex_count}-{seed}", truths, factors, np.full(count, 1e4))
     finer = solved_on(extrapolated(model, np.zeros(len(root))).observing(model))
     vertices = Vertices(offset, prior.matern.mass)
-    _row(OF_FIELDS, first=True)
+    row(OF_FIELDS, first=True)
     for noise in NOISES:
         rows = []
         for k, truth in enumerate(truths):
             data = _measured(model, clean[k], noise, k)
             find = partial(_field_inverted, model, prior, data, vertices, finer, truth, root)
-            rows.append(_kept(f"{name}-{k}-{noise:g}", truth, find))
+            rows.append(kept(f"{name}-{k}-{noise:g}", truth, find))
         size, nodes, mean, modes, trust, seconds = (np.array([row[name] for row in rows]) for name in rows[0])
         within = [f"{100 * (np.abs(gaps) < WIDE).mean():.0f} %" for gaps in (nodes, modes)]
-        _row(
+        row(
             (
                 f"{100 * noise:g} %",
                 f"{np.sqrt((size**2).mean()):.2f}",

@@ -9,6 +9,7 @@ the errors of the data.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -113,27 +114,52 @@ def shared_expansion(
     if finer is None:
         return SharedExpansion(model, Finer(None, why) if why else None, error, len(points), 0)
     few = _points(inputs, max(samples // FEWER, LEAST_SHARED))
-    there = finer(Request(few, tangents=True))
+    there, missed = expanded_finer(inputs, finer, few, lambda point: (own.outputs(point), own.slopes(point)))
+    return SharedExpansion(model, there, np.hypot(error, missed), len(points), len(few))
+
+
+def expanded_finer(
+    inputs: Inputs, finer: Evaluate, points: FloatArray, own: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+) -> tuple[Finer, FloatArray]:
+    """Expand what finer meshes add to a model, from points (n, d); collective over the groups.
+
+    Parameters
+    ----------
+    inputs
+        The prior.
+    finer
+        The model on finer meshes (`forward.extrapolated`).
+    points
+        Where it is solved.
+    own
+        Outputs (m,) and derivatives (m, d) of the model itself at parameters (d,).
+
+    Returns
+    -------
+    Finer
+        What finer meshes say anywhere: the model, and the expansion of the difference.
+    FloatArray
+        Root mean square (m,) of the errors of that expansion at samples that are left out.
+    """
+    there = finer(Request(points, tangents=True))
     assert there.tangents is not None
     good = there.ok
-    gap = there.outputs[good].copy()
-    slopes = there.tangents[good].copy()
-    m = len(evaluate.outputs)
-    for k, point in enumerate(few[good]):
-        gap[k, :m] -= own.outputs(point)
-        slopes[k, :m] -= own.slopes(point)
-    more, missed = _fitted(inputs, few[good], gap, slopes)
+    gap, slopes = there.outputs[good].copy(), there.tangents[good].copy()
+    for k, point in enumerate(points[good]):
+        outputs, tangents = own(point)
+        m = len(outputs)
+        gap[k, :m] -= outputs
+        slopes[k, :m] -= tangents
+    more, missed = _fitted(inputs, points[good], gap, slopes)
 
     def solve(point: FloatArray, tangents: bool) -> Solved:
-        outputs = more.outputs(point)
-        outputs[:m] += own.outputs(point)
-        if not tangents:
-            return outputs, None
-        derivatives = more.slopes(point)
-        derivatives[:m] += own.slopes(point)
-        return outputs, derivatives
+        outputs, derivatives = more.outputs(point), more.slopes(point)
+        here, of_here = own(point)
+        outputs[: len(here)] += here
+        derivatives[: len(here)] += of_here
+        return outputs, derivatives if tangents else None
 
-    return SharedExpansion(model, Finer(solve), np.hypot(error, missed[:m]), len(points), len(few))
+    return Finer(solve), missed[:m]
 
 
 def _points(inputs: Inputs, count: int) -> FloatArray:
