@@ -162,11 +162,15 @@ class Guess:
     iterations
         Maximum number of iterations: the solution is then the state reached, and its `residual` says how far it is from
         equilibrium. If that state is not admissible, the model is solved after all. None: iterate to the tolerance.
+    derivatives
+        Whether all derivatives of the solution will be asked for: a model that goes on to another state meanwhile may
+        find them before.
     """
 
     state: FloatArray | None = None
     reference: ReferenceSolution | None = None
     iterations: int | None = None
+    derivatives: bool = False
 
 
 @dataclass(frozen=True, eq=False)

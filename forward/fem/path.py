@@ -23,6 +23,8 @@ from forward.model import (
 )
 from forward.path import Path
 
+FEW = 16  # parameters up to which derivatives of the states of all steps are kept
+
 
 class PathModel(OneByOne):
     """A body along a path as a `ForwardModel`.
@@ -57,10 +59,15 @@ class PathModel(OneByOne):
             With the step at which the path stops, and the outputs before.
         """
         solutions: list[FiniteElementSolution] = []
+        slopes: list[FloatArray] = []
+        directions = self.along(np.eye(len(self.parameters)))
+        soon = guess is not None and guess.derivatives and len(directions) <= FEW
         for k, (model, given) in enumerate(zip(self.steps, self._guesses(guess or Guess()), strict=True)):
             known = given if given.state is not None else Guess(self._continued(solutions), iterations=given.iterations)
             try:
                 solutions.append(model.solve(np.append(parameters, self.values[k]), known))
+                if soon:  # while its factor is at hand: the next step needs the room
+                    slopes.append(solutions[-1].state_tangent(directions))
             except SolveError as error:
                 reached = np.full(len(self.outputs), np.nan)
                 for i, solution in enumerate(solutions):
@@ -69,7 +76,7 @@ class PathModel(OneByOne):
                 message = f"step {k + 1} of {len(self.steps)} ({where}): {error.reason}"
                 work = Work.sum_of([*(one.work for one in solutions), error.work])
                 raise type(error)(message, error.history, work, error.stability, reached) from error
-        return PathSolution(self, parameters, tuple(solutions))
+        return PathSolution(self, parameters, tuple(solutions), tuple(slopes))
 
     def _continued(self, solutions: Sequence[FiniteElementSolution]) -> FloatArray | None:
         """Predict the state (U_local,) of the next step from the last two."""
@@ -145,10 +152,24 @@ class PathSpace:
 
 
 class PathSolution:
-    """The equilibria of all steps with their linearisations."""
+    """The equilibria of all steps with their linearisations.
 
-    def __init__(self, model: PathModel, parameters: FloatArray, steps: tuple[FiniteElementSolution, ...]) -> None:
-        self._model, self.steps = model, steps
+    Parameters
+    ----------
+    model, parameters, steps
+        Where it was found, and what.
+    slopes
+        Derivatives (d, U_local) of the states by all parameters, where they were found with these; empty otherwise.
+    """
+
+    def __init__(
+        self,
+        model: PathModel,
+        parameters: FloatArray,
+        steps: tuple[FiniteElementSolution, ...],
+        slopes: tuple[FloatArray, ...] = (),
+    ) -> None:
+        self._model, self.steps, self._slopes = model, steps, slopes
         self.parameters = np.array(parameters, dtype=float)
         self.state = joined([step.state for step in steps])
         self.outputs = np.concatenate([step.outputs for step in steps])
@@ -177,13 +198,19 @@ class PathSolution:
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the states (U_local,) along a `direction` (d,), or (k, U_local); collective."""
-        along = self._model.along(direction)
-        return joined([step.state_tangent(along) for step in self.steps])
+        return joined(self._state_tangents(direction))
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them; collective."""
+        along, states = self._model.along(direction), self._state_tangents(direction)
+        return np.concatenate([step.along(du, along) for step, du in zip(self.steps, states, strict=True)], axis=-1)
+
+    def _state_tangents(self, direction: FloatArray) -> list[FloatArray]:
+        """Those of each step."""
+        if self._slopes:
+            return [direction @ slopes for slopes in self._slopes]
         along = self._model.along(direction)
-        return np.concatenate([step.tangent(along) for step in self.steps], axis=-1)
+        return [step.state_tangent(along) for step in self.steps]
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective.

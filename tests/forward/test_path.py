@@ -124,6 +124,21 @@ def test_a_predicted_path_is_corrected_with_a_factor_for_each_step():
 
 
 @pytest.mark.fem
+def test_derivatives_that_will_be_asked_for_are_found_while_the_factor_of_their_step_is_there():
+    spec = path()
+    model = spec.build(MPI.COMM_SELF, RANDOM)
+    late, soon = (model.solve(at(spec), Guess(derivatives=known)) for known in (False, True))
+    for found in (late, soon):
+        found.tangent(np.eye(3)), found.state_tangent(np.eye(3)[0])
+    np.testing.assert_array_equal(soon.outputs, late.outputs)
+    np.testing.assert_allclose(soon.tangent(np.eye(3)), late.tangent(np.eye(3)), rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(
+        soon.state_tangent(np.eye(3)[1]), late.state_tangent(np.eye(3)[1]), rtol=1e-9, atol=1e-15
+    )
+    assert soon.work.factorisations <= late.work.factorisations - (model.spec.count - 1)
+
+
+@pytest.mark.fem
 def test_a_path_that_stops_keeps_the_steps_before():
     spec = path(steps={"loads.traction.size": (5e2, 1e3, -1e9)})
     model = spec.build(MPI.COMM_SELF, RANDOM)

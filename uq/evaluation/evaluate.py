@@ -441,13 +441,14 @@ class BlockSolver:
         self._joint = request.joint.on(model) if request.joint is not None else None
         self._together = 1 if request.joint is None else request.joint.size
         self._guess = None if request.start is None else request.start.on(model)
-        self._plain = Guess(iterations=request.iterations)
+        self._plain = Guess(iterations=request.iterations, derivatives=request.tangents)
 
     def _guessed(self, point: FloatArray) -> Guess:
         """What is known about the solution at a point (d,)."""
         if self._guess is None:
             return self._plain
-        return replace(self._guess(point), iterations=self._plain.iterations)
+        plain = self._plain
+        return replace(self._guess(point), iterations=plain.iterations, derivatives=plain.derivatives)
 
     def _keep(self, rows: list[FloatArray], row: FloatArray) -> None:
         """Add a row (k, U_local) to the sum, or to the rows of a compact one."""
