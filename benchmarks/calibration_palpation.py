@@ -111,7 +111,7 @@ def _made(inputs: Inputs, truths: FloatArray, count: int) -> Made:
     model: Any = load(OTHER).specimen.build(MPI.COMM_SELF, inputs.names)  # type: ignore[attr-defined]
     guess: Guess | None = None
     FOLDER.mkdir(parents=True, exist_ok=True)
-    while (good := np.isfinite(np.reshape(found, (len(found), -1))).all(axis=1)).sum() < count:
+    while (good := np.isfinite(np.reshape(found, (len(found), len(model.outputs)))).all(axis=1)).sum() < count:
         assert len(found) < len(truths), "too few truths have an answer"
         guess = guess or Guess(model.solve(inputs.mean).state)
         try:
