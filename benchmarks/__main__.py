@@ -25,6 +25,7 @@ from benchmarks import (
     locking,
     mesh_error,
     meshes,
+    multifidelity,
     oddities,
     others,
     phases,
@@ -71,6 +72,7 @@ ALL = {
     "skewed": skewed.main,
     "coverage": coverage.main,
     "meshes": meshes.main,
+    "multifidelity": multifidelity.main,
     "oddities": oddities.main,
     "held_out": held_out.main,
     "others": others.main,
@@ -89,6 +91,7 @@ WITH_OPTIONS = {
     "tails": tails.main,
     "coverage": coverage.main,
     "meshes": meshes.main,
+    "multifidelity": multifidelity.main,
     "oddities": oddities.main,
     "tolerance": tolerance.main,
 }

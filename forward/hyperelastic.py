@@ -379,6 +379,21 @@ class Hyperelastic(ModelSpec):
             return self.refined(math.ceil(math.log2(times) - 1e-9))
         return self.model_copy(update={"body": self.body.with_cells(times, self.plane)})
 
+    def coarser(self, times: float, degree: Literal[1, 2] | None = None) -> Self:
+        """Return the same problem with longer cells, perhaps linear ones, which have displacements only.
+
+        Raises
+        ------
+        ModelError
+            If a mesh from a file was not divided as often, or coefficients of fields are those of its vertices.
+        """
+        objection = adaptive.of_fields(self)
+        if objection is not None:
+            raise ModelError(objection)
+        body = self.body.coarser(times, degree)
+        changed = {"formulation": "displacement"} if body.degree == 1 else {}
+        return self.model_copy(update={"body": body, "adapt": None, **changed})
+
     @property
     def solver_tolerance(self) -> float:
         """Residual that solutions may have, relative to the loads."""

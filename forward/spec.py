@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from forward.model import ModelError
 from forward.registry import Kinds
@@ -196,6 +196,17 @@ class ModelSpec(Settings):
 
     def finer(self, times: float) -> Self:
         """Return the same model with so many times the cells along each edge of its body, or a few more.
+
+        Raises
+        ------
+        ModelError
+            If there is no such mesh, with the reason.
+        """
+        message = f"a model of kind '{self.kind}' has no meshes"
+        raise ModelError(message)
+
+    def coarser(self, times: float, degree: Literal[1, 2] | None = None) -> Self:
+        """Return the same model with cells that are so many times as long, perhaps with elements of another degree.
 
         Raises
         ------

@@ -95,6 +95,18 @@ pilot = 8             # samples on every mesh before the numbers are chosen
 control = "tangent"   # or "none"
 seed = 1
 """,
+    "multifidelity": """\
+kind = "multifidelity"
+samples = 64          # what may be spent, in solves of the model above; or tolerance = 1e-3, or budget_seconds = 600
+# One to six cheap models, with the same parameters and outputs; `cost`: a solve, over one of the model above.
+cheap = [
+    { kind = "mesh", coarser = 2 },           # cells twice as long; degree = 1: linear ones
+    { kind = "iterations", iterations = 2 },  # the model above, stopped early
+    # { kind = "model", name = "beam theory", cost = 1e-4, model = { kind = "python", function = "my_beam.sag", ... } },
+]
+control = "auto"      # their tangents are taken off first, and an expansion takes their place where it is better
+seed = 1
+""",
     "chaos": """\
 kind = "chaos"
 samples = 15          # or tolerance = 1e-3 (leave-one-out error / std), or budget_seconds = 600: whichever comes first

@@ -136,6 +136,11 @@ class _SixSided(Settings):
         )
         return self.model_validate(self.model_dump() | {"cells": cells})
 
+    def coarser(self, times: float, degree: Literal[1, 2] | None) -> Self:
+        """Return the same body with cells that are so many times as long, or less, perhaps of another degree."""
+        elements = {} if degree is None else {"degree": degree, "quadrature_degree": None}
+        return self.model_validate(self.with_cells(1 / times).model_dump() | elements)
+
     @abstractmethod
     def contains(self, point: Vector) -> bool:
         """Whether a point (m) lies in the undeformed body."""

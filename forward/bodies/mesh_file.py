@@ -8,6 +8,7 @@ without the file; a hash tells whether it is the same file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -242,6 +243,26 @@ class MeshFile(Settings):
         degree = self.degree + 1  # beyond what a study may ask for
         quadrature = max(self.quadrature, default_quadrature(self.cell, degree))
         return self.model_copy(update={"degree": degree, "quadrature_degree": quadrature})
+
+    def coarser(self, times: float, degree: Literal[1, 2] | None) -> Self:
+        """Return the same body divided less often, for cells that are so many times as long, perhaps of another degree.
+
+        Raises
+        ------
+        ModelError
+            If it was not divided as often.
+        """
+        fewer = math.log2(times)
+        if self.divide is not None and fewer:
+            fewer -= 1
+        if fewer != round(fewer) or fewer > self.levels:
+            divided = self.levels + (self.divide is not None)
+            message = f"cells {times:g} times as long: its mesh was divided {divided} times; expected 1, 2, 4 …"
+            raise ModelError(message)
+        kept = {"levels": self.levels - round(fewer), "divide": None if times > 1 else self.divide}
+        elements = {} if degree is None else {"degree": degree, "quadrature_degree": None}
+        contents = {"contents": self.contents} if times == 1 else {}
+        return self.model_validate(self.model_dump(exclude={"contents"}) | kept | elements | contents)
 
     def refined(self, level: int) -> Self:
         """Return the same body with every cell divided into eight `level` times, when it is meshed.

@@ -530,7 +530,7 @@ def half_width(dataset: xr.Dataset) -> float:
     return Z if "scramble" not in dataset else student(int(dataset["scramble"].max()))
 
 
-def student(freedom: int) -> float:
+def student(freedom: float) -> float:
     """Return the standard errors on either side of a 95 % interval with these degrees of freedom."""
     from scipy.special import stdtrit
 

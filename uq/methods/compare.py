@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from forward.spec import ModelSpec, Times
 
 COMPARED = Kinds("method", SAMPLING, Amount)  # methods that estimate moments from samples
-REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **SAMPLING}, Method)
+# A reference is solved on a model of its own, which has no cheap ones beside it.
+_ALONE = {kind: where for kind, where in SAMPLING.items() if kind != "multifidelity"}
+REFERENCES = Kinds("method", {"given": "uq.methods.compare:Given", **_ALONE}, Method)
 ESTIMATED = ("mean", "std")
 TIMES = ("cpu_seconds", "own_seconds", "plain_seconds", "textbook_seconds")  # results that a restart does not reproduce
 RESOLVED = 2.0  # an error counts as measured if it is this many times the reference's own
@@ -253,14 +255,26 @@ class Compare(Method):
         return next(filter(None, (method.objection(inputs) for method in methods)), None)
 
     def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
-        """Return the model of the reference, that of the textbook and, if requested, one on a finer mesh."""
+        """Return the model of the reference, that of the textbook, those of the methods and one on a finer mesh."""
         found = {TIGHT: spec.tighter(TIGHTER), TEXTBOOK: spec.textbook()}
+        for entry in self.methods:
+            found |= entry.sampling.models(spec)
         return found | ({REFINED: spec.refined(1)} if self.mesh_error else {})
 
     def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
         """Find that there is no mesh to refine."""
         if self.mesh_error and not spec.meshed:
             yield ("method", "mesh_error"), f"a model of kind '{spec.kind}' has no mesh, expected false", True
+        named: dict[str, tuple[str, ModelSpec]] = {}
+        for i, entry in enumerate(self.methods):
+            wrong = list(entry.sampling.unfit(spec))
+            for (_, *place), message, given in wrong:
+                yield ("method", "methods", i, *place), message, given
+            for name, model in {} if wrong else entry.sampling.models(spec).items():
+                label, other = named.setdefault(name, (entry.label, model))
+                if other != model or name in (TIGHT, TEXTBOOK, REFINED):
+                    message = f"'{label}' has another model called '{name}', expected different names"
+                    yield ("method", "methods", i, "cheap"), message, name
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
         """Find what in the methods and the reference does not fit the parameters and the outputs."""

@@ -138,6 +138,7 @@ SAMPLING = {
     "quasi-monte-carlo": "uq.methods.quasi_monte_carlo:QuasiMonteCarlo",
     "chaos": "uq.methods.chaos:Chaos",
     "multilevel-chaos": "uq.methods.multilevel_chaos:MultilevelChaos",
+    "multifidelity": "uq.methods.multifidelity:Multifidelity",
 }
 METHODS = Kinds(
     "method",

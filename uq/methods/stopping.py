@@ -56,7 +56,7 @@ class Amount(Method):
         """Whether a tolerance was requested and an error `reached` meets it."""
         return self.tolerance is not None and reached <= self.tolerance
 
-    def affordable(self, solves: int, seconds: float) -> float:
+    def affordable(self, solves: float, seconds: float) -> float:
         """Return the number of solves that the budget still allows, if they take as long as those `solves` did."""
         if self.budget_seconds is None or seconds == 0:
             return np.inf

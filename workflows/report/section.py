@@ -164,6 +164,7 @@ SECTIONS = Kinds(
         "quantiles": f"{_HERE}.quantiles:Quantiles",
         "nominal": f"{_HERE}.nominal:Nominal",
         "meshes": f"{_HERE}.meshes:Meshes",
+        "fidelities": f"{_HERE}.fidelities:Fidelities",
         "expansion": f"{_HERE}.expansion:Expansion",
         "levels": f"{_HERE}.levels:Levels",
         "adapted-mesh": f"{_HERE}.adapted_mesh:AdaptedMesh",

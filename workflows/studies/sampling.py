@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -225,8 +226,13 @@ class Study(Sourced, StudyKind):
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Modules that a user has written for the model."""
-        return self.model.modules
+        """Modules that a user has written for the model, and for others that the method asks."""
+        return tuple(dict.fromkeys([*self.model.modules, *(one for other in self._others() for one in other.modules)]))
+
+    def _others(self) -> Iterator[ModelSpec]:
+        """Models beside that of the study; none where they cannot be."""
+        with suppress(ModelError, ValidationError):
+            yield from self.models.values()
 
     def plan(self, rank_groups: int) -> list[str]:
         """Say what is sampled, how often, and how long that will take."""
@@ -274,12 +280,16 @@ class Study(Sourced, StudyKind):
         found: dict[str, Any] = named("workflows.studies.sampling_job:of_estimates")(self, job)
         if len(self.meshes) > 1:
             found["meshes"] = named("workflows.studies.sampling_job:of_meshes")(self, job)
+        if self.method.kind == "multifidelity":
+            found["fidelities"] = named("workflows.studies.sampling_job:of_fidelities")(self, job)
         told = named("workflows.studies.adapted_mesh:history")(self) if self.model.adaptive else None
         return found if told is None else found | {"adapted": told}
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
-        return super().identity() | {"model": self.model.identity()} | self._source_identity
+        others = {name: other.identity() for name, other in self.models.items()}
+        beside = {"models": others} if others else {}
+        return super().identity() | {"model": self.model.identity()} | beside | self._source_identity
 
     @property
     def _source_identity(self) -> dict[str, Any]:

@@ -217,6 +217,19 @@ def of_estimates(study: Study, job: Job) -> dict[str, Any]:
     return told
 
 
+def of_fidelities(study: Study, job: Job) -> list[dict[str, Any]]:
+    """What was solved of the model and of each cheap one, and its cost; solves stopped early are the model's."""
+    assert isinstance(job, MethodJob)
+    recorder = job.recorders["/"]
+    found = []
+    for name in (OWN, *study.models):
+        parts = [part for part, model in zip(recorder.log, recorder.models, strict=True) if model == name]
+        seconds = float(sum(part.seconds.sum() for part in parts)) * study.parallel.ranks_per_model
+        solves = sum(len(part.points) for part in parts)
+        found.append({"name": name or "model", "solves": solves, "cpu_seconds": seconds})
+    return found
+
+
 def of_meshes(study: Study, job: Job) -> list[dict[str, Any]]:
     """What was solved on each mesh, and its cost."""
     assert isinstance(job, MethodJob)

@@ -71,7 +71,8 @@ def parts(study: Study) -> list[Part]:
     Samples are the maximum number; those that multilevel methods add after their pilots are unknown.
     """
     method, dimension = study.method, len(study.inputs.names)
-    costs = {OWN: times_of(study.spec)} | {name: times_of(model) for name, model in study.models.items()}
+    known = ((name, model.cost()) for name, model in study.models.items())
+    costs = {OWN: times_of(study.spec)} | {name: cost for name, cost in known if cost is not None}
     found = [times_of(mesh) for mesh in study.meshes]
     samples = study.planned - len(found)
     seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))

@@ -43,6 +43,7 @@ def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
         "sensitivity-monte-carlo",
         "quasi-monte-carlo",
         "multilevel-monte-carlo",
+        "multifidelity",
         "local-sensitivity",
         "chaos",
         "multilevel-chaos",

@@ -1,0 +1,257 @@
+"""Mean and standard deviation of one model from groups of samples of several, with weights that others determine.
+
+Each model k may have a control T_k of expectation zero and known variance V_k, its tangent. With the deviation w_k from
+a fixed value, the samples of both moments are the remainders of regressions
+
+    r_k = w_k − β_k T_k,   r'_k = w_k² − γ_k T_k − δ_k (T_k² − V_k)
+
+and their means follow from the groups by `uq.estimators.blue`. The coefficients and the covariances that determine the
+weights come from the samples of all models together. Weights of a sample among these come from the others: they are cut
+into `FOLDS` parts, each weighted by what the rest tells, so that the estimate has no bias from fitted weights, and the
+scatter of what is averaged is an honest error. What few degrees of freedom leave open lengthens it by Student's factor
+(B. L. Welch, Biometrika 34 (1947) 28–35).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from uq.estimators.blue import Group, Problem, informations, weights
+from uq.estimators.moments import Estimates, Term, Z, combine, ratio, student, term
+
+FOLDS = 10  # parts into which the samples of all models are cut
+FREE = 3  # degrees of freedom counted at least
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a group that have answers of all its models.
+
+    Attributes
+    ----------
+    group
+        Its models.
+    deviations
+        w_k (n, K, m); zero for models outside the group.
+    controls
+        T_k (n, K, m).
+    """
+
+    group: Group
+    deviations: FloatArray
+    controls: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number n of the samples."""
+        return len(self.deviations)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Regressions on the controls for one output, and the covariances of what they leave.
+
+    Attributes
+    ----------
+    slopes
+        β, and γ and δ (K, 3).
+    covariances
+        Of the remainders r, and of the influences r' − 2⟨r⟩r on the variance (2, K, K).
+    means
+        ⟨r⟩ (K,).
+    """
+
+    slopes: FloatArray
+    covariances: FloatArray
+    means: FloatArray
+
+    @classmethod
+    def of(cls, w: FloatArray, T: FloatArray, V: FloatArray) -> Fitted:
+        """Fit deviations w and controls T (n, K) of all models, with the variances V (K,) of the controls."""
+        n, K = w.shape
+        slopes, parts = np.zeros((K, 3)), np.empty((2, n, K))
+        for k in range(K):
+            slopes[k, 0] = _slopes(w[:, k], T[:, k, None])[0]
+            slopes[k, 1:] = _slopes(w[:, k] ** 2, np.column_stack([T[:, k], T[:, k] ** 2 - V[k]]))
+        first, second = remainders(w, T, V, slopes)
+        means = first.mean(axis=0)
+        parts = np.array([first, second - 2 * means * first])
+        used = (slopes != 0).sum(axis=1).max()
+        parts = parts - parts.mean(axis=1, keepdims=True)
+        return cls(slopes, np.einsum("ank,anl->akl", parts, parts) / max(n - 1 - used / 2, 1), means)
+
+
+def _slopes(y: FloatArray, x: FloatArray) -> FloatArray:
+    """Slopes (q,) of the regression of y (n,) on x (n, q) and a constant; zero where chance explains as much."""
+    n, q = x.shape
+    centred, target = x - x.mean(axis=0), y - y.mean()
+    scale = np.sqrt((centred**2).sum(axis=0))
+    found = np.linalg.lstsq(centred / np.where(scale > 0, scale, 1.0), target, rcond=1e-10)[0]
+    found = np.where(scale > 0, found / np.where(scale > 0, scale, 1.0), 0.0)
+    left = ((target - centred @ found) ** 2).sum()
+    helps = left * (n - 1) < (target**2).sum() * max(n - 1 - q, 0)
+    return np.asarray(found if helps else np.zeros(q))
+
+
+def remainders(w: FloatArray, T: FloatArray, V: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return r and r' (n, K) of deviations w and controls T (n, K), with V (K,) and the slopes (K, 3)."""
+    beta, gamma, delta = slopes.T
+    return w - beta * T, w**2 - gamma * T - delta * (T**2 - V)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Estimates of all outputs from all groups.
+
+    Attributes
+    ----------
+    estimates
+        Of mean and standard deviation, by output; errors with Student's factor.
+    terms
+        The part of each group in both moments.
+    moved
+        By how much each sample (n, m) of each group moves the variance.
+    fitted
+        What all samples of all models tell, by output.
+    relative
+        Relative variances (2, m) of the squared errors of mean and variance, as estimates of these.
+    """
+
+    estimates: Estimates
+    terms: tuple[Term, ...]
+    moved: tuple[FloatArray, ...]
+    fitted: tuple[Fitted, ...]
+    relative: FloatArray
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariances (m, K, K) of the remainders, by output."""
+        return np.array([one.covariances[0] for one in self.fitted])
+
+    def problem(self, groups: Sequence[Group], costs: FloatArray, taken: FloatArray, sizes: FloatArray) -> Problem:
+        """Return how to choose numbers of samples for means, whose errors count relative to sizes (m,)."""
+        some = [(one, size) for one, size in zip(self.fitted, sizes, strict=True) if one.covariances[0, 0, 0] > 0]
+        told = [informations(groups, one.covariances[0] / size**2) for one, size in some]
+        return Problem(np.array(told), costs, taken)
+
+
+def estimated(
+    samples: Sequence[Samples], offset: FloatArray, variances: FloatArray, apart: Samples | None = None
+) -> Found:
+    """Estimate the moments of model 0 from groups with at least two samples each.
+
+    Parameters
+    ----------
+    samples
+        Of each group.
+    offset
+        What the deviations of model 0 are from (m,).
+    variances
+        V_k (K, m).
+    apart
+        Samples of all models that tell the weights, and nothing else; by default the first group does.
+    """
+    whole = apart or samples[0]
+    groups, counts = [one.group for one in samples], np.array([float(one.count) for one in samples])
+    n, m = whole.count, offset.size
+    fold = np.arange(n) % min(FOLDS, n) if apart is None else np.zeros(n, dtype=int)
+    shares = np.bincount(fold) / n
+    first, second = ([np.zeros((one.count, m)) for one in samples] for _ in range(2))
+    fitted = []
+    for j in range(m):
+        V = variances[:, j]
+        middle = _middle(samples, j)
+        for f, share in enumerate(shares):
+            kept = fold != f if apart is None else fold == f
+            fit = Fitted.of(whole.deviations[kept, :, j], whole.controls[kept, :, j], V)
+            a = [weights(informations(groups, c), counts) for c in fit.covariances]
+            for g, one in enumerate(samples):
+                inner = g == 0 and apart is None
+                rows = fold == f if inner else slice(None)
+                w, T = one.deviations[rows, :, j], one.controls[rows, :, j]
+                portion = 1.0 if inner else share
+                for sums, r, by, centre in zip(
+                    (first, second), remainders(w, T, V, fit.slopes), a, middle, strict=True
+                ):
+                    sums[g][rows, j] += portion * ((r - centre) @ by[g] + (centre[0] if g == 0 else 0.0))
+        fitted.append(Fitted.of(whole.deviations[:, :, j], whole.controls[:, :, j], V))
+    terms = tuple(term(a, b) for a, b in zip(first, second, strict=True))
+    found = combine(offset, terms)
+    mean = np.sum([one.first for one in terms], axis=0)
+    moved = tuple(b - 2 * mean * a for a, b in zip(first, second, strict=True))
+    moved = tuple(one - one.mean(axis=0) for one in moved)
+    factors, relative = zip(*(_uncertainty(parts) for parts in (first, moved)), strict=True)
+    estimates = replace(found, mean_error=found.mean_error * factors[0], std_error=found.std_error * factors[1])
+    return Found(estimates, terms, moved, tuple(fitted), np.array(relative))
+
+
+def _middle(samples: Sequence[Samples], j: int) -> tuple[FloatArray, FloatArray]:
+    """About where the deviations of output j and their squares are (K,): from there weights vary with little effect."""
+    count = samples[0].deviations.shape[1]
+    found = np.zeros((2, count))
+    for k in range(count):
+        w = np.concatenate([one.deviations[:, k, j] for one in samples if k in one.group])
+        found[:, k] = w.mean(), (w**2).mean()
+    return found[0], found[1]
+
+
+def _uncertainty(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Student's factor (m,) of the error of a sum of means of samples (n, m), and relative variance of its square."""
+    squares, spread, freedom = [], [], []
+    for one in parts:
+        n = len(one)
+        centred = one - one.mean(axis=0)
+        second = (centred**2).mean(axis=0)
+        squares.append((centred**2).sum(axis=0) / (n - 1) / n)
+        kurtosis = ratio((centred**4).mean(axis=0), second**2, empty=3.0)
+        spread.append(squares[-1] ** 2 * np.maximum(kurtosis - 1, 0) / n)
+        freedom.append(squares[-1] ** 2 / (n - 1))
+    total = np.sum(squares, axis=0)
+    degrees = np.maximum(ratio(total**2, np.sum(freedom, axis=0), empty=1e6), FREE)
+    factor = np.array([student(float(d)) / Z for d in degrees])
+    return factor, ratio(np.sum(spread, axis=0), total**2)
+
+
+def correlations(covariance: FloatArray) -> FloatArray:
+    """Return the correlations (m, K) of models with model 0 from covariances (m, K, K)."""
+    scale = np.sqrt(np.einsum("mkk->mk", covariance))
+    return ratio(covariance[:, 0], scale * scale[:, :1])
+
+
+def ok_rows(values: FloatArray, group: Group) -> NDArray[np.bool_]:
+    """Which samples (n,) of values (n, K, m) have answers of all models of a group."""
+    return np.asarray(np.isfinite(values[:, list(group)]).all(axis=(1, 2)))
+
+
+def gains(plain: FloatArray, cost: float, found: Found) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield how many plain samples each unit of cost was worth, and the standard error, for means and variances.
+
+    Parameters
+    ----------
+    plain
+        Samples (n, m) of model 0.
+    cost
+        What was spent, in samples of model 0.
+    """
+    n = len(plain)
+    centred = plain - plain.mean(axis=0)
+    influences = centred**2 - (centred**2).mean(axis=0)
+    for which, (parts, one) in enumerate(((centred, "variance"), (influences, "second"))):
+        squares = np.sum([_error_square(t, one, found) for t in found.terms], axis=0)
+        variance = (parts**2).sum(axis=0) / (n - 1)
+        kurtosis = ratio((parts**4).mean(axis=0), (parts**2).mean(axis=0) ** 2, empty=3.0)
+        gain = ratio(variance, squares * cost, empty=1.0)
+        yield gain, gain * np.sqrt(np.maximum(kurtosis - 1, 0) / n + found.relative[which])
+
+
+def _error_square(one: Term, which: str, found: Found) -> FloatArray:
+    if which == "variance":
+        return np.asarray(one.variance / one.n)
+    mean = np.sum([t.first for t in found.terms], axis=0)
+    return np.asarray((one.second_variance - 4 * mean * one.covariance + 4 * mean**2 * one.variance) / one.n)

@@ -1,0 +1,179 @@
+"""Cheap models that a method may ask besides that of the study: each says what it is, and what a solve of it costs."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from forward.model import ModelError
+from forward.registry import Kinds, OfKind
+from forward.settings import Settings
+from forward.spec import MODELS, ModelSpec
+from uq.methods.stopping import seconds_per_solve
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from forward.scalars import Mistake
+
+CORRECTIONS = 8  # of a solve from the tangent to the tolerance, by which few of them are cheaper
+
+
+class CheapModel(Settings):
+    """A model with the parameters and the outputs of the study's.
+
+    Parameters
+    ----------
+    name
+        Its name in results.
+    cost
+        Processor time of a solve over that of a solve of the study's model, by which numbers of samples are chosen. By
+        default it is predicted from the numbers of unknowns; other models need it.
+    """
+
+    name: str = ""
+    cost: Annotated[float, Field(gt=0)] | None = None
+
+    if TYPE_CHECKING:
+
+        @property
+        def kind(self) -> str:
+            """Its kind, as in the study."""
+
+    @property
+    @abstractmethod
+    def label(self) -> str:
+        """Its name in results."""
+
+    @abstractmethod
+    def of(self, spec: ModelSpec) -> ModelSpec | None:
+        """Return the model, given that of the study; None if it is that one, stopped early.
+
+        Raises
+        ------
+        ModelError, pydantic.ValidationError
+            If there is no such model.
+        """
+
+    @property
+    def stopped_after(self) -> int | None:
+        """Iterations of the solver after which it is stopped; None if it is not."""
+        return None
+
+    def predicted(self, unknowns: int, own: int) -> float | None:
+        """Cost of a solve over that of the study's model, from its unknowns and its own; None if it is unknown."""
+        if self.cost is not None or not unknowns or not own:
+            return self.cost
+        return seconds_per_solve(own) / seconds_per_solve(unknowns)
+
+    def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find what does not fit the model of the study; places are those in the block."""
+        other = self.of(spec)
+        if other is not None:
+            wanted, returned = ([one.name for one in model.returned] for model in (spec, other))
+            if returned != wanted:
+                yield ("model", "outputs"), f"expected those of the study's model: {', '.join(wanted)}", returned
+        if self.predicted(spec.unknowns, 0 if other is None else other.unknowns) is None:
+            message = "cannot be predicted, expected the time of a solve over that of the study's model"
+            yield ("cost",), message, None
+
+
+class Coarser(CheapModel):
+    """The same body with larger cells, or simpler ones.
+
+    Parameters
+    ----------
+    coarser
+        How many times as long cells are along each edge (numbers of cells are rounded up); those of a file must have
+        been divided, by a power of two.
+    degree
+        Degree of its elements; by default that of the body.
+    """
+
+    kind: Literal["mesh"] = "mesh"
+    coarser: Annotated[float, Field(ge=1)] = 2.0
+    degree: Literal[1, 2] | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        cells = "" if self.coarser == 1 else f"cells × {self.coarser:g}"
+        degree = "" if self.degree is None else f"degree {self.degree}"
+        return self.name or ", ".join(filter(None, (cells, degree))) or "mesh"
+
+    def of(self, spec: ModelSpec) -> ModelSpec:
+        """Return the body on the coarser mesh."""
+        found = spec.coarser(self.coarser, self.degree)
+        if found.unknowns >= spec.unknowns:
+            raise ModelError(f"{self.label}: {found.unknowns:,} unknowns, expected fewer than {spec.unknowns:,}")
+        return found
+
+
+class FewIterations(CheapModel):
+    """The study's own model, stopped after a few iterations from the tangent at the mean parameters.
+
+    Parameters
+    ----------
+    iterations
+        Their number.
+    """
+
+    kind: Literal["iterations"] = "iterations"
+    iterations: Annotated[int, Field(ge=1)] = 1
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        return self.name or f"{self.iterations} iteration{'s' if self.iterations > 1 else ''}"
+
+    @property
+    def stopped_after(self) -> int:
+        """Iterations of the solver."""
+        return self.iterations
+
+    def of(self, spec: ModelSpec) -> None:
+        """Return none: it is the model of the study."""
+
+    def predicted(self, unknowns: int, own: int) -> float | None:
+        """Return the share of the corrections that a solve takes."""
+        return min(1.0, self.iterations / CORRECTIONS) if self.cost is None else self.cost
+
+    def mistakes(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find that there are no iterations."""
+        if not spec.iterative:
+            yield ("kind",), f"a model of kind '{spec.kind}' has no iterations of a solver", self.kind
+
+
+class OtherModel(CheapModel):
+    """Any other model, with the same parameters and outputs by name.
+
+    Parameters
+    ----------
+    model
+        Its block, as that of a study.
+    """
+
+    kind: Literal["model"] = "model"
+    model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        return self.name or self.model.kind
+
+    def of(self, spec: ModelSpec) -> ModelSpec:
+        """Return the model."""
+        return self.model
+
+
+CHEAP = Kinds(
+    "cheap-model",
+    {
+        "mesh": "uq.methods.cheap:Coarser",
+        "iterations": "uq.methods.cheap:FewIterations",
+        "model": "uq.methods.cheap:OtherModel",
+    },
+    CheapModel,
+)

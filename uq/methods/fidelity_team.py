@@ -1,0 +1,179 @@
+"""The models of a multifidelity study at work: linearised, sampled in groups, and paid for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray, SolveError
+from uq.estimators.blue import Group, subsets
+from uq.estimators.fidelities import Samples, ok_rows
+from uq.evaluation.evaluate import Evaluations, Recorder, Request
+from uq.inputs.random_parameters import Inputs
+from uq.inputs.sampling import random_points
+from uq.methods.cheap import CheapModel
+from uq.methods.stopping import TEXTBOOK
+from uq.surrogates.linearisation import Linearisation, linearise
+
+OWN_LABEL = "model"  # name in results of the model of the study
+PILOT = -1  # group of a pilot that does not count in estimates, in results
+
+
+@dataclass(frozen=True)
+class Member:
+    """A model that is sampled.
+
+    Attributes
+    ----------
+    label
+        Its name in results.
+    evaluate
+        Its evaluation.
+    stopped_after
+        Iterations of its solver.
+    cost
+        Of a solve, over that of the study's model.
+    centre
+        Its linearisation at the mean parameters.
+    """
+
+    label: str
+    evaluate: Recorder
+    stopped_after: int | None
+    cost: float
+    centre: Linearisation
+
+    def solve(self, points: FloatArray, *, tangents: bool = False) -> Evaluations:
+        """Solve at points (n, d)."""
+        start = self.centre.prediction
+        return self.evaluate(Request(points, tangents=tangents, start=start, iterations=self.stopped_after))
+
+
+@dataclass
+class Taken:
+    """The samples of a group: points (n, d), outputs (n, K, m), NaN for models outside it, and reasons of failures."""
+
+    points: FloatArray
+    values: FloatArray
+    reasons: set[str] = field(default_factory=set)
+
+
+class Team:
+    """The model of a study (the first) and cheap ones.
+
+    Attributes
+    ----------
+    members
+        The models.
+    groups, costs
+        All groups of models, and the cost (G,) of a sample of each, in solves of the study's model.
+    spent
+        Cost of all solves so far but those of the linearisation of the study's model, which every method needs.
+    controlled
+        Whether the tangent is taken off.
+    pilot
+        Evaluations of the model of the study at the points of the pilot.
+    """
+
+    def __init__(
+        self, cheap: Sequence[CheapModel], inputs: Inputs, evaluate: Recorder, seed: int, *, controlled: bool
+    ) -> None:
+        self.inputs, self.evaluate = inputs, evaluate
+        self._seed, self.controlled = seed, controlled and evaluate.differentiable
+        centre = linearise(inputs, evaluate)
+        self.members = [Member(OWN_LABEL, evaluate, None, 1.0, centre)]
+        self.spent = 0.0
+        for one in cheap:
+            if one.stopped_after is not None:
+                cost = one.predicted(0, 0)
+                self.members.append(Member(one.label, evaluate, one.stopped_after, _known(one, cost), centre))
+                continue
+            other = evaluate.on(one.label)
+            cost = _known(one, one.predicted(evaluate.displacements, other.displacements))
+            try:
+                found = linearise(inputs, other)
+            except SolveError as error:
+                raise SolveError(f"{one.label}: {error.reason}", error.history) from None
+            self.members.append(Member(one.label, other, None, cost, found))
+            self.spent += TEXTBOOK * cost
+        self.groups: list[Group] = subsets(len(self.members))
+        self.costs = np.array([sum(self.members[k].cost for k in group) for group in self.groups])
+        self.offsets = np.array([one.centre.middle for one in self.members])
+        self.slopes = [self._slopes(k) for k in range(len(self.members))]
+        # E[T²] (K, m).
+        self.variances = np.array([np.einsum("mi,ij,mj->m", s, inputs.correlation, s) for s in self.slopes])
+        self.taken: dict[int, Taken] = {}
+        self.pilot: Evaluations | None = None
+
+    def _slopes(self, k: int) -> FloatArray:
+        """Slopes (m, d) of the control of a model: its own tangent, or that of the study's model where it has none."""
+        own, first = self.members[k].centre.output_slopes, self.members[0].centre.output_slopes
+        if not self.controlled:
+            return np.zeros_like(first)
+        return own if np.isfinite(own).all() else first
+
+    @property
+    def count(self) -> int:
+        """Number of samples of all groups, each of one or several models."""
+        return sum(len(one.points) for one in self.taken.values())
+
+    def begin(self, count: int, *, counts: bool, tangents: bool) -> None:
+        """Take the pilot, which counts in estimates or does not, with derivatives of the study's model or without."""
+        self.take(0 if counts else PILOT, count, tangents=tangents, keep=True)
+
+    def take(self, g: int, count: int, *, tangents: bool = False, keep: bool = False) -> None:
+        """Take further samples of a group, or of all models for a pilot that does not count."""
+        d, K, m = len(self.inputs.names), len(self.members), len(self.evaluate.outputs)
+        group = self.groups[max(g, 0)]
+        before = self.taken.setdefault(g, Taken(np.empty((0, d)), np.empty((0, K, m))))
+        n = len(before.points)
+        stream = g if g >= 0 else len(self.groups)
+        points = self.inputs.points(random_points((self._seed, stream), n, n + count, d))
+        values = np.full((count, K, m), np.nan)
+        for k in group:
+            found = self.members[k].solve(points, tangents=tangents and k == 0)
+            values[:, k] = np.where(found.ok[:, None], found.outputs, np.nan)
+            before.reasons.update(f"{self.members[k].label}: {failure.reason}" for failure in found.failures)
+            if keep and k == 0:
+                self.pilot = found
+        before.points = np.concatenate([before.points, points])
+        before.values = np.concatenate([before.values, values])
+        self.spent += count * self.costs[max(g, 0)]
+
+    def counts(self) -> FloatArray:
+        """Numbers of samples (G,) of the groups that count."""
+        return np.array([float(len(self.taken[g].points)) if g in self.taken else 0.0 for g in range(len(self.groups))])
+
+    def ok(self, g: int) -> NDArray[np.bool_]:
+        """Which samples (n,) of a group have answers of all its models."""
+        return ok_rows(self.taken[g].values, self.groups[max(g, 0)])
+
+    def samples(self, g: int) -> Samples:
+        """Return the samples of a group that have answers of all its models.
+
+        Raises
+        ------
+        SolveError
+            If there are fewer than two.
+        """
+        taken, ok, group = self.taken[g], self.ok(g), self.groups[max(g, 0)]
+        if ok.sum() < 2:
+            names = ", ".join(self.members[k].label for k in group)
+            reasons = "; ".join(sorted(taken.reasons)[:3])
+            message = f"{ok.sum()} of {len(ok)} samples have an answer of {names}, expected 2: {reasons}"
+            raise SolveError(message)
+        t = self.members[0].centre.coordinates.of(taken.points[ok])
+        inside = np.isin(np.arange(len(self.members)), group)
+        deviations = np.where(inside[:, None], taken.values[ok] - self.offsets, 0.0)
+        controls = np.array([t @ slopes.T for slopes in self.slopes]).swapaxes(0, 1)
+        return Samples(group, deviations, np.where(inside[:, None], controls, 0.0))
+
+
+def _known(one: CheapModel, cost: float | None) -> float:
+    if cost is None:
+        message = f"{one.label}: the cost of a solve cannot be predicted, expected its `cost`"
+        raise ValueError(message)
+    return cost

@@ -1,0 +1,343 @@
+"""Two ways to spend what a multifidelity study has: on groups of models, or on what an expansion leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from forward.model import Finding, FloatArray, SolveError
+from uq.estimators.blue import Problem
+from uq.estimators.doubts import of_tails
+from uq.estimators.fidelities import Found, correlations, estimated, gains
+from uq.estimators.moments import ESTIMATES, Estimates, Z, combine, controlled, ratio, student, term
+from uq.estimators.tails import of_influences, unseen
+from uq.evaluation.evaluate import Evaluations
+from uq.findings import add
+from uq.methods.chaos import objection
+from uq.methods.fidelity_team import PILOT, Team
+from uq.surrogates.field_regression import Deviations, deviations
+from uq.surrogates.linearisation import local_dataset
+from uq.surrogates.regression import Regression
+from uq.surrogates.taylor import Control, expansion
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FEWEST = 8  # samples of a group that gets any
+ORDER = 6  # largest order of the expansion
+UNRELATED = 0.1  # squared correlation of remainders up to which a cheap model is of no use
+UNLIMITED = 1e9
+
+
+class ByModels:
+    """Groups of models that share their samples.
+
+    Attributes
+    ----------
+    found
+        What all samples so far tell.
+    pilot
+        What the pilot tells.
+    """
+
+    def __init__(self, team: Team) -> None:
+        self._team = team
+        self.pilot = self.found = self._estimated()
+
+    def _estimated(self) -> Found:
+        """Estimate from all groups that count; from the pilot, as long as nothing else was taken."""
+        team = self._team
+        counted = [g for g in team.taken if g != PILOT] or [PILOT]
+        apart = team.samples(PILOT) if PILOT in team.taken and counted != [PILOT] else None
+        counted.sort()
+        found = estimated([team.samples(g) for g in counted], team.offsets[0], team.variances, apart)
+        return replace(found, estimates=with_tails(team, found.estimates, found.moved))
+
+    @property
+    def estimates(self) -> Estimates:
+        """Mean and standard deviation."""
+        return self.found.estimates
+
+    def _sizes(self) -> FloatArray:
+        """What errors of means are relative to (m,)."""
+        return sizes(self.estimates)
+
+    def _problem(self) -> Problem | None:
+        """How to choose numbers; None if controls leave nothing."""
+        team = self._team
+        found = self.found.problem(team.groups, team.costs, team.counts(), self._sizes())
+        return found if len(found.told) else None
+
+    def expected(self, cost: float) -> float:
+        """Predict the largest relative variance of a mean once so much more is spent."""
+        problem = self._problem()
+        if problem is None:
+            return 0.0
+        return float(problem.variances(problem.taken + problem.best(cost)).max())
+
+    def needed(self, target: float) -> float:
+        """Predict what has to be spent for a largest relative variance."""
+        problem = self._problem()
+        return 0.0 if problem is None else problem.needed(target, UNLIMITED)
+
+    def spend(self, cost: float) -> None:
+        """Take samples for a cost, or a little less, and estimate again."""
+        problem = self._problem()
+        if problem is None:
+            return
+        team, wanted = self._team, problem.best(cost)
+        # Groups too small to tell their own scatter give way to the others.
+        few = (wanted < FEWEST) & (problem.taken < FEWEST)
+        counts = np.where(few, 0.0, wanted)
+        own = np.array([0 in group for group in team.groups])
+        if not (problem.taken + counts)[own].any():
+            counts[np.argmax(np.where(own, wanted, -1.0))] = FEWEST
+        total = counts @ team.costs
+        if not total:
+            counts[-len(team.members)] = total = cost  # the model of the study alone
+        numbers = np.floor(counts * min(1.0, cost / total) + 1e-9).astype(int)
+        numbers[(numbers < 2) & (problem.taken < 2)] = 0
+        for g in np.flatnonzero(numbers):
+            team.take(int(g), int(numbers[g]))
+        if numbers.any():
+            self.found = self._estimated()
+
+    def doubts(self) -> Iterator[Finding]:
+        """Find what a few samples decide."""
+        team, found = self._team, self.found
+        counted = sorted(g for g in team.taken if g != PILOT) or [PILOT]
+        largest = max(range(len(counted)), key=lambda i: float(_share(found, i).max()))
+        g = counted[largest]
+        values = team.taken[g].values[team.ok(g)][:, team.groups[max(g, 0)][0]]
+        yield from of_tails(team.evaluate.outputs, values, found.estimates.relative_std_error, found.moved[largest])
+
+
+def _share(found: Found, i: int) -> FloatArray:
+    """Share (m,) of the error of the standard deviation that comes from a group."""
+    errors = np.array([one.var(axis=0) / len(one) for one in found.moved])
+    return ratio(errors[i], errors.sum(axis=0))
+
+
+class ByExpansion:
+    """An expansion fitted to the pilot, and samples of the study's model that correct what it leaves.
+
+    Attributes
+    ----------
+    left
+        Its leave-one-out errors (m,).
+    """
+
+    def __init__(self, team: Team, fitted: Deviations, scale: Estimates) -> None:
+        self._team, self._fitted, self._scale = team, fitted, scale
+        self._control: Control = expansion(fitted)
+        self.left: FloatArray = fitted.relative * scale.std
+        self.estimates, self._moved = scale, np.zeros((0, 0))
+
+    @classmethod
+    def of(cls, team: Team) -> ByExpansion | None:
+        """Fit to values, and gradients where there are some, at the pilot; None if that is impossible."""
+        pilot, centre = team.pilot, team.members[0].centre
+        if pilot is None or objection(team.inputs, "multifidelity") is not None:
+            return None
+        ok = pilot.ok
+        tangents = None if pilot.tangents is None else pilot.tangents[ok]
+        try:
+            regression = Regression.of(team.inputs, pilot.points[ok], pilot.outputs[ok], tangents, ORDER)
+        except SolveError:
+            return None
+        plain = pilot.outputs[ok]
+        scale = np.maximum(plain.std(axis=0, ddof=1), 1e-300)
+        zero = np.zeros_like(scale)
+        return cls(
+            team,
+            deviations(regression, _without_fields(pilot), centre),
+            Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
+        )
+
+    @property
+    def _own(self) -> int:
+        """Group of the study's model alone."""
+        return len(self._team.groups) - len(self._team.members)
+
+    def expected(self, cost: float) -> float:
+        """Predict the largest relative variance of a mean with so many samples more."""
+        before = self._team.counts()[self._own]
+        return float(ratio(self.left**2, sizes(self._scale) ** 2).max() / (before + max(cost, 1)))
+
+    def needed(self, target: float) -> float:
+        """Predict what has to be spent for a largest relative variance."""
+        n = self._team.counts()[self._own]
+        if not n:
+            return self.expected(1) / target
+        return float(n * ((self.estimates.relative_error.max() ** 2 / target) - 1))
+
+    def spend(self, cost: float) -> None:
+        """Take as many samples, and estimate again."""
+        team, count = self._team, int(cost + 1e-9)
+        if not count:
+            return
+        team.take(self._own, count)
+        ok = team.ok(self._own)
+        points, values = team.taken[self._own].points[ok], team.samples(self._own).deviations[:, 0]
+        offset = team.offsets[0]
+        # The expansion is one of deviations from the solution at the mean parameters.
+        centre = team.members[0].centre.outputs
+        L, _ = self._control.predict(self._control.features(points), self._fitted.outputs)
+        expected, second = self._control.expected(self._fitted.outputs)
+        shift = offset - centre
+        L, expected, second = L - shift, expected - shift, second - 2 * shift * expected + shift**2
+        one = term(values, values**2, (L - expected, L**2 - second))
+        found = combine(offset, [one])
+        first, squares = controlled(values, values**2, (L - expected, L**2 - second))
+        moved = squares - 2 * first.mean(axis=0) * first
+        self._moved = moved - moved.mean(axis=0)
+        factor = student(max(len(values) - 1, 1)) / Z
+        found = replace(found, mean_error=found.mean_error * factor, std_error=found.std_error * factor)
+        self.estimates = with_tails(team, found, (self._moved,))
+
+    def doubts(self) -> Iterator[Finding]:
+        """Find what a few samples decide."""
+        team = self._team
+        values = team.taken[self._own].values[team.ok(self._own)][:, 0]
+        relative = self.estimates.relative_std_error
+        yield from of_tails(team.evaluate.outputs, values, relative, self._moved, expanded=True)
+
+
+def _without_fields(pilot: Evaluations) -> Evaluations:
+    return replace(pilot, fields=np.zeros((0, 0)))
+
+
+def sizes(estimates: Estimates) -> FloatArray:
+    """Return what errors of means are relative to (m,): the mean, or the standard deviation where that is larger."""
+    found = np.maximum(np.abs(estimates.mean), estimates.std)
+    return np.where(found > 0, found, 1.0)
+
+
+def with_tails(team: Team, found: Estimates, moved: tuple[FloatArray, ...]) -> Estimates:
+    """Return estimates with errors of standard deviations that count tails beyond the samples."""
+    own = [g for g in team.taken if 0 in team.groups[max(g, 0)]]
+    values = np.concatenate([team.taken[g].values[team.ok(g)][:, 0] for g in own])
+    tails = [of_influences(found, team.inputs, one) for one in moved]
+    tails[0] = np.maximum(tails[0], unseen(team.inputs, values) * found.std)
+    return replace(found, std_error=np.linalg.norm([found.std_error, *tails], axis=0))
+
+
+# --- what it says of itself ------------------------------------------------------------------------------------------
+
+
+def described(team: Team, way: ByModels | ByExpansion, models: ByModels, expanded: ByExpansion | None) -> xr.Dataset:
+    """Return estimates, what was spent on what, and what other methods are predicted to need, as labelled arrays."""
+    by_output, fidelity, group = ("output",), ("fidelity",), ("group",)
+    estimates, pilot = way.estimates, models.pilot
+    dataset = local_dataset(team.inputs, team.evaluate, team.members[0].centre, fields=False)
+    numbers = sorted(team.taken)
+    taken = [team.taken[g] for g in numbers]
+    K = len(team.members)
+    inside = np.array([np.isin(np.arange(K), team.groups[max(g, 0)]) for g in numbers])
+    sizes_of = np.array([len(one.points) for one in taken])
+    own = np.concatenate(
+        [t.values[team.ok(g)][:, 0] for g, t in zip(numbers, taken, strict=True) if inside_own(team, g)]
+    )
+    plain = own.var(axis=0, ddof=1)
+    dataset = dataset.assign_coords(fidelity=[one.label for one in team.members], group=np.arange(len(numbers)))
+    dataset = dataset.assign(
+        {
+            **{name: (by_output, getattr(estimates, name)) for name in ESTIMATES},
+            "fidelity_cost": (fidelity, np.array([one.cost for one in team.members])),
+            "fidelity_samples": (fidelity, sizes_of @ inside),
+            "fidelity_nominal": (("output", "fidelity"), np.array([m.centre.outputs for m in team.members]).T),
+            "fidelity_correlation": (("output", "fidelity"), plain_correlations(team)),
+            "fidelity_remainder_correlation": (("output", "fidelity"), correlations(pilot.covariance)),
+            "group_models": (("group", "fidelity"), inside),
+            "group_pilot": (group, np.array([g == PILOT for g in numbers])),
+            "group_samples": (group, sizes_of),
+            "group_failed": (group, np.array([int((~team.ok(g)).sum()) for g in numbers])),
+            "group_cost": (group, np.array([team.costs[max(g, 0)] for g in numbers])),
+            "spent": ((), team.spent),
+            "points": (("sample", "parameter"), np.concatenate([one.points for one in taken])),
+            "sample_group": (("sample",), np.repeat(np.arange(len(numbers)), sizes_of)),
+            "fidelity_values": (("sample", "fidelity", "output"), np.concatenate([one.values for one in taken])),
+            "ok": (("sample",), np.concatenate([team.ok(g) for g in numbers])),
+        }
+    )
+    if isinstance(way, ByModels):
+        (mean, mean_error), (std, std_error) = gains(own, team.spent, way.found)
+        worth = {"gain": mean, "gain_error": mean_error, "std_gain": std, "std_gain_error": std_error}
+        dataset = dataset.assign({name: (by_output, value) for name, value in worth.items()})
+    else:
+        gain = ratio(plain, estimates.mean_error**2 * team.spent, empty=1.0)
+        dataset = dataset.assign(gain=(by_output, gain), gain_error=(by_output, gain * np.sqrt(2 / len(own))))
+    squares = np.where(estimates.mean_error > 0, estimates.mean_error, np.nan) ** 2
+    others = {"monte-carlo": plain / squares}
+    if team.controlled:
+        others["sensitivity-monte-carlo"] = np.einsum("mkk->mk", pilot.covariance)[:, 0] / squares
+    if expanded is not None:
+        others["expansion"] = expanded.left**2 / squares + sizes_of[0]
+    dataset = dataset.assign_coords(alternative=list(others))
+    dataset = dataset.assign(alternative_solves=(("alternative", "output"), np.array(list(others.values()))))
+    add(dataset, compared(others, team.spent, expanded_used=isinstance(way, ByExpansion)))
+    failed = int(dataset["group_failed"].sum())
+    if failed:
+        total = int(sizes_of.sum())
+        dataset.attrs["note"] = (
+            f"{failed} of {total} samples have no answer of all models of their group; estimates are over the others, "
+            "that is, conditional on the models having an answer"
+        )
+    return dataset
+
+
+def inside_own(team: Team, g: int) -> bool:
+    """Whether a group includes the model of the study."""
+    return 0 in team.groups[max(g, 0)]
+
+
+def plain_correlations(team: Team) -> FloatArray:
+    """Return the correlations (m, K) of the outputs of the models with those of the study's, at samples of all."""
+    samples = team.samples(PILOT if PILOT in team.taken else 0)
+    centred = samples.deviations - samples.deviations.mean(axis=0)
+    return correlations(np.einsum("nkm,nlm->mkl", centred, centred))
+
+
+def compared(others: dict[str, FloatArray], spent: float, *, expanded_used: bool) -> Finding:
+    """Say what other methods are predicted to need for the errors that were reached."""
+    words = {
+        "monte-carlo": "plain Monte Carlo {} solves",
+        "sensitivity-monte-carlo": "the tangent alone {}",
+        "expansion": "an expansion of the pilot, corrected by further solves, {}",
+    }
+    needed = {name: float(np.nanmax(found, initial=0.0)) for name, found in others.items()}
+    told = ", ".join(words[name].format(f"{number:,.0f}") for name, number in needed.items())
+    text = f"For the errors of the means that were reached at the cost of {spent:,.0f} solves, by prediction, {told}."
+    least = min(needed, key=lambda name: needed[name])
+    if needed[least] < spent and not expanded_used:
+        instead = "quasi-monte-carlo with control = 'chaos'" if least == "expansion" else least
+        text += f" The cheap models are not worth their cost here: take {instead}."
+    elif expanded_used:
+        text += " The expansion was taken in place of the cheap models."
+    return Finding("note", text)
+
+
+def preferred(by_models: float, by_expansion: float) -> Finding:
+    """Say that an expansion takes the place of the cheap models."""
+    times = f"{by_models / by_expansion:.3g} times" if by_expansion > 0 else "infinitely"
+    return Finding(
+        "note",
+        f"An expansion of the pilot leaves so little that, by prediction, the variance of the worst mean is {times} "
+        "smaller than with the cheap models for the same cost: it is taken in their place.",
+    )
+
+
+def useless(team: Team, found: Found) -> Iterator[Finding]:
+    """Find cheap models that do not follow the model of the study."""
+    squares = correlations(found.covariance) ** 2
+    for k, one in enumerate(team.members[1:], 1):
+        if (squares[:, k] <= UNRELATED).all():
+            beside = "what the tangents leave of it" if team.controlled else "it"
+            yield Finding(
+                "note",
+                f"The cheap model '{one.label}' does not follow {beside} (squared correlations up to "
+                f"{squares[:, k].max():.2g} in the pilot): it is of no use for these outputs.",
+            )

@@ -1,0 +1,211 @@
+"""Several models of one body: most samples from cheap ones, and no bias from any of them.
+
+E[ψ_0] is a sum of what groups of models tell (`uq.estimators.blue`): every group gets its own random parameters, which
+all its models share. A pilot of all models tells their covariances, from which the numbers of samples of all possible
+groups follow, by predicted costs: those that make the largest relative error of a mean least. The tangent of each model
+at the mean parameters, whose expectation is known, is taken off first (`uq.estimators.fidelities`).
+
+The pilot also tells, with derivatives, how well an expansion does. Where that is predicted to be better than any
+combination of models, it takes their place: the pilot is spent on the fit, and the samples of the model of the study
+correct what it leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from forward.model import ModelError
+from forward.registry import OfKind
+from uq.evaluation.evaluate import OWN, Evaluate, Recorder
+from uq.findings import add
+from uq.inputs.random_parameters import Inputs
+from uq.methods.cheap import CHEAP, CheapModel
+from uq.methods.fidelity_team import OWN_LABEL, Team
+from uq.methods.fidelity_ways import ByExpansion, ByModels, described, preferred, useless
+from uq.methods.method import MESH
+from uq.methods.monte_carlo import MOST_GROWTH, UNLIMITED
+from uq.methods.stopping import Amount
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from forward.scalars import Mistake
+    from forward.spec import ModelSpec, Times
+
+MOST_MODELS = 6  # cheap ones: 127 groups
+FEWEST = 8  # samples of a pilot
+PILOT, PER_MODEL = 16, 4  # samples of a pilot, and how many more for each cheap model
+BETTER = 0.8  # predicted variance, over that of the models, from which an expansion takes their place
+LITTLE = 0.01  # of what was spent: not worth another round
+MORE = 0.1  # of what was spent: least that a tolerance that was missed is worth
+
+
+class Multifidelity(Amount):
+    """Approximate control variates: mean and standard deviation from a model and cheap ones, without bias.
+
+    Displacement fields and quantiles are not estimated: models may live on different meshes.
+
+    Parameters
+    ----------
+    cheap
+        The cheap models, one to six.
+    samples
+        What may be spent, in solves of the study's model by predicted costs: with pilot and linearisations of all
+        models, so that it compares with as many samples of other methods. With a tolerance or a budget, the most.
+    tolerance
+        Stop when the standard error of every mean is below this fraction of the mean (of the standard deviation,
+        where the mean is smaller than that).
+    budget_seconds
+        As in `Amount`.
+    pilot
+        Number of samples of all models before anything is known of them; by default 16, and 4 more for each cheap one.
+        They count in the estimates: each is weighted by what the others tell.
+    reuse
+        Whether they do. Without, the pilot decides on numbers and weights only and the estimates are unbiased to the
+        letter; with, the numbers of samples depend on some of them, which has a bias of the order of 1/n.
+    control
+        What is taken off every model first: "tangent", its tangent at the mean parameters, or "none". "auto": its
+        tangent, and where an expansion is predicted to be better than all models, that in their place.
+    seed
+        Seed of the random points; every group of models has its own stream.
+    """
+
+    kind: Literal["multifidelity"] = "multifidelity"
+    cheap: Annotated[tuple[Annotated[CheapModel, OfKind(CHEAP)], ...], Field(min_length=1, max_length=MOST_MODELS)]
+    pilot: Annotated[int, Field(ge=FEWEST)] | None = None
+    reuse: bool = True
+    control: Literal["auto", "tangent", "none"] = "auto"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> Multifidelity:
+        labels = [one.label for one in self.cheap]
+        for label in dict.fromkeys(labels):
+            if labels.count(label) > 1:
+                message = f"{labels.count(label)} cheap models are called '{label}', expected different names"
+                raise ValueError(message)
+            if label == OWN_LABEL or label.startswith(MESH):
+                message = f"a cheap model is called '{label}', expected another name"
+                raise ValueError(message)
+        if self.samples is not None and self.samples <= self.first:
+            message = f"samples = {self.samples}, expected more than the {self.first} of the pilot"
+            raise ValueError(message)
+        return self
+
+    @property
+    def first(self) -> int:
+        """Number of samples of the pilot."""
+        return self.pilot or PILOT + PER_MODEL * len(self.cheap)
+
+    @property
+    def limit(self) -> float:
+        """What may be spent, in solves of the study's model."""
+        return float(self.samples or UNLIMITED)
+
+    @property
+    def undecided(self) -> str:
+        """What the planned solves are for."""
+        return "linearisations and the pilot"
+
+    def planned(self, dimension: int) -> int:
+        """Number of solves of linearisations and pilot on all models, which decide how many more are needed."""
+        return len(self._separate) + 1 + self.first * (1 + len(self.cheap))
+
+    @property
+    def _separate(self) -> list[CheapModel]:
+        """The cheap models that are not the study's own."""
+        return [one for one in self.cheap if one.stopped_after is None]
+
+    def models(self, spec: ModelSpec) -> dict[str, ModelSpec]:
+        """Return the cheap models."""
+        found = {one.label: one.of(spec) for one in self._separate}
+        return {label: model for label, model in found.items() if model is not None}
+
+    def unfit(self, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find cheap models that cannot be, or do not fit the study's."""
+        for i, one in enumerate(self.cheap):
+            try:
+                wrong = list(one.mistakes(spec))
+            except (ModelError, ValidationError) as error:
+                reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+                wrong = [((), str(reason), one.kind)]
+            for place, message, given in wrong:
+                yield ("method", "cheap", i, *place), message, given
+
+    def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
+        """Find cheap models that do not have the random parameters."""
+        yield from super().mistakes(inputs, spec)
+        for i, one in enumerate(self.cheap if not list(self.unfit(spec)) else ()):
+            other = one.of(spec)
+            known = () if other is None else (*other.scalars, *other.coefficients)
+            missing = [] if other is None else [name for name in inputs.names if name not in known]
+            if missing:
+                message = f"has no {', '.join(missing[:3])}, expected all random parameters of the study"
+                yield ("method", "cheap", i, "model", "parameters"), message, list(known)[:8]
+
+    def seconds(self, dimension: int, costs: Mapping[str, Times]) -> float:
+        """Predict the processor time (s) of what may be spent; of the pilot, if a tolerance or a budget decides."""
+        if self.samples is not None:
+            return self.samples * costs[OWN].sample
+        known = [costs[one.label].sample for one in self._separate if one.label in costs]
+        return self.first * (costs[OWN].sample + sum(known))
+
+    def run(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
+        """Sample and estimate.
+
+        Returns
+        -------
+        xarray.Dataset
+            Estimates by output (`mean`, `mean_error`, `std`, `std_error`), the `gain` over plain Monte Carlo, what each
+            model costs and how it is correlated (`fidelity_…`), what was taken of each group (`group_…`), and what
+            other methods are predicted to need (`alternative_solves`); see docs/results.md.
+
+        Raises
+        ------
+        SolveError
+            If a model has no answer at the mean parameters, or too few samples have answers of all models.
+        ValueError
+            If a cheap model without unknowns has no `cost`.
+        """
+        recorder = Recorder(evaluate)
+        team = Team(self.cheap, inputs, recorder, self.seed, controlled=self.control != "none")
+        team.begin(self.first, counts=self.reuse, tangents=self.control == "auto" and evaluate.differentiable)
+        models = ByModels(team)
+        told = list(useless(team, models.pilot))
+        expansion = ByExpansion.of(team) if self.control == "auto" else None
+        way: ByModels | ByExpansion = models
+        if expansion is not None:
+            cost = self._left(team) if self.tolerance is None else models.needed(self.tolerance**2)
+            cost = max(min(cost, self._left(team)), FEWEST)
+            by_models, by_expansion = models.expected(cost), expansion.expected(cost)
+            if by_expansion < BETTER * by_models:
+                told.append(preferred(by_models, by_expansion))
+                way = expansion
+                way.spend(max(FEWEST, min(cost, MOST_GROWTH * team.spent)))
+        elif not self.reuse:
+            models.spend(max(FEWEST, min(self._left(team), team.spent)))
+        while True:
+            reached, left = float(way.estimates.relative_error.max()), self._left(team)
+            if self.met(reached) or left < max(1.0, LITTLE * team.spent):
+                break
+            cost = left
+            if self.tolerance is not None:
+                cost = min(left, max(way.needed(self.tolerance**2), MORE * team.spent))
+            before = team.spent
+            way.spend(min(cost, MOST_GROWTH * team.spent))
+            if team.spent == before:  # what is left pays for no further sample
+                break
+        poor = self.budget_seconds is not None and self._left(team) < self.limit - team.spent
+        amount = f"{team.count} samples that cost {team.spent:.4g} solves"
+        stopped = self.why_stopped(reached, f"relative error {reached:.3g}", 1 - int(poor), 1, amount)
+        dataset = described(team, way, models, expansion)
+        add(dataset, *told, *way.doubts())
+        dataset.attrs["stopped"] = stopped
+        return dataset
+
+    def _left(self, team: Team) -> float:
+        """What may still be spent, in solves of the study's model."""
+        return min(self.limit - team.spent, self.affordable(team.spent, team.evaluate.seconds))
