@@ -26,6 +26,7 @@ from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.fields import left_out
 from inverse.designs.greedy import Choice, choose
 from inverse.designs.linearised import Linearised, scaled
+from inverse.designs.of_mesh import with_mesh_errors
 from inverse.methods.synthesize import SyntheticNoise
 from uq.evaluation.evaluate import Evaluate, Request
 from uq.findings import add
@@ -69,6 +70,9 @@ class Design(Settings):
         Errors of some values by their names, where * stands for any letters; the last that fits counts.
     costs
         Costs of candidates by their names, in the same way.
+    mesh_error
+        What the error of the mesh, estimated at the medians or for a field at the first draw, does: "report" says where
+        it exceeds the noise; "noise" counts it as noise too; false: it is not looked at.
     draws
         Draws at which the model is linearised; one is at the medians.
     random
@@ -88,6 +92,7 @@ class Design(Settings):
     noise: SyntheticNoise
     noises: dict[str, SyntheticNoise] = Field(default={})
     costs: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
+    mesh_error: Literal["report", "noise", False] = "report"
     draws: Annotated[int, Field(ge=1)] = 16
     random: Annotated[int, Field(ge=2)] = 64
     rank: Annotated[int, Field(ge=1)] = 200
@@ -110,7 +115,7 @@ class Design(Settings):
         limits += [f"a budget of {self.budget:g}"] if self.budget is not None else []
         return f"{', '.join(limits)}; one is a {self.each}"
 
-    def run(self, inputs: Inputs, evaluate: Evaluate, values: Values) -> xr.Dataset:
+    def run(self, inputs: Inputs, evaluate: Evaluate, values: Values, of_mesh: Evaluate | None = None) -> xr.Dataset:
         """Linearise the model at draws, and choose.
 
         Parameters
@@ -121,6 +126,8 @@ class Design(Settings):
             The model; it must have derivatives.
         values
             What its outputs are.
+        of_mesh
+            The same for an estimate of the error of its mesh; None if it has none.
 
         Raises
         ------
@@ -137,7 +144,8 @@ class Design(Settings):
             message = f"the model has no answer at any of the {len(ok)} draws: {found.failures[0].reason}"
             raise SolveError(message)
         assert found.tangents is not None
-        sigma = self.sigma(values, found.outputs[ok])
+        mesh = self._mesh_errors(inputs, of_mesh) if self.mesh_error and of_mesh is not None else None
+        sigma = self._with_mesh(self.sigma(values, found.outputs[ok]), mesh)
         whitened = found.tangents[ok] @ slopes[ok]  # (draws, m, d)
         told = Linearised(
             [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened],
@@ -152,7 +160,17 @@ class Design(Settings):
             posterior_std=("parameter", np.mean(left, axis=0)),
             draw=(("draw_number", "parameter"), points[ok]),
         ).assign_coords(parameter=list(inputs.names))
-        return with_values(result, values, sigma, candidates)
+        return with_mesh_errors(with_values(result, values, sigma, candidates), mesh, noise=self.mesh_error == "noise")
+
+    def _mesh_errors(self, inputs: Inputs, of_mesh: Evaluate) -> FloatArray | None:
+        """Estimate what the mesh takes away from all values (m,) at the medians; None where nothing tells."""
+        middle = inputs.points(np.full((1, len(inputs.names)), 0.5))
+        found = of_mesh(Request(middle, mesh_errors=True))
+        return None if found.failures or found.mesh_errors is None else found.mesh_errors[0]
+
+    def _with_mesh(self, sigma: FloatArray, mesh: FloatArray | None) -> FloatArray:
+        """Count errors of the mesh (m,) as noise too, if that is asked for."""
+        return sigma if mesh is None or self.mesh_error != "noise" else np.hypot(sigma, np.nan_to_num(mesh))
 
     def of_fields(self, draws: Sequence[xr.Dataset], values: Values) -> xr.Dataset:
         """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
@@ -163,7 +181,8 @@ class Design(Settings):
             As `run`.
         """
         candidates, _, costs = self.candidates(values)
-        sigma = self.sigma(values, np.array([one["output"].to_numpy() for one in draws]))
+        mesh = next((one["mesh_error"].to_numpy() for one in draws if "mesh_error" in one), None)
+        sigma = self._with_mesh(self.sigma(values, np.array([one["output"].to_numpy() for one in draws])), mesh)
         rows = [one["row"].to_numpy() * (one["sigma"].to_numpy() / sigma)[:, None] for one in draws]
         goals = [one["field_goal"].to_numpy() for one in draws]
         if self.criterion == "predictions":
@@ -184,7 +203,7 @@ class Design(Settings):
                 f"kept, of {known:.3g}. Take a larger method.rank."
             )
             add(result, Finding("warning", text))
-        return with_values(result, values, sigma, candidates)
+        return with_mesh_errors(with_values(result, values, sigma, candidates), mesh, noise=self.mesh_error == "noise")
 
     def whitened(self, number: int, size: int) -> FloatArray:
         """Draw `number` (size,) of standard normal numbers, for a field; a single one is at the median."""

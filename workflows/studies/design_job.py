@@ -21,12 +21,13 @@ from uq.evaluation.kept import KeptModel
 from workflows.studies.design_values import of_outputs
 from workflows.studies.job import MethodJob, TasksJob
 from workflows.studies.output_inversion import derivable
+from workflows.studies.predictions import has_mesh
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.fem.specimen import SpecimenModel
-    from forward.model import ForwardModel
+    from forward.model import FloatArray, ForwardModel, Solution
     from forward.spec import ModelSpec
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
@@ -48,7 +49,7 @@ def job(study: DesignStudy, ensemble: Ensemble, checkpoint: Checkpoint) -> Job:
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        return study.method.run(study.inputs, recorders["/"], values)
+        return study.method.run(study.inputs, recorders["/"], values, evaluate if has_mesh(study.spec) else None)
 
     return MethodJob(model, {}, task, recorders, lambda found: found, texts=lambda found: files(study, found))
 
@@ -102,7 +103,9 @@ def _of_field(
             raise
         ensemble.count(1, 0)
         sigma = method.sigma(values, solution.outputs[None])
-        return of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
+        mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
+        found = of_field(kept, solution, whitened, prior, prior.matern.mass, sigma, goals, method.rank, method.seed)
+        return found if mesh is None else found.assign(mesh_error=("value", mesh))
 
     def forget() -> None:
         while solving:
@@ -124,6 +127,15 @@ def _of_field(
         lambda found: found,
         texts=lambda found: files(study, found),
     )
+
+
+def uncalibrated(solution: Solution) -> FloatArray | None:
+    """Estimate what the mesh takes away from the outputs (m,) of a solution; None where nothing tells."""
+    try:
+        error = solution.mesh_error()
+    except SolveError:
+        return None
+    return None if error is None else error.outputs
 
 
 def values_of(spec: ModelSpec, model: Any) -> Values:

@@ -13,6 +13,7 @@ from scipy.stats import multivariate_normal
 
 from tests.launch import ROOT, TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
+from uq.findings import findings
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
 from workflows.run.run import run
@@ -251,6 +252,29 @@ def test_check_refuses_what_candidates_do_not_have(folder, method, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+@pytest.mark.fem
+def test_errors_of_the_mesh_are_told_and_count_as_noise(folder):
+    """They are those of the model at the medians, and what counts is √(σ² + e²)."""
+    one = "number = 3\nseed = 2"
+    found = load(cube(folder, one)).run()
+    study = load(cube(folder, one))
+    model = study.spec.build(MPI.COMM_SELF, study.inputs.names)
+    middle = study.inputs.points(np.full((1, 2), 0.5))[0]
+    right = model.solve(middle).mesh_error().outputs
+    np.testing.assert_allclose(found["value_mesh_error"], right, rtol=1e-6, atol=1e-9 * np.abs(right).max())
+    text = next(finding.text for finding in findings(found) if "err by more than the noise" in finding.text)
+    names, which = found["candidate"].values.tolist(), found["value_candidate"].to_numpy()
+    size = [np.sqrt(np.mean((right / found["value_sigma"].to_numpy())[which == k] ** 2)) for k in range(len(names))]
+    assert f"at {(np.array(size) > 1).sum()} of 31 candidates" in text
+    noisy = load(cube(folder, one + "\nmesh_error = 'noise'")).run()
+    np.testing.assert_allclose(noisy["value_sigma"], np.hypot(found["value_sigma"], right), rtol=1e-6)
+    assert float(noisy["information"][-1]) < float(found["information"][-1])
+    assert not [one for one in findings(noisy) if one.severity == "warning" and "err by more" in one.text]
+    without = load(cube(folder, one + "\nmesh_error = false")).run()
+    assert "value_mesh_error" not in without
+    np.testing.assert_array_equal(without["information"], found["information"])
 
 
 BUMPS = """
