@@ -1,7 +1,7 @@
 """Designs: chosen points against random ones, and chosen load cases against what synthetic inversions find.
 
-The shipped designs are run as they are (`configs/next/inclusion-design.toml`, `field-design.toml`), with all three
-criteria that apply. The load case is chosen for a cube with a ball (`benchmarks.calibration`), and then specimens are
+The shipped designs are run as they are (`configs/next/inclusion-design.toml`, `field-design.toml`,
+`field-prediction-design.toml`), with all criteria that apply, and that of a field with other errors. The load case is chosen for a cube with a ball (`benchmarks.calibration`), and then specimens are
 drawn from the prior, measured in one load case each, and inverted: ln p(y | truth) − ln p(y), with the evidence from
 weighted points, is on average the information that was predicted, if the linearisation is right.
 """
@@ -33,6 +33,8 @@ from workflows.studies.design_job import values_of
 CELLS, NOISE, SPECIMENS, DRAWS = 3, 0.02, 16, 32
 SAMPLES = 64
 LARGEST = 0.5  # error of an evidence (nat) that counts
+PARTS = ("cases", "inclusion", "field", "noise", "prediction")
+NOISES = (0.01, 0.03, 0.1, 0.3)  # of the field
 CASES = {
     "shear along x": ("traction", (1.0, 0.0, 0.0)),
     "shear along y": ("traction", (0.0, 1.0, 0.0)),
@@ -132,11 +134,17 @@ def main(given: Sequence[str] = ()) -> None:
     """Print what chosen observations are worth."""
     parser = ArgumentParser(prog="designs")
     parser.add_argument("--specimens", type=int, default=SPECIMENS)
-    parser.add_argument("--without-fields", action="store_true", help="fields take ten minutes")
+    parser.add_argument("--only", choices=PARTS, nargs="*", default=PARTS, help="all of them take a quarter of an hour")
     options = parser.parse_args(given)
-    load_cases(options.specimens)
-    shipped("inclusion-design")
-    shipped("inclusion-design", "method.criterion=parameters")
-    if not options.without_fields:
+    if "cases" in options.only:
+        load_cases(options.specimens)
+    if "inclusion" in options.only:
+        shipped("inclusion-design")
+        shipped("inclusion-design", "method.criterion=parameters")
+    if "field" in options.only:
         shipped("field-design")
         shipped("field-design", "method.criterion=parameters")
+    for noise in NOISES if "noise" in options.only else ():
+        shipped("field-design", "method.draws=2", "method.mesh_error=false", f"method.noise.relative={noise}")
+    if "prediction" in options.only:
+        shipped("field-prediction-design")
