@@ -19,6 +19,7 @@ from annotated_types import Gt
 from pydantic import Field, model_validator
 
 from forward.bodies.geometry import Body, Count, Length
+from forward.bodies.selected_inverse import Dissection
 from forward.model import FloatArray
 from forward.settings import Settings
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 PositiveFloat = Annotated[float, Gt(0)]
 Smoothness = Literal[2, 4]
 ROBIN = 1 / 1.42  # coefficient over κ: Y. Daon, G. Stadler, Inverse Probl. Imaging 12 (2018) 1083–1102
-BATCH = 128  # right-hand sides that are solved together
 EQUAL = 1e-6  # relative distance of eigenvalues below which rounding determines their eigenvectors
 
 
@@ -99,7 +99,7 @@ class RandomField(Settings):
         return NodalPrior(Matern.on(body, self.length, self.smoothness), self.log_std)
 
     def on(self, body: Body) -> Expansion:
-        """Expand the field on the vertices of a body, in this process: one factorisation, and a solve per vertex."""
+        """Expand the field on the vertices of a body, in this process."""
         offset = np.full(body.vertex_count, np.log(self.mean) - self.log_std**2 / 2)
         match self.basis:
             case "nodes":
@@ -219,6 +219,8 @@ class Matern:
     ----------
     mass, laplacian, surface
         M, K and B (N, N), of trilinear elements.
+    places
+        The vertices (N, 3).
     length
         Correlation length √(8ν)/κ (m).
     smoothness
@@ -237,13 +239,14 @@ class Matern:
         mass: csr_matrix,
         laplacian: csr_matrix,
         surface: csr_matrix,
+        places: FloatArray,
         length: float,
         smoothness: Smoothness = 2,
         robin: float = ROBIN,
     ) -> None:
         self._smoothness = smoothness
         self._kappa = inverse_length(length, smoothness)
-        self._matrix = mass
+        self._matrix, self._places = mass, places
         self.mass = np.asarray(mass.sum(axis=1)).ravel()
         self._operator = (self._kappa**2 * mass + laplacian + robin * self._kappa * surface).tocsr()
         self._factor = _factorise(self._operator)
@@ -275,16 +278,13 @@ class Matern:
 
     @cached_property
     def _raw_std(self) -> FloatArray:
-        """Point standard deviation (N,) of the solution of the SPDE, by a solve for each vertex."""
-        n = len(self.mass)
-        variance = np.empty(n)
-        for first in range(0, n, BATCH):
-            last = min(first + BATCH, n)
-            units = np.zeros((n, last - first))
-            units[np.arange(first, last), np.arange(last - first)] = 1
-            x = self._smooth(units)
-            variance[first:last] = (x * (self._matrix @ x)).sum(axis=0)
-        return np.asarray(np.sqrt(variance))
+        """Point standard deviation (N,) of the solution of the SPDE, exact to rounding.
+
+        (A + tM)⁻¹ = A⁻¹ − t A⁻¹MA⁻¹ + …, so that the variances are coefficients of its diagonal, with the other sign.
+        """
+        order = self._smoothness - 1
+        variance = -Dissection(self._matrix, self._places).diagonal_of_inverse(self._operator, self._matrix, order)
+        return np.sqrt(variance)
 
     @property
     def inflation(self) -> FloatArray:

@@ -10,7 +10,7 @@ G. Klimeck, E. Darve, J. Comput. Phys. 227 (2008) 9408–9427). The work is that
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,40 +84,58 @@ class Dissection:
         self._fronts.append(_Front(np.sort(own), border, before))
         return (len(self._fronts) - 1,)
 
-    def diagonal_of_inverse(self, matrix: Any) -> Any:
-        """Return the diagonal (N,) of the inverse of a symmetric matrix, real or complex."""
-        eliminated: list[tuple[Any, Any]] = []
-        waiting: dict[int, Any] = {}
+    def diagonal_of_inverse(self, matrix: csr_matrix, change: csr_matrix, order: int) -> FloatArray:
+        """Return the coefficient (N,) of t^order in the diagonal of (A + tM)⁻¹, of symmetric matrices A and M.
+
+        All arithmetic is that of polynomials in t, cut off after this power, so that nothing is lost by differences.
+        """
+        eliminated: list[tuple[FloatArray, FloatArray]] = []
+        waiting: dict[int, FloatArray] = {}
         position = np.zeros(self._size, dtype=np.int64)
-        matrix = matrix.tocsr()
         for k, front in enumerate(self._fronts):
             every = np.concatenate([front.own, front.border])
             position[every] = np.arange(len(every))
             s = len(front.own)
-            F = np.zeros((len(every), len(every)), dtype=matrix.dtype)
-            rows = matrix[front.own]
-            owner = np.repeat(np.arange(s), np.diff(rows.indptr))
-            known = np.isin(rows.indices, every)
-            F[owner[known], position[rows.indices[known]]] = rows.data[known]
-            F[s:, :s] = F[:s, s:].T
+            F = np.zeros((order + 1, len(every), len(every)))
+            for power, one in enumerate((matrix, change)[: order + 1]):
+                rows = one[front.own]
+                owner = np.repeat(np.arange(s), np.diff(rows.indptr))
+                known = np.isin(rows.indices, every)
+                F[power, owner[known], position[rows.indices[known]]] = rows.data[known]
+            F[:, s:, :s] = F[:, :s, s:].swapaxes(1, 2)
             for child in front.before:
                 at = position[self._fronts[child].border]
-                F[np.ix_(at, at)] += waiting.pop(child)
-            inverse = np.linalg.inv(F[:s, :s])
-            X = inverse @ F[:s, s:]
-            waiting[k] = F[s:, s:] - F[s:, :s] @ X
+                F[:, at[:, None], at] += waiting.pop(child)
+            inverse = _inverse(F[:, :s, :s])
+            X = _product(inverse, F[:, :s, s:])
+            waiting[k] = F[:, s:, s:] - _product(F[:, s:, :s], X)
             eliminated.append((inverse, X))
-        diagonal = np.empty(self._size, dtype=matrix.dtype)
-        below: dict[int, Any] = {}
+        diagonal = np.empty(self._size)
+        below: dict[int, FloatArray] = {}
         for k in range(len(self._fronts) - 1, -1, -1):
             front, (inverse, X) = self._fronts[k], eliminated.pop()
-            Z = below.pop(k, np.zeros((0, 0)))
-            of_border = -X @ Z
-            own = inverse - of_border @ X.T
-            diagonal[front.own] = np.diagonal(own)
-            whole = np.block([[own, of_border], [of_border.T, Z]])
-            position[np.concatenate([front.own, front.border])] = np.arange(len(whole))
+            s, b = len(front.own), len(front.border)
+            whole = np.empty((order + 1, s + b, s + b))
+            whole[:, s:, s:] = below.pop(k, 0.0)
+            whole[:, :s, s:] = -_product(X, whole[:, s:, s:])
+            whole[:, s:, :s] = whole[:, :s, s:].swapaxes(1, 2)
+            whole[:, :s, :s] = inverse - _product(whole[:, :s, s:], X.swapaxes(1, 2))
+            diagonal[front.own] = np.diagonal(whole[order])[:s]
+            position[np.concatenate([front.own, front.border])] = np.arange(s + b)
             for child in front.before:
                 at = position[self._fronts[child].border]
-                below[child] = whole[np.ix_(at, at)]
+                below[child] = whole[:, at[:, None], at]
         return diagonal
+
+
+def _product(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Multiply polynomials of matrices (order + 1, m, n)."""
+    return np.array([sum(one[i] @ other[k - i] for i in range(k + 1)) for k in range(len(one))])
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Invert a polynomial of matrices (order + 1, n, n)."""
+    found = [np.linalg.inv(matrix[0])]
+    for k in range(1, len(matrix)):
+        found.append(-found[0] @ sum(matrix[i] @ found[k - i] for i in range(1, k + 1)))
+    return np.array(found)

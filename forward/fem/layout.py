@@ -110,15 +110,15 @@ def sorted_by_place(space: Any, comm: Any) -> tuple[FloatArray, NDArray[np.int64
     return everywhere[order], canonical, canonical[before : before + len(parts[comm.rank])]
 
 
-def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix]:
-    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, vertices in canonical order.
+def vertex_matrices(body: Body) -> tuple[csr_matrix, csr_matrix, csr_matrix, FloatArray]:
+    """Return ∫vw dX, ∫∇v·∇w dX and ∫vw dS (N, N) of a body, and its vertices (N, 3), in canonical order.
 
     They use trilinear hexahedra, whatever the cells of the body: with tetrahedra on these vertices, correlations would
     depend on how the hexahedra are cut.
     Each calling process makes its own mesh: the numbers do not depend on how others share theirs.
     """
     space, matrices = assembly.trilinear_elements(body)
-    _, canonical, _ = sorted_by_place(space, space.mesh.comm)
+    places, canonical, _ = sorted_by_place(space, space.mesh.comm)
     order = np.argsort(canonical)
     mass, laplacian, surface = (matrix[order][:, order] for matrix in matrices)
-    return mass, laplacian, surface
+    return mass, laplacian, surface, places
