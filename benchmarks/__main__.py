@@ -26,6 +26,7 @@ from benchmarks import (
     mesh_error,
     meshes,
     multifidelity,
+    meshes_of_fields,
     oddities,
     others,
     phases,
@@ -73,6 +74,7 @@ ALL = {
     "coverage": coverage.main,
     "meshes": meshes.main,
     "multifidelity": multifidelity.main,
+    "meshes_of_fields": meshes_of_fields.main,
     "oddities": oddities.main,
     "held_out": held_out.main,
     "others": others.main,
@@ -92,6 +94,7 @@ WITH_OPTIONS = {
     "coverage": coverage.main,
     "meshes": meshes.main,
     "multifidelity": multifidelity.main,
+    "meshes_of_fields": meshes_of_fields.main,
     "oddities": oddities.main,
     "tolerance": tolerance.main,
 }

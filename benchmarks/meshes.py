@@ -1,10 +1,11 @@
 """Whether intervals hold the truth of data that have no mesh in common with the inversion.
 
-Specimens are drawn from the prior: a ball in a cube, or a random stiffness at its vertices. Their data are those of
-another code (`benchmarks.other_code`), on tetrahedra of degree 4, 24 times thinner at the held face; inversions are on
-4 quadratic hexahedra along an edge, or on what is asked for, by the defaults of studies. Of posteriors that are linear
-at the truth it is known in closed form how often intervals hold it, over all noise. What is made and found is kept in
-results/meshes-*, so that a run that is stopped goes on where it was, and one with more truths adds to what is there.
+Specimens are drawn from the prior: a ball in a cube; `benchmarks.meshes_of_fields` does so for a stiffness field.
+Their data are those of another code (`benchmarks.other_code`), on tetrahedra of degree 4, 24 times thinner at the held
+face; inversions are on 4 quadratic hexahedra along an edge, or on what is asked for, by the defaults of studies. Of
+posteriors that are linear at the truth it is known in closed form how often intervals hold it, over all noise. What is
+made and found is kept in results/meshes-*, so that a run that is stopped goes on where it was, and one with more truths
+adds to what is there.
 """
 
 from __future__ import annotations
@@ -31,10 +32,8 @@ from inverse.criticism.finer import Finer
 from inverse.data.approximation_error import ApproximationError, Places, Whitening
 from inverse.data.errors import NORMAL
 from inverse.data.observations import Components
-from inverse.fields.field_posterior import FieldPosterior
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_by_group
-from inverse.methods.invert_field import Vertices, invert_field
 from inverse.methods.mesh_correction import Treatment, error_of
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Uniform
 from uq.inputs.random_parameters import Inputs
@@ -44,14 +43,12 @@ from workflows.studies.finer import solved_on
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.bodies.random_fields import NodalPrior
 
 Factor = Callable[[FloatArray], FloatArray]  # places (n, 3) → (n,)
 
 CELLS, OVERKILL = 4, 5  # along an edge, of the inversion and of the data
 WIDE = 1.959964  # deviations of an interval of 95 %
-TRUTHS, ALSO_INVERTED, FIELDS, SEED = 20, 5, 2, 17
-DIRECTIONS = 4  # of a field, of which the data say most
+TRUTHS, ALSO_INVERTED, SEED = 20, 5, 17
 NOISES = (0.01, 0.03)  # of the root mean square of the displacements of each load case
 LMBDA, WIDTH = 4e4, 0.15
 FOLDER = Path("results")
@@ -71,16 +68,6 @@ INVERTED = (
     "mean less truth over deviation (rms)",
     "can be trusted",
     "of these, hold",
-    "CPU time of each (s)",
-)
-OF_FIELDS = (
-    "noise",
-    "error of the mesh over the noise",
-    "95 % intervals hold: vertices",
-    f"the {DIRECTIONS} directions of which the data say most",
-    "the mean over the body",
-    "mean less truth over deviation (rms) of these",
-    "can be trusted",
     "CPU time of each (s)",
 )
 PRIORS: dict[str, Distribution] = {
@@ -174,7 +161,6 @@ def main(options: Sequence[str] = ()) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks meshes")
     parser.add_argument("--truths", type=int, default=TRUTHS)
     parser.add_argument("--inverted", type=int, default=ALSO_INVERTED)
-    parser.add_argument("--fields", type=int, default=FIELDS)
     parser.add_argument("--seed", type=int, default=SEED, help="of the truths; what is uncertain was chosen on 16")
     parser.add_argument("--cells", type=int, default=CELLS, help="of the inversion, along an edge")
     parser.add_argument("--degree", type=int, default=2, help="of the inversion")
@@ -187,9 +173,6 @@ def main(options: Sequence[str] = ()) -> None:
         expect(case, [known(case, truth) for truth in truths[: given.truths]], clean[: given.truths])
     if given.inverted:
         invert(case, truths[: given.inverted], clean[: given.inverted], f"inverted-{mesh}")
-    if given.fields:
-        spec = specimen(given.cells, given.degree, field=True)
-        _invert_fields(spec, given.fields, given.seed, f"field-{mesh}")
 
 
 def expect(case: Case, at: Sequence[Known], clean: FloatArray, noises: Sequence[float] = NOISES) -> None:
@@ -305,23 +288,41 @@ def expected(
     The posterior is linearised at the truth, which is drawn from the prior: of its error Gain·(rest + noise) the noise
     and the prior make the variance, what is left of the error of the mesh the shift.
     """
-    from scipy.special import ndtr
-
-    sigma = _sigma(case.model, clean, noise)
+    sigma = sigma_of(case.model, clean, noise)
     mesh = known.error if treatment == "correct" else None
-    white = Whitening.of(sigma, mesh, NORMAL)
-    A = white((known.slopes / white.sigma[:, None]).T).T
-    covariance = np.linalg.inv(np.eye(A.shape[1]) + A.T @ A)
-    deviations = np.sqrt(np.diag(covariance))
-    gain = white(covariance @ A.T) / white.sigma
-    rest = clean - known.outputs - (0.0 if mesh is None else mesh.error)
-    shift = gain @ rest / deviations
-    spread = np.sqrt(np.diag((gain * sigma) @ (gain * sigma).T + covariance @ covariance)) / deviations
-    held = ndtr((WIDE - shift) / spread) - ndtr((-WIDE - shift) / spread)
+    held, shift = shares(known.slopes, np.eye(known.slopes.shape[1]), sigma, clean - known.outputs, mesh)
     return float(np.sqrt((((clean - known.outputs) / sigma) ** 2).mean())), held, shift
 
 
-def _sigma(model: SpecimenModel, clean: FloatArray, noise: float) -> FloatArray:
+def shares(
+    slopes: FloatArray, wanted: FloatArray, sigma: FloatArray, missed: FloatArray, mesh: ApproximationError | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return shares (q,) of data whose intervals hold the truth, and the shifts (q,) of these over deviations.
+
+    Parameters
+    ----------
+    slopes
+        Derivatives (m, d) of the data by coordinates that are standard normal a priori.
+    wanted
+        Rows (q, d) of what is asked for, in these coordinates.
+    sigma, missed
+        Standard deviations (m,) of the errors, and what the model misses (m,) in the data without them.
+    mesh
+        What it is corrected by.
+    """
+    from scipy.special import ndtr
+
+    white = Whitening.of(sigma, mesh, NORMAL)
+    A = white((slopes / white.sigma[:, None]).T).T
+    covariance = wanted @ np.linalg.inv(np.eye(A.shape[1]) + A.T @ A)
+    deviations = np.sqrt((covariance * wanted).sum(axis=1))
+    gain = white(covariance @ A.T) / white.sigma
+    shift = gain @ (missed - (0.0 if mesh is None else mesh.error)) / deviations
+    spread = np.sqrt(((gain * sigma) ** 2).sum(axis=1) + (covariance**2).sum(axis=1)) / deviations
+    return ndtr((WIDE - shift) / spread) - ndtr((-WIDE - shift) / spread), shift
+
+
+def sigma_of(model: SpecimenModel, clean: FloatArray, noise: float) -> FloatArray:
     """Standard deviations (m,) of the errors: a share of the root mean square of each load case."""
     sizes = np.array([np.sqrt((part**2).mean()) for part in model.values(clean)])
     return noise * sizes[model.cases]
@@ -333,24 +334,25 @@ def inverted(
     """Invert one data set."""
     begin = time.process_time()
     inputs, model, finer = case
-    data = _measured(model, clean, noise, seed)
+    data = measured(model, clean, noise, seed)
     found = invert_by_group(inputs, model, data, method, None, finer=finer)
     lower, upper, mean, std = (found[name].to_numpy() for name in ("lower", "upper", "mean", "std"))
     return {
         "held": (lower <= truth) & (truth <= upper),
         "gaps": (mean - truth) / std,
         "seconds": time.process_time() - begin,
-        "trust": _trusted(found),
+        "trust": trusted(found),
     }
 
 
-def _measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -> Components:
-    sigma = _sigma(model, clean, noise)
+def measured(model: SpecimenModel, clean: FloatArray, noise: float, seed: int) -> Components:
+    """Add errors to data (m,)."""
+    sigma = sigma_of(model, clean, noise)
     values = clean + sigma * np.random.default_rng([seed, 7]).standard_normal(len(clean))
     return Components(model.places, model.axes, model.cases, values, sigma)
 
 
-def _trusted(found: xr.Dataset) -> bool:
+def trusted(found: xr.Dataset) -> bool:
     """Whether a study would say that the posterior can be trusted, as far as its weights and the mesh are concerned."""
     error, shift, left = (found[name].to_numpy() for name in ("mesh_error", "mesh_shift", "mesh_left"))
     nodes = found["stiffness_mesh_shift"].to_numpy() if "stiffness_mesh_shift" in found else np.zeros(0)
@@ -365,68 +367,3 @@ def _trusted(found: xr.Dataset) -> bool:
 def enumerate_as_names(values: FloatArray) -> Iterator[tuple[str, float]]:
     """Give values (d,) names."""
     return ((str(k), value) for k, value in enumerate(values.tolist()))
-
-
-def _invert_fields(spec: Specimen, count: int, seed: int, name: str) -> None:
-    """Count in inversions for the stiffness at all vertices: vertices, the mean, and what the data say most about."""
-    model: SpecimenModel = spec.build(MPI.COMM_SELF, spec.coefficients)
-    prior = spec.fields[0].prior(spec.body)
-    root = prior.root(np.eye(len(prior.variance))).T
-    coordinates = np.random.default_rng([seed, 1]).standard_normal((count, len(root)))
-    offset = model.log_fields(np.zeros((1, len(root))))[0]
-    truths = offset + coordinates @ root.T
-    factors = [lattice(truth, model.vertices.coordinates) for truth in truths]
-    clean = made(model, f"fields-{spec.body.vertex_count}-{seed}", truths, factors, np.full(count, 1e4))
-    finer = solved_on(extrapolated(model, np.zeros(len(root))).observing(model))
-    vertices = Vertices(offset, prior.matern.mass)
-    row(OF_FIELDS, first=True)
-    for noise in NOISES:
-        rows = []
-        for k, truth in enumerate(truths):
-            data = _measured(model, clean[k], noise, k)
-            find = partial(_field_inverted, model, prior, data, vertices, finer, truth, root)
-            rows.append(kept(f"{name}-{k}-{noise:g}", truth, find))
-        size, nodes, mean, modes, trust, seconds = (np.array([row[name] for row in rows]) for name in rows[0])
-        within = [f"{100 * (np.abs(gaps) < WIDE).mean():.0f} %" for gaps in (nodes, modes)]
-        row(
-            (
-                f"{100 * noise:g} %",
-                f"{np.sqrt((size**2).mean()):.2f}",
-                *within,
-                f"{(np.abs(mean) < WIDE).sum()} of {count}",
-                ", ".join(f"{np.sqrt((gaps**2).mean()):.2f}" for gaps in (nodes, modes, mean)),
-                f"{trust.sum()} of {count}",
-                f"{seconds.mean():.0f}",
-            )
-        )
-
-
-def _field_inverted(
-    model: SpecimenModel,
-    prior: NodalPrior,
-    data: Components,
-    vertices: Vertices,
-    finer: Finer,
-    truth: FloatArray,
-    root: FloatArray,
-) -> dict[str, Any]:
-    """Invert one data set for a field."""
-    begin = time.process_time()
-    posterior = FieldPosterior(model, data.values, data.sigma, prior)
-    found = invert_field(posterior, data, Invert(), vertices, finer)
-    return _of_field(found, truth, prior.matern.mass, root) | {"s": time.process_time() - begin}
-
-
-def _of_field(found: xr.Dataset, truth: FloatArray, mass: FloatArray, root: FloatArray) -> dict[str, Any]:
-    """Mean less truth, over deviations: at the vertices, in the first directions, and of the mean over the body."""
-    gap = found["stiffness_mean"].to_numpy() - truth
-    values = found["eigenvalue"].to_numpy()[:DIRECTIONS]
-    along = np.linalg.solve(root, found["direction_stiffness"].to_numpy()[:DIRECTIONS].T)
-    whitened = np.linalg.solve(root, gap) @ (along / np.linalg.norm(along, axis=0))
-    return {
-        "size": float(np.sqrt((found["mesh_error"].to_numpy() ** 2).mean())),
-        "nodes": gap / found["stiffness_std"].to_numpy(),
-        "mean": float(mass @ gap / mass.sum() / found["std"].to_numpy()[0]),
-        "modes": whitened * np.sqrt(1 + values),
-        "trust": _trusted(found),
-    }

@@ -48,6 +48,8 @@ OF_EQUAL = 1.6  # order with which errors fall where cells are not graded toward
 OF_LINEAR = 0.1  # what quadratic cells of the same size still miss, over what they add to linear ones
 QUADRATIC = {"degree": 2, "quadrature_degree": None}
 HELD, BESIDE = 8.0, 4.0  # grading at the faces that are held, and at those that meet them in a rim
+# Iterations at a load, and the smallest step of it, after which thin cells are given up: answers took 10 and 1/8.
+ITERATIONS, LOAD_STEP = 12, 1 / 16
 VTK_TO_TENSOR = [0, 1, 3, 2, 4, 5, 7, 6]  # corners of a hexahedron, x first
 
 
@@ -140,14 +142,25 @@ def extrapolated(model: AnyModel, start: FloatArray | None = None) -> FinerMeshe
     """
     spec = model.spec
     fine, beside = finer(spec), graded(spec)
-    coarse = None if beside is None else OtherMesh(model, beside)
     otherwise = None
     if not isinstance(spec.body, MeshFile) and fine.body.grading != spec.body.grading:
-        equal, less = (_on(spec, times, thin=False) for times in (TIMES, 1.0))
+        equal, less = (_hurried(_on(spec, times, thin=False), spec.solver.minimum_load_step) for times in (TIMES, 1.0))
         times = (equal.body.cell_count / less.body.cell_count) ** (1 / 3)
         other = None if less.body == spec.body else OtherMesh(model, less)
         otherwise = FinerMeshes(model, OtherMesh(model, equal), other, 1 / (times**OF_EQUAL - 1), start)
+        fine, beside = _hurried(fine, LOAD_STEP), None if beside is None else _hurried(beside, LOAD_STEP)
+    coarse = None if beside is None else OtherMesh(model, beside)
     return FinerMeshes(model, OtherMesh(model, fine), coarse, share(spec), start, otherwise)
+
+
+def _hurried(spec: Any, smallest: float) -> Any:
+    """Return a body whose solver gives up sooner: at a load, and at a smallest step of it, where other meshes wait."""
+    known = spec.solver
+    limits = {
+        "iterations": min(known.iterations, ITERATIONS),
+        "minimum_load_step": max(known.minimum_load_step, smallest),
+    }
+    return spec.model_copy(update={"solver": known.model_copy(update=limits)})
 
 
 class FinerMeshes:

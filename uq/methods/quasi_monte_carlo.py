@@ -67,7 +67,8 @@ class QuasiMonteCarlo(MonteCarlo):
         Number of samples in all, `scrambles` times a power of two; with a tolerance, the largest number.
     tolerance
         As in `MonteCarlo`: the number of points is doubled until it is met, and all earlier points are kept. The error
-        compared with it is itself uncertain (by 18 % for 16 scrambles).
+        compared with it is itself uncertain (by 18 % for 16 scrambles). For the tolerance of a study, of all errors,
+        half as many scrambles more are taken in place of that where they are predicted to be enough.
     seed
         Point z of scramble r of a seed is the same in every study with as many parameters.
     scrambles
@@ -198,25 +199,26 @@ class QuasiMonteCarlo(MonteCarlo):
         samples = _Samples(
             self, inputs, evaluate, centre, control, held, start, None if fitted is None else fitted.rest
         )
-        last = self.limit // self.scrambles
-        if goal is not None:
-            left = max(goal.most - evaluate.solves, self.scrambles)
-            last = min(last, power_of_two(left // self.scrambles))
-        open_ended, half_width = self.open_ended or goal is not None, student(self.scrambles - 1)
+        most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
+        last = power_of_two(most // self.scrambles)
+        open_ended = self.open_ended or goal is not None
         first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if open_ended else last
         samples.extend(first)
         scalars = samples.scalars(first)
 
-        def enough() -> bool:
+        def missed() -> float:
             if goal is not None:
-                return goal.reached(scalars, half_width) <= 1
-            return self.met(float(scalars.relative_error.max()))
+                return goal.reached(scalars, student(samples.scrambles - 1))
+            return np.inf if not self.met(float(scalars.relative_error.max())) else 0.0
 
-        while not enough() and samples.each < last:
-            if self.scrambles * samples.each > self.affordable(evaluate.solves, evaluate.seconds):
+        while (left := missed()) > 1:
+            wider = samples.wider if left * samples.gained <= 1 else samples.scrambles
+            each = samples.each * (1 if wider > samples.scrambles else 2)
+            further = wider * each - samples.count
+            if wider * each > most or further > self.affordable(evaluate.solves, evaluate.seconds):
                 break
-            samples.extend(2 * samples.each)
-            scalars = samples.scalars(samples.each)
+            samples.extend(each, wider)
+            scalars = samples.scalars(each)
         return self._dataset(inputs, evaluate, centre, fitted, samples, scalars, as_asked=goal is None)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
@@ -248,7 +250,9 @@ class QuasiMonteCarlo(MonteCarlo):
         running = [(each, samples.scalars(each)) for each in samples.rounds if samples.usable(each)]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
-        dataset = dataset.assign_coords(quantile=list(self.quantiles), round=[self.scrambles * n for n, _ in running])
+        dataset = dataset.assign_coords(
+            quantile=list(self.quantiles), round=[samples.scrambles * n for n, _ in running]
+        )
         dataset = dataset.assign(
             {
                 **{name: (by_output, getattr(scalars, name)) for name in ESTIMATES},
@@ -277,7 +281,7 @@ class QuasiMonteCarlo(MonteCarlo):
         if field is not None:
             dataset = dataset.assign(by_node(field, evaluate.displacements))
             add(dataset, *samples.field_doubts(field))
-        amount = f"{ok.size} samples ({self.scrambles} scrambles of {samples.each} Sobol' points)"
+        amount = f"{ok.size} samples ({samples.scrambles} scrambles of {samples.each} Sobol' points)"
         reached = float(scalars.relative_error.max())
         error = f"relative error {reached:.3g}"
         asked = self.why_stopped(reached, error, ok.size, self.limit, amount) if as_asked else f"{amount}: {error}"
@@ -348,15 +352,35 @@ class _Samples:
     ) -> None:
         self._method, self._inputs, self._evaluate = method, inputs, evaluate
         self._centre, self._control, self._held, self._start, self._rest = centre, control, held, start, rest
-        R, d, m = method.scrambles, len(inputs.names), len(evaluate.outputs)
+        d, m = len(inputs.names), len(evaluate.outputs)
         self._field_control = control if control is not None and len(control.state) else None
         self.each = 0
-        self.points = np.empty((R, 0, d))
-        self.outputs = np.empty((R, 0, m))
-        self.ok = np.empty((R, 0), dtype=bool)
-        self._sums: list[FloatArray | None] = [None] * R
+        self.points = np.empty((method.scrambles, 0, d))
+        self.outputs = np.empty((method.scrambles, 0, m))
+        self.ok = np.empty((method.scrambles, 0), dtype=bool)
+        self._sums: list[FloatArray | None] = [None] * method.scrambles
         self._higher: FloatArray | None = None
         self._reasons: set[str] = set()
+
+    @property
+    def scrambles(self) -> int:
+        """Number R of scrambles."""
+        return len(self.points)
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.scrambles * self.each
+
+    @property
+    def wider(self) -> int:
+        """Number of scrambles where half as many samples more are to be enough."""
+        return self.scrambles + self.scrambles // 2
+
+    @property
+    def gained(self) -> float:
+        """What so many scrambles make of half the width of an interval."""
+        return float(np.sqrt(self.scrambles / self.wider) * student(self.wider - 1) / student(self.scrambles - 1))
 
     @property
     def rounds(self) -> list[int]:
@@ -366,36 +390,53 @@ class _Samples:
     @property
     def scramble(self) -> NDArray[np.int64]:
         """Scramble (R n,) of each sample in the order of results."""
-        return np.tile(np.arange(self._method.scrambles), self.each)
+        return np.tile(np.arange(self.scrambles), self.each)
 
     def in_order(self, values: NDArray) -> NDArray:  # type: ignore[type-arg]
         """Flatten (R, n, …) to (R n, …), first points of all scrambles first: a shorter study is a prefix."""
         return np.ascontiguousarray(values.swapaxes(0, 1)).reshape(-1, *values.shape[2:])
 
-    def extend(self, each: int) -> None:
-        """Go on to `each` points in every scramble."""
+    def extend(self, each: int, scrambles: int | None = None) -> None:
+        """Go on to `each` points in every scramble, of which there may be more from now on."""
+        R, more = self.scrambles, (scrambles or self.scrambles) - self.scrambles
+        self._sums += [None] * more
+        outputs, ok, points = self._solved(range(R), self.each, each)
+        self.points = np.concatenate([self.points, points], axis=1)
+        self.outputs = np.concatenate([self.outputs, outputs], axis=1)
+        self.ok = np.concatenate([self.ok, ok], axis=1)
+        if more:
+            outputs, ok, points = self._solved(range(R, R + more), 0, each)
+            self.points = np.concatenate([self.points, points])
+            self.outputs = np.concatenate([self.outputs, outputs])
+            self.ok = np.concatenate([self.ok, ok])
+        self.each = each
+
+    def _solved(self, scrambles: range, start: int, stop: int) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
+        """Outputs (r, n, m), answers (r, n) and points (r, n, d) of some scrambles, from a number of point to another.
+
+        Their fields are added to the sums.
+        """
         method, centre = self._method, self._centre
-        d, new = len(self._inputs.names), each - self.each
-        R = method.scrambles
-        cubes = [sobol_points(method.seed, r, self.each, each, d) for r in range(R)]
-        points = self._inputs.points(np.concatenate(cubes)).reshape(R, new, d)
-        outputs, ok = np.empty((R, new, self.outputs.shape[2])), np.empty((R, new), dtype=bool)
+        r, d, new = len(scrambles), len(self._inputs.names), stop - start
+        outputs, ok = np.empty((r, new, self.outputs.shape[2])), np.empty((r, new), dtype=bool)
+        points = np.empty((r, new, d))
+        if not new:
+            return outputs, ok, points
+        cubes = [sobol_points(method.seed, number, start, stop, d) for number in scrambles]
+        points = self._inputs.points(np.concatenate(cubes)).reshape(r, new, d)
         if method.fields and centre.state.size:
             wanted = _FieldProducts(centre.state, self._field_control)
-            for r in range(R):
-                found = self._ask(Request(points[r], fields=wanted, start=self._start))
-                outputs[r], ok[r] = found.outputs, found.ok
+            for row, number in enumerate(scrambles):
+                found = self._ask(Request(points[row], fields=wanted, start=self._start))
+                outputs[row], ok[row] = found.outputs, found.ok
                 if found.fields.size:
-                    kept, products, higher = self._sums[r], found.fields[:-2], found.fields[-2:]
-                    self._sums[r] = products if kept is None else kept + products
+                    kept, products, higher = self._sums[number], found.fields[:-2], found.fields[-2:]
+                    self._sums[number] = products if kept is None else kept + products
                     self._higher = higher if self._higher is None else self._higher + higher
         else:
             found = self._ask(Request(points.reshape(-1, d), start=self._start))
             outputs, ok = found.outputs.reshape(outputs.shape), found.ok.reshape(ok.shape)
-        self.each = each
-        self.points = np.concatenate([self.points, points], axis=1)
-        self.outputs = np.concatenate([self.outputs, outputs], axis=1)
-        self.ok = np.concatenate([self.ok, ok], axis=1)
+        return outputs, ok, points
 
     def _ask(self, request: Request) -> Evaluations:
         found = self._evaluate(request)
@@ -412,7 +453,7 @@ class _Samples:
         if not self.usable(each):
             answers = int(self.ok[:, :each].any(axis=1).sum())
             reasons = "; ".join(sorted(self._reasons)[:3])
-            message = f"{answers} of {self._method.scrambles} scrambles have an answer, expected more: {reasons}"
+            message = f"{answers} of {self.scrambles} scrambles have an answer, expected more: {reasons}"
             raise SolveError(message)
         centre = self._centre
         ok = self.ok[:, :each]

@@ -100,7 +100,10 @@ def _told(
     row, column = np.unravel_index(int(np.argmax(np.nan_to_num(parts["total"]))), parts["total"].shape)
     meshes = [] if before is None else before["meshes"]
     never = told_of(study).never
-    known = before is None or all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
+    if before is None:  # nothing to be known, or not asked for; else it was too much
+        known = not study.spec.meshed or not study.accuracy.mesh_error
+    else:
+        known = all(_corrected(found, i) for i, name in enumerate(names) if name not in never)
     return {
         "tolerance": goal.tolerance,
         "reached": float(goal.tolerance * parts["total"][row, column]),
@@ -199,7 +202,7 @@ def _findings(study: Study, told: dict[str, Any]) -> Iterator[Finding]:
         f"(of the tolerance: {taken})."
     )
     if shares["mesh"] > 1 - shares["solver"] or shares["total"] <= 1:  # which is then not known
-        why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else ""
+        why = f" {told['reasons'][0]}" if told["mesh"]["tried"] else " The error of the mesh is not known."
     else:
         why = f" More solves than accuracy.solves = {study.accuracy.solves:,} would be needed."
     yield Finding("error", text + why)  # a script that asked for it would go on with less

@@ -7,6 +7,7 @@ import pytest
 
 from forward.model import FunctionModel
 from uq.accuracy.goal import Goal
+from uq.estimators.moments import half_width
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
 from uq.findings import findings
 from uq.inputs.distributions import LogNormal, Normal, Uniform
@@ -156,6 +157,26 @@ def test_a_given_method_stops_at_the_goal(method):
     assert solves < (20_000 if method.kind == "monte-carlo" else 3_000)
     assert "as asked" not in found.attrs["stopped"]
     assert not any(one.severity == "error" for one in findings(found))
+
+
+def test_where_half_as_many_samples_more_are_enough_scrambles_are_added():
+    goal = Goal.of(0.03, ["1"], 10_000)
+    found, solves = solved(QuasiMonteCarlo(samples=8192, control="none", fields=False), two(), model(hinge), goal)
+    n = 16
+    assert int(found["scramble"].max()) + 1 == 24
+    assert solves == 1 + 24 * n
+    # The same points as if there had been so many from the start, and the same estimates.
+    plain = QuasiMonteCarlo(samples=24 * n, scrambles=24, control="none", fields=False)
+    whole = plain.run(two(), model(hinge))
+    for name in ("points", "scramble", "mean", "mean_error", "std", "std_error", "round"):
+        assert np.array_equal(found[name], whole[name])
+    few = QuasiMonteCarlo(samples=16 * n, control="none", fields=False).run(two(), model(hinge))
+    widths = [half_width(one) * one["std_error"].item() / one["std"].item() for one in (few, found)]
+    assert widths[0] > 0.03 >= widths[1]
+    # As many as are allowed, and no more.
+    fewer = Goal.of(goal.tolerance, ["1"], 300)
+    _, solves = solved(QuasiMonteCarlo(samples=8192, control="none", fields=False), two(), model(hinge), fewer)
+    assert solves == 1 + 16 * n
 
 
 def test_it_does_nothing_without_a_tolerance():

@@ -364,6 +364,30 @@ def test_what_is_not_reached_is_said(tmp_path):
     assert "accuracy.memory = 16 MiB" in texts[0]
 
 
+@pytest.mark.fem
+@pytest.mark.parametrize(
+    ("setting", "kept", "said"),
+    [
+        ("accuracy={tolerance=0.1, memory=1}", False, "more than accuracy.memory = 1 MiB"),
+        ("accuracy={tolerance=0.1, mesh_error=false}", True, "accuracy.mesh_error = false"),
+    ],
+)
+def test_an_error_of_the_mesh_that_is_not_known_keeps_no_tolerance_unless_it_was_not_asked_for(
+    tmp_path, setting, kept, said
+):
+    study = load(TINY, [*COARSE, setting, "model.body.degree=1"])
+    assert not study.estimates
+    study.run(tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    told, errors = summary["accuracy"], [one for one in summary["findings"] if one["severity"] == "error"]
+    assert told["kept"] is kept
+    assert not told["mesh"]["estimated"]
+    assert told["shares"]["total"] <= 1
+    assert len(errors) == (not kept)
+    assert kept or "The error of the mesh is not known" in errors[0]["text"]
+    assert any(said in one["text"] for one in summary["findings"])
+
+
 @pytest.mark.unit
 def test_too_few_solves_are_said(tmp_path):
     study = without_method(1e-9, solves=16)
