@@ -1,9 +1,10 @@
 """Designs: chosen points against random ones, and chosen load cases against what synthetic inversions find.
 
 The shipped designs are run as they are (`configs/next/inclusion-design.toml`, `field-design.toml`,
-`field-prediction-design.toml`), with all criteria that apply, and that of a field with other errors. The load case is chosen for a cube with a ball (`benchmarks.calibration`), and then specimens are
-drawn from the prior, measured in one load case each, and inverted: ln p(y | truth) − ln p(y), with the evidence from
-weighted points, is on average the information that was predicted, if the linearisation is right.
+`field-prediction-design.toml`), with all criteria that apply, and that of a field with other errors. The load case is
+chosen for a cube with a ball (`benchmarks.calibration`), and then specimens are drawn from the prior, measured in one
+load case each, and inverted: ln p(y | truth) − ln p(y), with the evidence from weighted points, is on average the
+information that was predicted, if the linearisation is right.
 """
 
 from __future__ import annotations
