@@ -6,7 +6,6 @@ Nothing is solved, but for specimens whose draws do not reach the population (`w
 from __future__ import annotations
 
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,7 +20,7 @@ from workflows.config.blocks import Parallel
 from workflows.config.mistakes import StudyError, refused
 from workflows.config.report import Report
 from workflows.studies.job import Job
-from workflows.studies.posteriors import LETTERS, specimens
+from workflows.studies.posteriors import digest_of, specimens
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -112,10 +111,13 @@ class PopulationStudy(StudyKind):
             posteriors = self.posteriors
             Scale.of(self.method.distribution, posteriors)
             Columns.of(self.method.covariates, list(posteriors)).row(self.method.new)
-            found = sha256((source / "results.nc").read_bytes()).hexdigest()[:LETTERS]
+            found = digest_of(self.method.source)
         except (ValueError, StudyError) as error:
             refused("Population", [(place, str(error), self.method.source)])
             raise
+        if self.method.study is not None and not Path(self.method.study).is_file():
+            message = "is not there, expected the file of the study that the source is of"
+            refused("Population", [(("method", "study"), message, self.method.study)])
         if digest and found != digest:
             message = f"has changed since the study was begun: hash {digest} → {found}"
             refused("Population", [(place, message, self.method.source)])

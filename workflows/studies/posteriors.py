@@ -19,7 +19,7 @@ from uq.evaluation.hdf5 import variables
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from workflows.config.priors import findings_of_impossible
-from workflows.config.source import KEPT
+from workflows.config.source import AVERAGED, KEPT, STACKED
 from workflows.studies.tables_of_draws import of_table
 
 if TYPE_CHECKING:
@@ -97,16 +97,28 @@ def _of_results(path: Path, group: str | None, model: str | None) -> Draws:
     if kind not in READERS:
         message = f"{path}: is a study of kind '{kind}', which has no posterior, expected one of: {', '.join(READERS)}"
         raise ValueError(message)
-    content = (path / "results.nc").read_bytes()
-    found = {name: one.values for name, one in variables(content)[0].items()}
-    digest = sha256(content).hexdigest()[:LETTERS]
-    return READERS[kind](path, found, group, model, digest)
+    found = {name: one.values for name, one in _content(path)[0].items()}
+    try:
+        return READERS[kind](path, found, group, model, digest_of(str(path)))
+    except KeyError as error:
+        message = f"{path}: its results.nc has no {error}, expected one that this version has made: run it again"
+        raise ValueError(message) from None
+
+
+def _content(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return variables and attributes of results.nc; a ValueError says that it cannot be read."""
+    try:
+        return variables((path / "results.nc").read_bytes())
+    except (OSError, KeyError, RuntimeError, ValueError):
+        message = f"{path / 'results.nc'}: missing or damaged, expected that of a finished study: run it again"
+        raise ValueError(message) from None
 
 
 def _summary(path: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found.keys()  # a list has none
+    except (OSError, ValueError, AttributeError):
         begun = (path / "study.toml").exists()
         what = "holds an unfinished study" if begun else "holds no results" if path.exists() else "is not there"
         message = f"{path}: {what}, expected the directory of a finished study of kind 'select' or 'invert'"
@@ -123,7 +135,8 @@ def _chosen(what: str, given: str | None, known: Sequence[str], path: Path) -> i
         message = f"{path}: has several {what}s, expected {what} = one of: {', '.join(known)}"
         raise ValueError(message)
     if given is not None and given not in known:
-        message = f"{what} = '{given}' is not in {path}; {nearest(given, list(known))}"
+        words = [*known, BEST, AVERAGED, STACKED] if what == "model" else list(known)
+        message = f"{what} = '{given}' is not in {path}; {nearest(given, words)}"
         raise ValueError(message)
     return 0 if given is None else known.index(given)
 
@@ -206,7 +219,7 @@ def candidates(file: str, by: str) -> list[NamedCandidate]:
     if kind != "select":
         message = f"{path}: is a study of kind '{kind}', expected 'select' for model = 'averaged' or 'stacked'"
         raise ValueError(message)
-    found = variables((path / "results.nc").read_bytes())[0]
+    found = _content(path)[0]
     if by not in found:
         message = f"{path}: has no weights of stacking, as it was made by an earlier version: run it again"
         raise ValueError(message)
@@ -223,6 +236,7 @@ def digest_of(file: str) -> str:
     """Return the hash of a source; a ValueError says that it is not there."""
     path = _directory(file)
     _summary(path)
+    _content(path)
     return sha256((path / "results.nc").read_bytes()).hexdigest()[:LETTERS]
 
 
@@ -237,12 +251,12 @@ def specimens(file: str, model: str | None) -> dict[str, Draws]:
     ValueError
         As `read`.
     """
-    path = Path(file)
+    path = _directory(file)
     summary = _summary(path)
     if summary.get("method") not in ("select", "invert"):
         message = f"{path}: is a study of kind '{summary.get('method')}', expected 'select' or 'invert'"
         raise ValueError(message)
-    found = variables((path / "results.nc").read_bytes())[0]
+    found = _content(path)[0]
     if summary["method"] == "select":
         return {name: read(file, name, model) for name in map(str, found["group"].values)}
     done = np.atleast_1d(found["ok"].values).astype(bool)
@@ -252,13 +266,13 @@ def specimens(file: str, model: str | None) -> dict[str, Draws]:
 
 def source_blocks(file: str) -> dict[str, Any]:
     """Return the blocks of the study that left results in a directory."""
-    attributes = variables((Path(file) / "results.nc").read_bytes())[1]
+    attributes = _content(_directory(file))[1]
     return tomllib.loads(str(attributes["config"]))
 
 
 def candidate_of(file: str, model: str | None) -> str:
-    """Return the name of the candidate that is meant, or that is the most probable."""
-    found = variables((Path(file) / "results.nc").read_bytes())[0]
+    """Return the name of the candidate that is meant, or that is the most probable; errors as of `read`."""
+    found = _content(_directory(file))[0]
     best = str(found["model"].values[int(np.nanargmax(found["probability"].values))])
     return best if model in (None, BEST) else str(model)
 
@@ -268,7 +282,7 @@ def prior_of(file: str, model: str | None, names: Sequence[str]) -> Inputs:
     from workflows.config.study import parse
 
     blocks = source_blocks(file)
-    study: Any = parse(blocks, folder=Path(file))
+    study: Any = parse(blocks, folder=_directory(file))
     inputs: Inputs = study.models[candidate_of(file, model)].inputs if "candidates" in blocks else study.inputs
     return Inputs({name: inputs.marginals[name] for name in names}, inputs.correlations)
 

@@ -589,6 +589,41 @@ def test_populations_that_cannot_be(selected, tmp_path, source, more, said):
     assert said in line
 
 
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda one: (one / "results.nc").write_bytes((one / "results.nc").read_bytes()[:9000]), "missing or damaged"),
+        (
+            lambda one: (one / "results.nc").unlink(),
+            "results.nc: missing or damaged, expected that of a finished study",
+        ),
+        (lambda one: (one / "summary.json").write_text("[]"), "expected the directory of a finished study"),
+        (lambda one: (one / "summary.json").unlink(), "holds an unfinished study"),
+    ],
+)
+def test_damaged_sources_are_one_line(selected, tmp_path, damage, said):
+    """Of a population, of draws, and of averages over candidates."""
+    shutil.copytree(selected[0] / "results", tmp_path / "hurt")
+    damage(tmp_path / "hurt")
+    assert said in mistake(population(tmp_path, tmp_path / "hurt", 'model = "neo-hookean"'))
+    for model in ("neo-hookean", "averaged"):
+        source = {"file": str(tmp_path / "hurt"), "group": "one", "model": model}
+        with pytest.raises(StudyError) as error:
+            parse(BODY | {"parameters": {"from": source}})
+        assert len(error.value.args) == 1
+        assert said in error.value.args[0]
+
+
+def test_a_source_may_be_named_by_its_file(selected, tmp_path):
+    more = 'model = "neo-hookean"'
+    one, other = (load(population(tmp_path, selected[0] / name, more)) for name in ("results", "results/results.nc"))
+    assert one.method.digest == other.method.digest
+    line = mistake(population(tmp_path, selected[0] / "results", f'{more}\nstudy = "nowhere.toml"'))
+    assert line.startswith("method.study: is not there, expected the file of the study that the source is of; given")
+    line = mistake(population(tmp_path, selected[0] / "results", 'model = "neo-hokean"'))
+    assert "did you mean 'neo-hookean'?" in line
+
+
 # --- averages over candidates -----------------------------------------------------------------------------------------
 
 
