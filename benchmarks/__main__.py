@@ -33,6 +33,7 @@ from benchmarks import (
     population,
     predictions,
     realisation,
+    reduced,
     scaling,
     selection,
     sizes,
@@ -48,6 +49,7 @@ from benchmarks import (
 
 ALL = {
     "realisation": realisation.main,
+    "reduced": reduced.main,
     "bookkeeping": bookkeeping.main,
     "throughput": throughput.main,
     "tolerance": tolerance.main,

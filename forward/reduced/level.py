@@ -42,6 +42,13 @@ class Integrand:
         return self._derived(())
 
     @cached_property
+    def dead(self) -> bool:
+        """Whether its outputs do not depend on the state."""
+        graph, outputs = self._written.tape.graph()
+        slopes = (one for i in range(self.components) for one in graph.tangent(outputs, i))
+        return all(graph.value(one) == 0 for one in slopes)
+
+    @cached_property
     def _by_state(self) -> Kernel:
         return self._derived(range(self.components))
 
@@ -120,23 +127,30 @@ class Level:
 
     def forces(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, float]:
         """Return the forces (N,) on all coordinates, and the size that they would have if they did not cancel."""
-        R, numbers, coefficients = self._dead(parameters), self.numbers(parameters), self.coefficients(parameters)
-        size = float(np.abs(R[self.free]).max(initial=0.0))
-        for work in self.works:
-            part = work.values(work.inputs(c, coefficients), numbers).ravel() @ work.weighted
-            size = max(size, float(np.abs(part[self.free]).max(initial=0.0)))
-            R += part
-        return R, max(size, float(np.abs(R[: self.before]).max(initial=0.0)))
+        numbers, coefficients = self.numbers(parameters), self.coefficients(parameters)
+        ofs = ((work, work.values(work.inputs(c, coefficients), numbers)) for work in self.works)
+        return self._summed([self._dead(parameters), *(T.ravel() @ work.weighted for work, T in ofs)])
 
-    def stiffness(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the forces (N,) and their derivative (N, N) by all coordinates."""
-        R, numbers, coefficients = self._dead(parameters), self.numbers(parameters), self.coefficients(parameters)
-        K = np.zeros((self.count, self.count))
+    def stiffness(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return the forces (N,), their derivative (N, N) by all coordinates, and that size."""
+        numbers, coefficients = self.numbers(parameters), self.coefficients(parameters)
+        parts, K = [self._dead(parameters)], np.zeros((self.count, self.count))
         for work in self.works:
-            T, H = work.by_state(work.inputs(c, coefficients), numbers)
-            R += T.ravel() @ work.weighted
+            inputs = work.inputs(c, coefficients)
+            if work.dead:
+                parts.append(work.values(inputs, numbers).ravel() @ work.weighted)
+                continue
+            T, H = work.by_state(inputs, numbers)
+            parts.append(T.ravel() @ work.weighted)
             K += work.weighted.T @ spread(H, work.fields).reshape(-1, self.count)
-        return R, K
+        R, size = self._summed(parts)
+        return R, K, size
+
+    def _summed(self, parts: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+        every = np.array(parts)
+        R = every.sum(axis=0)
+        largest = float(np.abs(every[:, self.free]).max(initial=0.0))
+        return R, max(largest, float(np.abs(R[: self.before]).max(initial=0.0)))
 
     def by_parameters(self, c: FloatArray, parameters: FloatArray, K: FloatArray) -> FloatArray:
         """Return the derivatives (N, d) of the forces by the parameters at coordinates of the modes that stay."""
@@ -167,6 +181,10 @@ class Level:
     def outputs(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
         """Return the outputs (m,)."""
         return np.array([output.value(c, parameters) for output in self._outputs])
+
+    def some_outputs(self, which: Sequence[int], c: FloatArray, parameters: FloatArray) -> list[float]:
+        """Return some of the outputs, by number."""
+        return [self._outputs[i].value(c, parameters) for i in which]
 
     def output_slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray

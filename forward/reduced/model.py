@@ -164,7 +164,7 @@ class ReducedModel(OneByOne):
         c = level.coordinates(whole, modes)
         step, before, still = np.zeros(level.modes), np.inf, False
         for _ in range(ITERATIONS):
-            R, K = level.stiffness(c, whole)
+            R, K, scale = level.stiffness(c, whole)
             work.assemblies += 1
             size = float(np.abs(R[free]).max(initial=0.0))
             shortened = 0
@@ -173,12 +173,10 @@ class ReducedModel(OneByOne):
                     return None
                 step = step / 2
                 c[free] -= step
-                R, K = level.stiffness(c, whole)
+                R, K, scale = level.stiffness(c, whole)
                 work.assemblies += 1
                 size = float(np.abs(R[free]).max(initial=0.0))
                 shortened += 1
-            _, scale = level.forces(c, whole)
-            work.residuals += 1
             if size <= TOLERANCE * scale or still:
                 return c, K
             before = size
@@ -277,7 +275,7 @@ class ReducedSolution:
         K: FloatArray,
         work: Work,
     ) -> None:
-        self._model, self._whole, self._K, self.work = model, whole, K, work
+        self._model, self._whole, self.stiffness, self.work = model, whole, K, work
         self.parameters, self.c = np.array(parameters), c
         self.outputs = model.level.outputs(c, whole)[model.which]
         self.stability = self._stability()
@@ -289,7 +287,7 @@ class ReducedSolution:
         free = self._model.level.free
         if not self._model.tested:
             return Stability.NOT_TESTED
-        K = self._K[free, free]
+        K = self.stiffness[free, free]
         try:
             np.linalg.cholesky((K + K.T) / 2)
         except np.linalg.LinAlgError:
@@ -306,41 +304,41 @@ class ReducedSolution:
 
     @cached_property
     def _F(self) -> FloatArray:
-        return self._model.level.by_parameters(self.c, self._whole, self._K)
+        return self._model.level.by_parameters(self.c, self._whole, self.stiffness)
 
     @cached_property
-    def _slopes(self) -> FloatArray:
+    def slopes(self) -> FloatArray:
         """Derivatives (N, d) of the coordinates by the parameters of the model."""
         level, places = self._model.level, self._model.places
         slopes = np.zeros((level.count, len(self._whole)))
         for k, (number, _) in enumerate(self._model.data.lifts):
             if number >= 0:
                 slopes[k, number] = 1.0
-        slopes[level.free] = -np.linalg.solve(self._K[level.free, level.free], self._F[level.free])
+        slopes[level.free] = -np.linalg.solve(self.stiffness[level.free, level.free], self._F[level.free])
         self.work.factorisations += 1
         self.work.back_substitutions += slopes.shape[1]
         return slopes[:, places]
 
     @cached_property
-    def _jacobian(self) -> FloatArray:
+    def jacobian(self) -> FloatArray:
         """Derivatives (m, d) of the outputs."""
         model = self._model
-        by_state, directly = model.level.output_slopes(self.c, self._whole, self._K, self._F)
+        by_state, directly = model.level.output_slopes(self.c, self._whole, self.stiffness, self._F)
         free = model.level.free
-        found = by_state[:, free] @ self._slopes[free] + directly[:, model.places]
+        found = by_state[:, free] @ self.slopes[free] + directly[:, model.places]
         return np.asarray(found[model.which])
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
-        return np.asarray(direction) @ self._jacobian.T
+        return np.asarray(direction) @ self.jacobian.T
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them."""
-        return np.asarray(weights) @ self._jacobian
+        return np.asarray(weights) @ self.jacobian
 
     def state_tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the state (U,) along a `direction` (d,), or (k, U) for k of them."""
-        return np.asarray(direction) @ self._slopes.T @ self._model.data.fields[: len(self.c)]
+        return np.asarray(direction) @ self.slopes.T @ self._model.data.fields[: len(self.c)]
 
     @cached_property
     def estimate(self) -> Estimate:
@@ -354,7 +352,7 @@ class ReducedSolution:
         modes = np.zeros(larger.modes)
         modes[: model.level.modes] = self.c[model.level.free]
         c = larger.coordinates(self._whole, modes)
-        R, K = larger.stiffness(c, self._whole)
+        R, K, _ = larger.stiffness(c, self._whole)
         try:
             change = -np.linalg.solve(K[larger.free, larger.free], R[larger.free])
         except np.linalg.LinAlgError:

@@ -24,7 +24,7 @@ from forward.reduced.limits import mistakes
 
 CANDIDATES = 20_000  # points among which a rule is chosen, of more a random part
 KEPT_WHOLE = 600  # points of a boundary that are all kept
-NEAR_PEAK = 0.6  # of the largest stress of any snapshot, from which on points may have the largest
+NEAR_PEAK = 0.75  # of the largest stress of any snapshot, from which on points may have the largest
 SEED = 7
 DIRECTIONS = 16  # parameters up to which states are differentiated by each of them
 FEW = 6  # random directions otherwise
@@ -44,14 +44,14 @@ class Sizes:
         What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
     cubature
         What the points may miss of the forces of the snapshots, relative.
-    larger
-        How many times the modes the nested larger model has, beside those of adjoints.
+    more
+        How many modes of states the nested larger model has besides, and as many of adjoints as the model has modes.
     """
 
     modes: int | None = None
     truncation: float = 3e-3
     cubature: float = 3e-3
-    larger: float = 2.0
+    more: int = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,13 +262,12 @@ class Reduction:
         tangents = OF_TANGENTS * layout.scatter(snapshots.tangents)
         tangents[:, self.equations.fixed] = 0
         every = np.vstack([rest, tangents])
-        squares = basis.spectrum(every, self.inner)
+        none = np.zeros((0, self.equations.size))
+        modes, squares = basis.orthonormal(every, self.inner, none, self._most(sizes))
         n = sizes.modes or basis.enough(squares, sizes.truncation)
-        of_states = basis.orthonormal(every, self.inner, np.zeros((0, self.equations.size)), round(sizes.larger * n))
-        n = min(n, len(of_states))
-        modes = of_states
-        of_adjoints = self._of_adjoints(adjoints, modes, n)
-        modes = np.vstack([modes, of_adjoints])
+        n = min(n, len(modes))
+        modes = modes[: n + sizes.more]
+        modes = np.vstack([modes, self._of_adjoints(adjoints, modes, n)])
         tests = np.array(self._tests).reshape(-1, self.equations.size)
         rows = np.vstack([lifts, tests, modes])
         coordinates = np.hstack([moved, np.zeros((len(states), len(tests))), rest @ self.inner(modes).T])
@@ -313,12 +312,17 @@ class Reduction:
             },
         )
 
+    @staticmethod
+    def _most(sizes: Sizes) -> float:
+        """Return how many modes the larger model may have, or what these may leave of the snapshots."""
+        return sizes.truncation / 10 if sizes.modes is None else sizes.modes + sizes.more
+
     def _of_adjoints(self, adjoints: FloatArray, modes: FloatArray, most: int) -> FloatArray:
         """Return modes of adjoints beside those of states; never the same ones, to which the residual is orthogonal."""
         if not len(adjoints):
             return np.zeros((0, self.equations.size))
         sizes = np.sqrt(np.maximum((adjoints * self.inner(adjoints)).sum(axis=1), 1e-300))
-        return basis.orthonormal(adjoints / sizes[:, None], self.inner, modes, most)
+        return basis.orthonormal(adjoints / sizes[:, None], self.inner, modes, most)[0]
 
     def _factor(self, number: int) -> tuple[FloatArray, FloatArray, float]:
         """Return the logarithm of a random field at the nodes, its slopes, and the variance that is kept."""
@@ -391,9 +395,15 @@ class Reduction:
         size = min(training.count * len(tested), 4 * len(tested) + 400)
         mixture = cubature.Mixture(size, len(points.weights), SEED)
         rows: list[FloatArray] = []
+        m, n = points.fields.shape[:2]
+        fields = points.fields[:, :, tested].transpose(0, 2, 1).copy()
         for c, point in training:
-            T = kernel(self._inputs(points.fields @ c, points, point), point[numbers])
-            values = np.einsum("mq,mqi->iq", T, points.fields[:, :, tested])
+            T = kernel(
+                self._inputs((points.fields.reshape(m * n, -1) @ c).reshape(m, n), points, point), point[numbers]
+            )
+            values = T[0] * fields[0]
+            for k in range(1, m):
+                values += T[k] * fields[k]
             targets = values @ points.weights
             totals = []
             for of, kernel_of in zip(densities, of_densities, strict=True):

@@ -1,0 +1,103 @@
+"""The reduced slab (configs/slab.toml): modes, points, errors on 100 unseen samples, effectivity, times; and the gain.
+
+All times are processor time on one core, measured side by side; frames are by the clock, since that is what counts.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from forward.reduced.data import load
+from forward.reduced.model import ReducedModel
+from forward.reduced.stream import begin, local
+from workflows.__main__ import main as command
+
+CONFIG = Path(__file__).parent.parent / "configs" / "slab.toml"
+MODES = (20, 40, 80)
+FRAMES, EVERY = 20_000, 50
+POINTS = 20
+
+
+def main() -> None:
+    """Print a table for each size."""
+    for modes in [int(a.removeprefix("--modes=")) for a in sys.argv if a.startswith("--modes=")] or MODES:
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "slab"
+            command(
+                ["reduce", str(CONFIG), "--out", str(out), "--quiet", "--no-report", "--set", f"method.modes={modes}"]
+            )
+            told = json.loads((out / "summary.json").read_text())["reduced"]
+            _table(told, load(out / told["file"]))
+
+
+def _table(told: dict[str, Any], data: Any) -> None:
+    model = ReducedModel(data, data.parameters)
+    rng = np.random.default_rng(0)
+    points = data.lower + (data.upper - data.lower) * rng.random((POINTS, len(data.parameters)))
+    for point in points:
+        model.reduced(point)
+    cold = _times(lambda point: model.reduced(point), points)
+    gradient = _times(lambda point: model.reduced(point).adjoint(np.eye(len(model.outputs))), points)
+    estimate = _times(lambda point: model.reduced(point).estimate, points)
+    seconds = told["seconds"]
+    print(
+        f"\n{told['modes']} modes, {told['points']} points (larger model: {told['modes of the larger model']}, "
+        f"{told['points of the larger model']}); off-line {seconds['snapshots']:.0f} s of solves with adjoints and tangents, "
+        f"{seconds['reduction']:.0f} s of reduction"
+    )
+    print(
+        f"cold {cold:.2f} ms, with gradients of all outputs {gradient:.2f} ms, with error estimates {estimate:.1f} ms; "
+        f"fastest full solve {1e3 * seconds['full solve']:.1f} ms: {1e3 * seconds['full solve'] / cold:.0f} times as long"
+    )
+    print(f"state: error {100 * told['error of the state']:.2g} %")
+    print("| output | error (% of the spread) | after correction | effectivity |\n|---|---|---|---|")
+    for name, error in told["errors"].items():
+        after, effectivity = told["errors after correction"][name], told["effectivity"][name]
+        print(f"| {name} | {100 * error:.2g} | {100 * after:.2g} | {effectivity:.2f} |")
+    _frames(model)
+
+
+def _times(what: Any, points: Any) -> float:
+    """Milliseconds of processor time for one of several calls."""
+    start = time.process_time()
+    for point in points:
+        what(point)
+    return 1e3 * (time.process_time() - start) / len(points)
+
+
+def _frames(model: ReducedModel) -> None:
+    """A spot that circles at 0.1 m/s, a thousand frames a second; the local model is made anew every 50 frames."""
+    data, uncertain = model.data, model.data.spread.copy()
+    names = list(data.parameters)
+    x, y = names.index("loads.spot.x"), names.index("loads.spot.y")
+    uncertain[[x, y]] = 0
+    stream, lasted, left = begin(model, uncertain), np.empty(FRAMES), np.empty(FRAMES)
+    radius, errors = 0.015, []
+    for k in range(FRAMES):
+        at = data.nominal.copy()
+        angle = 0.1 / radius * k / 1000
+        at[[x, y]] += radius * np.array([np.cos(angle) - 1, np.sin(angle)])
+        if k % EVERY == 0:
+            stream.moved(local(model, at, stream.modes, uncertain))
+        start = time.perf_counter()
+        frame = stream.frame(at)
+        lasted[k], left[k] = time.perf_counter() - start, frame.residual
+        if k % 997 == 0:
+            exact = model.reduced(at)
+            errors.append(np.abs(frame.outputs - exact.outputs) / np.array(data.about["spread"]))
+    low, high, worst = 1e3 * np.array([np.median(lasted), np.quantile(lasted, 0.99), lasted.max()])
+    print(
+        f"frames: median {low:.3f} ms, 99 % {high:.3f} ms, worst of {FRAMES} {worst:.2f} ms; {(lasted > 1e-3).mean():.2%} over "
+        f"1 ms; off the equilibrium by at most {100 * np.max(errors):.2g} % of the spread"
+    )
+
+
+if __name__ == "__main__":
+    main()
