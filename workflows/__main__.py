@@ -1,4 +1,4 @@
-"""The command line: tissuq check | run | report | reduce | serve | init | schema | completion."""
+"""The command line: tissuq check | run | report | reduce | live | serve | init | schema | completion."""
 
 from __future__ import annotations
 
@@ -113,6 +113,16 @@ def _parser() -> argparse.ArgumentParser:
         "reduce", help="make a reduced model of the body of a study, over its random parameters"
     )
     init = commands.add_parser("init", help="print a commented starter study")
+    live = commands.add_parser(
+        "live", help="serve a reduced model in real time: a socket for devices, a page to look at"
+    )
+    live.add_argument("model", type=Path, metavar="MODEL", help="what `tissuq reduce` has made")
+    live.add_argument("--port", type=int, default=4343, help="of the socket; 0: any free one (default: 4343)")
+    live.add_argument("--page", type=int, default=8043, help="port of the page (default: 8043)")
+    live.add_argument("--no-page", action="store_true", help="the socket alone")
+    live.add_argument("--host", default="127.0.0.1", help="0.0.0.0 accepts devices on other machines too")
+    live.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    live.set_defaults(command=_live)
     for command in (check, run, reduce, serve):
         command.add_argument("study", type=Path, metavar="STUDY.toml")
         command.add_argument(
@@ -245,6 +255,14 @@ def _serve(options: argparse.Namespace) -> int:
         message = f"{options.study}: is of kind '{study.method.kind}', expected a study of one model to serve"
         raise StudyError(message)
     serve(study.sampled, options.port, options.host, quiet=options.quiet)
+    return DONE
+
+
+def _live(options: argparse.Namespace) -> int:
+    from workflows.live.loop import serve
+
+    page = None if options.no_page else options.page
+    serve(options.model, options.host, options.port, page, quiet=options.quiet)
     return DONE
 
 

@@ -1,0 +1,90 @@
+"""Frames of a reduced model that follow moving parameters."""
+
+import numpy as np
+import pytest
+
+from forward.reduced.data import load, save
+from forward.reduced.model import ReducedModel
+from forward.reduced.stream import Stream, begin, local
+from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
+    NOMINAL,
+    SPREAD,
+    full,
+    reduction,
+    small,
+    snapshots,
+)
+
+pytestmark = pytest.mark.fem
+
+
+@pytest.fixture
+def model(small):  # noqa: F811
+    return ReducedModel(small, small.parameters)
+
+
+def test_frames_follow_the_equilibrium(model, small):  # noqa: F811
+    stream = begin(model, SPREAD)
+    way = NOMINAL + SPREAD * np.linspace(0, 1, 60)[:, None] * np.array([1, -1, 1, 0.5, 1, 0.5, 0])
+    spread = np.array(small.about["spread"])
+    smooth = [i for i, output in enumerate(small.outputs) if output.kind != "peak"]
+    for at in way:
+        frame = stream.frame(at)
+        exact = model.reduced(at).outputs
+        assert frame.corrections > 0
+        assert (np.abs(frame.outputs - exact) < 1e-3 * spread)[smooth].all()
+
+
+def test_a_local_model_knows_errors_and_spread(model):
+    solution = model.reduced(NOMINAL)
+    uncertain = SPREAD * np.array([1, 0, 1, 0, 0, 0, 0])
+    here = local(model, NOMINAL, None, uncertain)
+    np.testing.assert_allclose(here.errors, solution.estimate.outputs)
+    tangents = solution.tangent(np.diag(uncertain))
+    np.testing.assert_allclose(here.spread, np.sqrt((tangents**2).sum(axis=0)))
+    move = 1e-4 * SPREAD
+    exact = model.reduced(NOMINAL + move).outputs - solution.outputs
+    linear = Stream(model, here).linear(NOMINAL + move)
+    np.testing.assert_allclose(linear.outputs - solution.outputs, exact, rtol=1e-2, atol=1e-12)
+    assert linear.corrections == 0
+
+
+def test_where_it_cannot_follow_it_says_so_and_catches_up(model):
+    stream = begin(model, SPREAD)
+    far = NOMINAL.copy()
+    far[[0, 2, 4]] = 300, 1500, 0.03
+    frame = stream.frame(far)
+    assert stream.lost
+    assert frame.corrections == 0
+    near = NOMINAL + SPREAD
+    stream.moved(local(model, near, None, SPREAD))
+    assert not stream.lost
+    found = stream.frame(near)
+    np.testing.assert_allclose(found.outputs, model.reduced(near).outputs, rtol=1e-6)
+
+
+def test_the_loop_answers_and_refuses_in_one_line(small, tmp_path):  # noqa: F811
+    import json
+
+    from workflows.live.loop import Loop
+
+    save(small, tmp_path / "model.npz")
+    loop = Loop(tmp_path / "model.npz", "127.0.0.1", 0)
+    try:
+        told = loop.greeting()
+        assert told["outputs"] == [output.name for output in load(tmp_path / "model.npz").outputs]
+        assert told["local"] == ["stress"]
+        answer = loop.answer(b'{"id": 7, "loads.pressure.size": 210}')
+        assert answer["id"] == 7
+        assert answer["corrections"] > 0
+        assert not answer["late"]
+        late = loop.answer(b'{"loads.pressure.size": 212}', late=True)
+        assert late["late"]
+        assert late["corrections"] == 0
+        assert "outside the trained range" in loop.answer(b'{"loads.pressure.size": 900}')["outside"]
+        assert "expected one of" in loop.answer(b'{"x": 1}')["error"]
+        for wrong in (b"[]", b"no", b'{"loads.pressure.size": "soft"}', b'{"loads.pressure.size": NaN}'):
+            assert "error" in loop.answer(wrong), wrong
+        json.dumps(answer)
+    finally:
+        loop.close()

@@ -1,0 +1,85 @@
+"""`tissuq live`: a socket and a page."""
+
+import json
+import socket
+import subprocess
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from forward.reduced.data import save
+from forward.reduced.model import ReducedModel
+from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
+    full,
+    reduction,
+    small,
+    snapshots,
+)
+from tests.launch import TISSUQ, environment
+from workflows.live.page import surface
+
+pytestmark = pytest.mark.fem
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as one:
+        return one.getsockname()[1]
+
+
+def test_the_surface_of_hexahedra_and_tetrahedra():
+    cube = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [4, 5, 6, 7, 8, 9, 10, 11]])
+    assert len(surface(cube, 12)) == 2 * 10
+    assert len(surface(np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), 10)) == 6
+
+
+def test_frames_over_a_socket_and_the_body_on_a_page(small, tmp_path):  # noqa: F811
+    save(small, tmp_path / "model.npz")
+    port, page = free_port(), free_port()
+    command = [TISSUQ, "live", tmp_path / "model.npz", "--port", str(port), "--page", str(page)]
+    served = subprocess.Popen(list(map(str, command)), env=environment(), stdout=subprocess.PIPE, text=True)
+    try:
+        assert f"127.0.0.1:{port}" in served.stdout.readline()
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
+            lines = client.makefile("rb")
+            told = json.loads(lines.readline())
+            assert told["parameters"]["loads.pressure.size"] == 200
+            client.sendall(b'{"loads.pressure.size": 230}\n')
+            answer = json.loads(lines.readline())
+            whole = small.nominal.copy()
+            whole[2] = 230
+            exact = ReducedModel(small, small.parameters).reduced(whole).outputs
+            each_frame = [i for i, name in enumerate(told["outputs"]) if name not in told["local"]]
+            np.testing.assert_allclose(np.array(answer["outputs"])[each_frame], exact[each_frame], rtol=1e-3)
+            # Lines that wait: only the last is solved for.
+            client.sendall(b'{"loads.pressure.size": 231}\n{"loads.pressure.size": 232}\n')
+            first, last = json.loads(lines.readline()), json.loads(lines.readline())
+            assert (first["late"], last["late"]) in {(True, False), (False, False)}
+        base = f"http://127.0.0.1:{page}"
+        scene = json.loads(_patiently(f"{base}/scene"))
+        size = 4 * (3 * len(small.outputs) + len(scene["places"]))
+        for _ in range(100):
+            frame = _patiently(f"{base}/frame")
+            if len(frame) == size:
+                break
+            time.sleep(0.1)
+        assert len(frame) == size
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(f"{base}/frame", headers={"Host": "elsewhere"}), timeout=10)
+        with pytest.raises(urllib.error.HTTPError, match="400"):
+            urllib.request.urlopen(f"{base}/move", data=b'{"loads.pressure.size": 1}', timeout=10)
+        assert b"<canvas" in _patiently(base)
+    finally:
+        served.terminate()
+        served.wait(20)
+
+
+def _patiently(address):
+    for _ in range(100):
+        try:
+            return urllib.request.urlopen(address, timeout=10).read()
+        except OSError:
+            time.sleep(0.1)
+    raise AssertionError(address)

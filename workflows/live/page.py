@@ -1,0 +1,138 @@
+"""The page of `tissuq live`: one file, the surface of the body at the newest frame, and sliders that move it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from forward.model import FloatArray
+from forward.reduced.data import ReducedData, load
+
+HERE = Path(__file__).parent
+LARGEST = 2**16  # bytes of a request
+HEXAHEDRA = {12, 25, 29, 72}  # VTK's numbers of their types; the others are tetrahedra
+_OF_HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+_OF_TETRAHEDRON = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
+
+
+def surface(cells: NDArray[np.int64], kind: int) -> NDArray[np.int64]:
+    """Return the triangles (t, 3) of the boundary of a mesh, between the corners of its cells."""
+    sides = _OF_HEXAHEDRON if kind in HEXAHEDRA else _OF_TETRAHEDRON
+    faces = np.concatenate([cells[:, list(side)] for side in sides])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = faces[np.sort(first[count == 1])]
+    return outer if outer.shape[1] == 3 else np.concatenate([outer[:, [0, 1, 2]], outer[:, [0, 2, 3]]])
+
+
+class Scene:
+    """The surface of a reduced model at its newest frame."""
+
+    def __init__(self, data: ReducedData) -> None:
+        triangles = surface(data.cells, data.cell_kind)
+        self._nodes, local = np.unique(triangles, return_inverse=True)
+        self._data = data
+        rows = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        modes = data.levels[0].modes
+        before = data.before
+        self._lifts = data.fields[: len(data.lifts), rows]
+        self._modes = np.ascontiguousarray(data.fields[before : before + modes, rows])
+        self.told = {
+            "places": data.places[self._nodes].ravel().tolist(),
+            "triangles": local.ravel().tolist(),
+            "outputs": [[output.name, output.unit] for output in data.outputs],
+            "parameters": [
+                [path, low, high, value]
+                for path, low, high, value in zip(
+                    data.parameters, data.lower.tolist(), data.upper.tolist(), data.nominal.tolist(), strict=True
+                )
+            ],
+        }
+        self._latest: tuple[FloatArray, ...] = ()
+
+    def take(self, latest: tuple[FloatArray, ...]) -> None:
+        """Keep the newest frame: parameters, modes, outputs, errors, spread."""
+        self._latest = latest
+
+    def image(self) -> bytes:
+        """Return the newest frame: numbers of the outputs (three each), then displacements of the surface, float32."""
+        if not self._latest:
+            return b""
+        parameters, modes, *rest = self._latest
+        moved = np.array([value if n < 0 else parameters[n] for n, value in self._data.lifts])
+        u = modes @ self._modes + (moved @ self._lifts if len(moved) else 0.0)
+        return bytes(np.concatenate([*rest, u]).astype("<f4").tobytes())
+
+
+def server(scene: Scene, port: int, move: Any) -> ThreadingHTTPServer:
+    """Return the server of a scene; `move` is called with what sliders say."""
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def _own(self) -> bool:
+            """Whether it was asked by this name: a page elsewhere can make its name point here."""
+            name = self.headers.get("Host", "").rsplit(":", 1)[0]
+            if name in {"127.0.0.1", "localhost"}:
+                return True
+            self.send_error(403)
+            return False
+
+        def _answer(self, content: bytes, kind: str) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(content)
+
+        def do_GET(self) -> None:
+            if not self._own():
+                return
+            match self.path:
+                case "/":
+                    self._answer((HERE / "page.html").read_bytes(), "text/html; charset=utf-8")
+                case "/scene":
+                    self._answer(json.dumps(scene.told).encode(), "application/json")
+                case "/frame":
+                    self._answer(scene.image(), "application/octet-stream")
+                case _:
+                    self.send_error(404)
+
+        def do_POST(self) -> None:
+            length = int(self.headers.get("Content-Length", "0"))
+            if not self._own():
+                return
+            # A page elsewhere may send text, but no JSON, without being allowed to.
+            if self.headers.get("Content-Type") != "application/json" or not 0 < length <= LARGEST:
+                self.send_error(400)
+                return
+            try:
+                move({str(k): float(v) for k, v in json.loads(self.rfile.read(length)).items()})
+            except (ValueError, TypeError, AttributeError):
+                self.send_error(400)
+                return
+            self._answer(b"{}", "application/json")
+
+        def log_message(self, format: str, *arguments: Any) -> None:
+            return
+
+    return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+
+
+def show(path: str, port: int, pipe: Connection) -> None:
+    """Serve the page of a model whose newest frames come through a pipe, until that is closed."""
+    scene = Scene(load(Path(path)))
+    found = server(scene, port, pipe.send)
+    threading.Thread(target=found.serve_forever, daemon=True).start()
+    try:
+        while True:
+            scene.take(pipe.recv())
+    except (EOFError, OSError, KeyboardInterrupt):
+        found.shutdown()
