@@ -44,7 +44,7 @@ class Discretisation(Linearisation):
 
     def __init__(self, spec: Hyperelastic, comm: Any, parameters: tuple[str, ...], beside: Forms | None = None) -> None:
         super().__init__(spec, comm, parameters, beside)
-        self._jacobians = self.at_points(self.J)
+        self._jacobians = self.at_points(self.J, often=True)
         self._external = 0.0
         self._sizes: dict[tuple[float, ...], float] = {}
         self._stretch = self._small_stretch()

@@ -188,9 +188,9 @@ class Forms:
             return self._ds(self._tags[boundary])
         return self._ds(self._tags[boundary], metadata={"quadrature_degree": degree})
 
-    def vector(self, form: Any) -> assembly.VectorAssembler:
+    def vector(self, form: Any, *, often: bool = False) -> assembly.VectorAssembler:
         """Compile a linear form."""
-        return assembly.VectorAssembler(self._invariants.inserted(form), self.unknowns, self.comm)
+        return assembly.VectorAssembler(self._invariants.inserted(form), self.unknowns, self.comm, often=often)
 
     def by_vertices(self, form: Any) -> assembly.VectorAssembler:
         """Compile a form that is linear in values at the vertices."""
@@ -200,13 +200,13 @@ class Forms:
         """Compile a functional."""
         return assembly.ScalarAssembler(self._invariants.inserted(form), self.comm)
 
-    def at_points(self, expression: Any) -> assembly.PointValues:
+    def at_points(self, expression: Any, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at the quadrature points."""
-        return self.at(expression, spaces.quadrature_points(self.space, self.spec.body.quadrature))
+        return self.at(expression, spaces.quadrature_points(self.space, self.spec.body.quadrature), often=often)
 
-    def at(self, expression: Any, points: FloatArray) -> assembly.PointValues:
+    def at(self, expression: Any, points: FloatArray, *, often: bool = False) -> assembly.PointValues:
         """Compile an expression for evaluation at points (q, 3) of the reference cell."""
-        return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm)
+        return assembly.PointValues(self._invariants.inserted(expression), points, self.space, self.comm, often=often)
 
     @property
     def size_of_value(self) -> int:
@@ -384,7 +384,7 @@ class Forms:
     @cached_property
     def _parameter_force(self) -> assembly.VectorAssembler | None:
         form = self._imbalance_form(self.along_parameters)
-        return None if form is None else self.vector(form)
+        return None if form is None else self.vector(form, often=True)
 
     @cached_property
     def _field_forces(self) -> tuple[tuple[VertexField, assembly.VectorAssembler], ...]:
@@ -409,7 +409,7 @@ class Forms:
 
     @cached_property
     def _stiffness_action(self) -> assembly.VectorAssembler:
-        return self.vector(self.derivative(self._imbalance_form(), self._along))
+        return self.vector(self.derivative(self._imbalance_form(), self._along), often=True)
 
     @cached_property
     def _transposed_action(self) -> assembly.VectorAssembler:
@@ -427,7 +427,7 @@ class Forms:
     @cached_property
     def gradients(self) -> assembly.NodalAverages:
         """Deformation gradients (3, 3, n_owned) at the nodes, at the current state."""
-        return assembly.NodalAverages(self.F, (3, 3), self.space, self.comm)
+        return assembly.NodalAverages(self.F, (3, 3), self.space, self.comm, often=True)
 
     @cached_property
     def stresses_at_nodes(self) -> assembly.NodalAverages:

@@ -49,7 +49,7 @@ class Linearisation(Forms):
         self.work = Work()
         self.latest = Latest()
         imbalance = self._imbalance_form()
-        self._residual = self.vector(imbalance)
+        self._residual = self.vector(imbalance, often=True)
         # Equations beside others are those of an estimate, which has ways of its own.
         self.linear = spec.linear if beside is None else Linear.FACTOR
         self._prescribe()

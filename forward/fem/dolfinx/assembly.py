@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import basix
@@ -16,6 +17,7 @@ from forward.bodies.geometry import Body
 from forward.bodies.mesh_file import MeshFile
 from forward.fem.dolfinx import version
 from forward.fem.dolfinx.compile import compile_form, compiled, options_for
+from forward.fem.dolfinx.lanes import Kernel, Numbers
 from forward.fem.dolfinx.meshes import mesh_body, owned_cells
 from forward.fem.dolfinx.spaces import cell_element, constant, scalar_space, sum_ghosts
 from forward.fem.dolfinx.unknowns import Unknowns
@@ -28,22 +30,60 @@ if TYPE_CHECKING:
 class VectorAssembler:
     """A compiled linear form with its vector, used again for every assembly.
 
-    Its test functions are those of the unknowns, or of any other space where no unknowns are given.
+    Its test functions are those of the unknowns, or of any other space where no unknowns are given. What is assembled
+    `often` takes several cells at once, if that can be compiled (`forward.fem.dolfinx.lanes`).
     """
 
-    def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any) -> None:
-        self._form = compile_form(form, comm)
+    def __init__(self, form: Any, unknowns: Unknowns | None, comm: Any, *, often: bool = False) -> None:
+        cells, rest = _parts(form) if often else (None, form)
+        self._forms = [compile_form(part, comm) for part in (cells, rest) if part is not None]
+        self._lanes: Kernel | None = None
+        if cells is not None and all(one.subdomain_id() == "everywhere" for one in cells.integrals()):
+            space = self._forms[0].function_spaces[0]
+            nodes, size, values = version.numbers_of(space)
+            self._lanes = _kernel(cells, self._forms[0], space.mesh, Numbers(nodes, size, values), comm)
+        self._of_cells = self._forms[0]
+        if self._lanes is not None:
+            self._forms.pop(0)
         self._unknowns = unknowns
-        self._vector = version.new_vector(self._form)
+        self._vector = version.new_vector(self._of_cells)
+        self._alone = comm.size == 1 and not self._forms
 
     def __call__(self) -> FloatArray:
         """Assemble; return a copy of this rank's part (U_local,)."""
+        if self._alone and self._lanes is not None:
+            values = np.zeros(self._vector.local_size)
+            self._lanes(version.constants_of(self._of_cells), values)
+            return values if self._unknowns is None else self._unknowns.take(values)
         with self._vector.localForm() as local:
             local.set(0.0)
-        fem.petsc.assemble_vector(self._vector, self._form)
+            if self._lanes is not None:
+                self._lanes(version.constants_of(self._of_cells), local.array)
+        for form in self._forms:
+            fem.petsc.assemble_vector(self._vector, form)
         self._vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         values = self._vector.array_r
         return np.array(values) if self._unknowns is None else self._unknowns.take(values)
+
+
+def _parts(form: Any) -> tuple[Any | None, Any | None]:
+    """The integrals over cells and the others; None where there are none."""
+    integrals = form.integrals()
+    cells = [one for one in integrals if one.integral_type() == "cell"]
+    rest = [one for one in integrals if one.integral_type() != "cell"]
+    return (ufl.Form(cells) if cells else None), (ufl.Form(rest) if rest else None)
+
+
+def _kernel(what: Any, made: Any, msh: Any, to: Numbers | int, comm: Any) -> Kernel | None:
+    """A kernel for several cells of what DOLFINx has `made` of a form or an expression; None if there is none."""
+    own = owned_cells(msh)
+    places = np.asarray(msh.geometry.x[version.corners_of_cells(msh)[:own]])
+    coefficients = [Numbers(*numbers) for numbers in version.coefficients_of(made)]
+    own_cells = [one._replace(nodes=one.nodes[:own]) for one in coefficients]
+    if isinstance(to, Numbers):
+        to = to._replace(nodes=to.nodes[:own])
+    kernel = Kernel(what, places, own_cells, len(version.constants_of(made)), to, comm)
+    return kernel if kernel.available else None
 
 
 class ScalarAssembler:
@@ -59,19 +99,40 @@ class ScalarAssembler:
 
 
 class PointValues:
-    """A compiled UFL expression with its values at reference `points` (q, 3) of this rank's cells."""
+    """A compiled UFL expression with its values at reference `points` (q, 3) of this rank's cells.
 
-    def __init__(self, expression: Any, points: FloatArray, space: Any, comm: Any) -> None:
+    As in `VectorAssembler` for what is evaluated `often`, at all cells.
+    """
+
+    def __init__(self, expression: Any, points: FloatArray, space: Any, comm: Any, *, often: bool = False) -> None:
+        self._what = what = (expression, points)
+        self._comm = comm
         self._expression = compiled(
-            (expression, points), lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
+            what, lambda folder: fem.Expression(expression, points, **options_for(folder)), comm
         )
         self._mesh = space.mesh
         self.cells = np.arange(owned_cells(space.mesh), dtype=np.int32)
+        self._size = len(points) * int(np.prod(expression.ufl_shape))
+        self._lanes = _kernel(what, self._expression, space.mesh, self._size, comm) if often else None
 
     def __call__(self) -> FloatArray:
         """Return the values (n_cells, q · size of the expression) at the current state."""
+        if self._lanes is not None:
+            found = np.empty((len(self.cells), self._size))
+            self._lanes(version.constants_of(self._expression), found)
+            return found
         values = version.evaluate(self._expression, self._mesh, self.cells)
         return np.asarray(values).reshape(len(self.cells), -1)
+
+    def summed(self, space: Any) -> Callable[[FloatArray], None] | None:
+        """Return what adds the values at the nodes of a space, if the points are these, to an array (n_nodes, size).
+
+        None if it cannot be compiled.
+        """
+        nodes, _, values = version.numbers_of(space)
+        to = Numbers(nodes, self._size // nodes.shape[1], values)
+        kernel = _kernel(self._what, self._expression, self._mesh, to, self._comm)
+        return None if kernel is None else lambda sums: kernel(version.constants_of(self._expression), sums)
 
 
 class FacetValues:
@@ -131,12 +192,17 @@ class NodalAverages:
         UFL expression.
     shape
         Its shape.
+    often
+        As of `PointValues`.
     """
 
-    def __init__(self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any) -> None:
+    def __init__(
+        self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any, *, often: bool = False
+    ) -> None:
         nodes = cell_element(space).points
         self._comm, self._shape = comm, shape
         self._values = PointValues(expression, nodes, space, comm)
+        self._sums = self._values.summed(space) if often else None
         self._count = space.dofmap.index_map.size_local + space.dofmap.index_map.num_ghosts
         self._nodes = version.nodes_of_cells(space, len(nodes))[: owned_cells(space.mesh)].ravel()
         self._carrier = fem.Function(space)
@@ -153,8 +219,13 @@ class NodalAverages:
     def __call__(self) -> FloatArray:
         """Return the values (*shape, n_owned) at this rank's nodes, for the current state."""
         count = int(np.prod(self._shape))
-        values = self._values().reshape(-1, count).T
-        sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
+        if self._sums is not None:
+            added = np.zeros((self._count, count))
+            self._sums(added)
+            sums = np.ascontiguousarray(added.T)
+        else:
+            values = self._values().reshape(-1, count).T
+            sums = np.array([np.bincount(self._nodes, weights=row, minlength=self._count) for row in values])
         found = np.concatenate([self._owned(rows) for rows in sums.reshape(-1, 3, self._count)])
         return np.asarray((found / self._meeting).reshape(*self._shape, -1))
 

@@ -23,7 +23,7 @@ T = TypeVar("T")
 # Sums over nodes are vectorised only if the compiler may reorder them; NaN and infinity keep their meaning, which
 # -ffast-math would take from them. Measured: residuals 2 to 4 times, stiffness 1.3 times faster.
 _REORDER = ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math", "-freciprocal-math", "-fno-math-errno"]
-_FLAGS = ["-O3", "-march=native", *_REORDER]
+FLAGS = ["-O3", "-march=native", *_REORDER]
 
 
 def _cache_directory() -> Path:
@@ -33,7 +33,7 @@ def _cache_directory() -> Path:
         processor = next(line for line in lines if line.startswith("flags"))
     except (OSError, StopIteration):
         processor = ""
-    made_for = [processor, str(sysconfig.get_config_var("SOABI")), version.VERSION, *_FLAGS]
+    made_for = [processor, str(sysconfig.get_config_var("SOABI")), version.VERSION, *FLAGS]
     return compiled_forms() / f"forms-{hashlib.sha256(' '.join(made_for).encode()).hexdigest()[:12]}"
 
 
@@ -42,7 +42,7 @@ _CACHE = _cache_directory()
 
 def options_for(folder: Path) -> dict[str, Any]:
     """Return DOLFINx's arguments with which it compiles in a folder."""
-    options = {"cffi_extra_compile_args": _FLAGS, "cffi_libraries": ["m"], "cache_dir": str(folder), "timeout": 600}
+    options = {"cffi_extra_compile_args": FLAGS, "cffi_libraries": ["m"], "cache_dir": str(folder), "timeout": 600}
     return {version.JIT: options}
 
 
@@ -62,17 +62,21 @@ def _lock(name: str) -> Iterator[None]:
         yield
 
 
-def compiled(what: Any, make: Callable[[Path], T], comm: Any) -> T:
+def folder_of(what: Any, beside: str = "") -> Path:
+    """Where what is compiled of forms or expressions is kept, or what is made from that."""
+    return _CACHE / f"{ffcx.naming.compute_signature([what], '')}{beside}"
+
+
+def compiled(what: Any, make: Callable[[Path], T], comm: Any, beside: str = "") -> T:
     """Return what `make` compiles, or loads, in a folder; collective over `comm`.
 
     However many processes ask for it at the same time, one compiles: in a folder that is renamed when it is complete,
     so that none ever finds half of it, or waits for a process that was killed. What exists is loaded without a lock.
     """
-    name = ffcx.naming.compute_signature([what], "")
-    folder = _CACHE / name
+    folder = folder_of(what, beside)
     if comm.bcast(folder.is_dir() if comm.rank == 0 else None):
         return make(folder)
-    with _lock(name) if comm.rank == 0 else nullcontext():
+    with _lock(folder.name) if comm.rank == 0 else nullcontext():
         place = comm.bcast(_vacant(folder) if comm.rank == 0 else None)
         try:
             made = make(place)

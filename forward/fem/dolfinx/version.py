@@ -144,3 +144,33 @@ def block_diagonal_matrix(space: Any, comm: Any) -> Any:
     pattern.insert_diagonal(owned)
     (pattern.assemble if FIVE else pattern.finalize)()
     return cpp.la.petsc.create_matrix(comm, pattern)
+
+
+# --- what compiled forms and expressions depend on --------------------------------------------------------------------
+
+
+def constants_of(made: Any) -> FloatArray:
+    """Values of the constants in a compiled form or expression, now."""
+    return np.asarray(cpp.fem.pack_constants(getattr(made, "_cpp_object", made)))
+
+
+def coefficients_of(made: Any) -> list[tuple[NDArray[np.int32], int, FloatArray]]:
+    """Nodes of the cells, numbers at each node and their values, of the functions in a compiled form or expression."""
+    if isinstance(made, fem.Expression):
+        order = made.ufcx_expression
+        functions = ufl.algorithms.extract_coefficients(made.ufl_expression)
+        places = [order.original_coefficient_positions[i] for i in range(order.num_coefficients)]
+        found = [functions[i]._cpp_object for i in places]
+    else:
+        found = getattr(made, "_cpp_object", made).coefficients
+    return [(*numbers_of(function.function_space)[:2], function.x.array) for function in found]
+
+
+def numbers_of(space: Any) -> tuple[NDArray[np.int32], int, FloatArray]:
+    """Nodes (n_cells, k) of this rank's cells, ghosts included, in a compiled space, and numbers at each; no values."""
+    dofmap = space.dofmap
+    if FIVE:
+        nodes = dofmap.list() if callable(dofmap.list) else dofmap.list
+        cells = space.mesh.topology.index_map(3)
+        return np.asarray(nodes.array).reshape(cells.size_local + cells.num_ghosts, -1), dofmap.bs, np.empty(0)
+    return np.asarray(getattr(dofmap, "_cpp_object", dofmap).map()), dofmap.bs, np.empty(0)
