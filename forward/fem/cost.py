@@ -91,7 +91,7 @@ FEW, NEAR = 4, 8  # derivatives of a sample up to which no factor is made, and t
 
 
 # Points that are corrected together (docs/decisions/0028-lockstep.md).
-MOST_TOGETHER, BYTES_TOGETHER = 32, 2**27  # points, and what they hold: vectors of unknowns
+MOST_TOGETHER, BYTES_TOGETHER = 32, 2**29  # points, and what they hold: vectors of unknowns
 HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, rotations
 
 

@@ -196,9 +196,7 @@ class NodalAverages:
         As of `PointValues`.
     """
 
-    def __init__(
-        self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any, *, often: bool = False
-    ) -> None:
+    def __init__(self, expression: Any, shape: tuple[int, ...], space: Any, comm: Any, *, often: bool = False) -> None:
         nodes = cell_element(space).points
         self._comm, self._shape = comm, shape
         self._values = PointValues(expression, nodes, space, comm)

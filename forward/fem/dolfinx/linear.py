@@ -297,12 +297,13 @@ class DirectSolver:
             self._right.array[:] = self._unknowns.reorder(right)
             (self._ksp.solveTranspose if transpose else self._ksp.solve)(self._right, self._solution)
             return self._unknowns.take(self._solution.array_r)
-        if transpose or len(right) == 1 or self._ksp.comm.size > 1:
+        if transpose or len(right) == 1:
             return np.array([self.solve(row, transpose=transpose) for row in right]).reshape(right.shape)
         # The factor is read once for all of them.
         ordered = np.asfortranarray(self._unknowns.reorder(right).T)
-        rights = PETSc.Mat().createDense(ordered.shape, array=ordered, comm=self._ksp.comm)
-        solutions = PETSc.Mat().createDense(ordered.shape, comm=self._ksp.comm)
+        sizes = (self._stiffness.matrix.getSizes()[0], (None, len(right)))  # rows of this rank, and of all
+        rights = PETSc.Mat().createDense(sizes, array=ordered, comm=self._ksp.comm)
+        solutions = PETSc.Mat().createDense(sizes, comm=self._ksp.comm)
         for matrix in (rights, solutions):
             matrix.setUp()
             matrix.assemble()
