@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from uq.inputs.random_parameters import Inputs
     from workflows.studies.reduction import Reduce, ReductionStudy
 
+ROUGH = 3.0  # times what points may miss while snapshots are chosen
 CANDIDATES = 8  # for each snapshot that is drawn where errors are large
 UNSEEN = 10_000  # number of the first random point at which errors are measured
 EXACT = 1e-6  # error relative to the spread, below which estimates do not matter
@@ -121,6 +122,7 @@ class _Making:
         first = method.snapshots - in_rounds
         snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
         reduction = Reduction(self._model, inputs.mean, inputs.std)
+        rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature)
         seconds = 0.0
         for number in range(method.rounds):
             few = in_rounds // method.rounds + (number < in_rounds % method.rounds)
@@ -128,7 +130,7 @@ class _Making:
                 continue
             begin = time.process_time()
             candidates = inputs.points(sobol_points(method.seed, 1 + number, 0, CANDIDATES * few, d))
-            worst = self._worst(reduction.reduced(snapshots, self._sizes), candidates, few)
+            worst = self._worst(reduction.reduced(snapshots, rough), candidates, few)
             seconds += time.process_time() - begin
             snapshots = snapshots.with_others(self._solved(worst))
         begin = time.process_time()
