@@ -89,6 +89,7 @@ ALL = {
     "indentation": indentation.main,
 }
 WITH_OPTIONS = {
+    "reduced": reduced.main,
     "designs": designs.main,
     "intervals": intervals.main,
     "calibration": calibration.main,

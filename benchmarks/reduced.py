@@ -6,9 +6,9 @@ All times are processor time on one core, measured side by side; frames are by t
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ FRAMES, EVERY = 20_000, 50
 POINTS = 20
 
 
-def main() -> None:
-    """Print a table for each size."""
-    for modes in [int(a.removeprefix("--modes=")) for a in sys.argv if a.startswith("--modes=")] or MODES:
+def main(options: Sequence[str] = ()) -> None:
+    """Print a table for each size; `--modes=40` for one of them."""
+    for modes in [int(one.removeprefix("--modes=")) for one in options] or MODES:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "slab"
             command(
@@ -101,7 +101,3 @@ def _frames(model: ReducedModel) -> None:
         f"{(lasted > 1e-3).mean():.2%} over 1 ms; off the equilibrium by at most "
         f"{100 * np.max(errors):.2g} % of the spread"
     )
-
-
-if __name__ == "__main__":
-    main()
