@@ -222,3 +222,15 @@ def test_the_stress_that_is_read_is_the_derivative_of_the_energy_that_is_read(ki
             moved[k] += sign * h
             ends.append(density.written.tape(list(moved))[0])
         np.testing.assert_allclose(row, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-5 * np.abs(stress).max())
+
+
+def test_of_many_points_a_part_are_candidates_for_the_integrals_over_all(full, snapshots, reduction, monkeypatch):
+    monkeypatch.setattr("forward.reduced.reduction.CANDIDATES", 40)
+    data = reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-3))
+    assert len(data.levels[0].works[0].weights) <= 40 < 48
+    model, other = ReducedModel(data, full.parameters), reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-11))
+    every = ReducedModel(other, full.parameters)
+    spread = np.array(data.about["spread"])
+    for point in snapshots.parameters[:3]:
+        off = np.abs(model.solve(point).outputs - every.solve(point).outputs) / spread
+        assert (off < 0.05).all(), off
