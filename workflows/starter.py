@@ -35,6 +35,7 @@ loads = [
     { kind = "gravity", direction = [0, -1, 0], density = 1000 },
     # { kind = "traction", on = "x-max", direction = [0, 0, 1], size = 100 },
     # { kind = "pressure", on = "y-max", size = 50 },
+    # { kind = "spot", on = "y-max", direction = [0, -1, 0], size = 0.1, x = 0.1, y = 0.02, z = 0.01, width = 0.005 },
 ]
 # max-displacement (component x, y, z or magnitude), displacement (at, component), mean-displacement (on, component),
 # reaction (on, component), strain-energy, volume-change, max-von-mises
@@ -105,6 +106,15 @@ cheap = [
     # { kind = "model", name = "beam theory", cost = 1e-4, model = { kind = "python", function = "my_beam.sag", ... } },
 ]
 control = "auto"      # their tangents are taken off first, and an expansion takes their place where it is better
+seed = 1
+""",
+    "reduce": """\
+kind = "reduce"       # `tissuq reduce` runs it too, of any study that samples a body (formulation = "displacement")
+snapshots = 96        # solves of which it is made: half of them even, the others where estimated errors are largest
+rounds = 3            # in which those are drawn
+# modes = 40          # by default as many as truncation = 2e-3 needs
+cubature = 1e-3       # what the points may miss of the forces of the snapshots
+unseen = 32           # further solves, on which its errors are measured
 seed = 1
 """,
     "chaos": """\

@@ -22,6 +22,7 @@ _REFERENCE = "#/$defs/{model}"  # where a JSON Schema has its blocks
 DEEPEST = 32  # levels of lists and tables in a study
 LARGEST, LARGEST_INTEGER = 1e60, 2**63 - 1  # numbers of a study, and the smallest is one over the first
 MOST_LINES = 50
+REDUCED = "reduced"  # the kind of a model that is a file
 _OPTIONS = "model.config"  # of another program's model, of which nothing is known
 
 
@@ -103,15 +104,30 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
             place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
             blocks = blocks | {"method": {**blocks["method"], key: str(place.resolve())}}
     blocks = _with_draws(blocks, folder)
-    reduced = model.get("file") if isinstance(model, Mapping) and model.get("kind") == "reduced" else None
-    if isinstance(reduced, str) and isinstance(model, Mapping):
-        place = next((path for path in (folder / reduced, Path(reduced)) if path.exists()), folder / reduced)
-        return blocks | {"model": {**model, "file": str(place.resolve())}}
+    cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
+    if isinstance(cheap, list):
+        own = [{**one, "model": _of_file(one["model"], folder)} if _holds_model(one) else one for one in cheap]
+        blocks = blocks | {"method": {**blocks["method"], "cheap": own}}
+    if isinstance(model, Mapping) and model.get("kind") == REDUCED:
+        return blocks | {"model": _of_file(model, folder)}
     body = model.get("body") if isinstance(model, Mapping) else None
     file = body.get("file") if isinstance(body, Mapping) else None
     if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
         return blocks
     return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
+
+
+def _holds_model(block: Any) -> bool:
+    return isinstance(block, Mapping) and isinstance(block.get("model"), Mapping)
+
+
+def _of_file(model: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Give the full path of a reduced model."""
+    file = model.get("file")
+    if model.get("kind") != REDUCED or not isinstance(file, str):
+        return dict(model)
+    place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+    return {**model, "file": str(place.resolve())}
 
 
 def _with_draws(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -227,7 +227,7 @@ def test_the_stress_that_is_read_is_the_derivative_of_the_energy_that_is_read(ki
 def test_of_many_points_a_part_are_candidates_for_the_integrals_over_all(full, snapshots, reduction, monkeypatch):
     monkeypatch.setattr("forward.reduced.reduction.CANDIDATES", 40)
     data = reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-3))
-    assert len(data.levels[0].works[0].weights) <= 40 < 48
+    assert len(data.levels[0].works[0].weights) <= 40
     model, other = ReducedModel(data, full.parameters), reduction.reduced(snapshots, Sizes(modes=5, cubature=1e-11))
     every = ReducedModel(other, full.parameters)
     spread = np.array(data.about["spread"])

@@ -151,3 +151,33 @@ def test_a_study_with_springs_is_checked_and_run(outside):
         done = subprocess.run(tissuq + command, cwd=outside, env=where, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     assert "Springs: on = x-max, k = random" in (outside / "out" / "report.html").read_text()
+
+
+def test_a_spot_is_a_force_of_its_size_that_moves_with_its_place():
+    from forward.hyperelastic import Hyperelastic
+
+    spot = {"kind": "spot", "on": "z-max", "direction": [0, 0, -1], "size": 2.0, "x": 0.5, "y": 0.5, "z": 0.3}
+    spec = Hyperelastic.model_validate(
+        {
+            "body": {"kind": "box", "size": [1, 1, 0.3], "cells": [6, 6, 1], "cell": "hexahedron", "degree": 1},
+            "material": {"kind": "neo-hookean", "C1": 1e3, "D1": 2e3},
+            "formulation": "displacement",
+            "clamp": ["z-min"],
+            "loads": [spot | {"width": 0.12}],
+            "outputs": [
+                {"name": "held", "kind": "reaction", "on": "z-min", "component": "z"},
+                {"name": "left", "kind": "displacement", "at": [0.25, 0.5, 0.3], "component": "z"},
+                {"name": "right", "kind": "displacement", "at": [0.75, 0.5, 0.3], "component": "z"},
+            ],
+        }
+    )
+    paths = ("loads.spot.size", "loads.spot.x", "loads.spot.width")
+    model = spec.build(MPI.COMM_SELF, paths)
+    held, left, right = model.solve(np.array([2.0, 0.5, 0.12])).outputs
+    assert held == pytest.approx(2.0, rel=1e-3)
+    assert left == pytest.approx(right, rel=1e-6)
+    _, left, right = model.solve(np.array([2.0, 0.25, 0.12])).outputs
+    assert left < 2 * right < 0
+    check_derivatives(model, [2.0, 0.45, 0.12], [0.1, 0.02, 0.005]).require()
+    sharp = spec.model_copy(update={"loads": (spec.loads[0].model_copy(update={"width": 0.01}),)})
+    assert any("hardly sees the spot" in one.text for one in sharp.findings)

@@ -103,6 +103,20 @@ def test_the_full_model_is_asked_above_a_tolerance(folder):
     assert json.loads((folder / "asked" / "summary.json").read_text())["work"]["factorisations"] > 0
 
 
+def test_it_is_a_cheap_model_beside_the_body(folder):
+    method = """
+[method]
+kind = "multifidelity"
+samples = 24
+seed = 1
+cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "reduced", file = "model.npz" } }]
+"""
+    (folder / "several.toml").write_text(BODY + method)
+    assert main(["run", str(folder / "several.toml"), "--out", str(folder / "several"), "--quiet", "--no-report"]) == 0
+    found, body = (xr.load_dataset(folder / name / "results.nc") for name in ("several", "direct"))
+    assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
+
+
 def test_a_number_that_was_kept_is_no_parameter(folder):
     text = USED.format(upper=1200, more="").replace("loads.gravity.density", "material.D1")
     text = text.replace("900, upper = 1100", "1e3, upper = 2e3")
