@@ -106,10 +106,16 @@ def _design_in_words(design: Mapping[str, Any]) -> list[str]:
     if len(chosen) > LISTED:
         last = chosen[-1]["information"]
         lines.append(f"{len(chosen) - LISTED} more are in design.csv, {last:.4g} nat together")
-    equal = design["random_equal"]
-    worth = f"{equal}" if equal is not None else f"more than {design['random_most']}"
-    lines.append(f"{len(chosen)} of {design['candidates']} candidates are worth {worth} random ones")
-    return lines
+    return [*lines, against_random(design)]
+
+
+def against_random(design: Mapping[str, Any]) -> str:
+    """Say what the chosen observations are worth beside random ones: nothing is to be said if all are chosen."""
+    n, candidates, equal = len(design["chosen"]), design["candidates"], design["random_equal"]
+    if n == candidates:
+        return f"all {n} candidates are chosen: only their order tells something"
+    worth = f"{equal:,}" if equal is not None else f"more than {design['random_most']:,}"
+    return f"{n} chosen of {candidates:,} candidates are worth {worth} random ones"
 
 
 def _comparison(dataset: xr.Dataset) -> Part:

@@ -202,5 +202,6 @@ def _told(dataset: xr.Dataset) -> xr.Dataset:
     """Say which part of the variances is which model it is."""
     shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])
     parts = [f"{name} {100 * float(share):.2g} %" for name, share in zip(dataset.output.values, shares, strict=True)]
-    add(dataset, Finding("note", f"Which candidate is right makes of the variance of each output: {', '.join(parts)}."))
+    text = f"Not to know which candidate is right makes up this share of the variance: {', '.join(parts)}."
+    add(dataset, Finding("note", text))
     return dataset

@@ -98,6 +98,11 @@ class PopulationStudy(StudyKind):
         made: Job = named("workflows.studies.redrawn:PopulationJob")(self, name, directory)
         return made
 
+    def units_of(self, label: str) -> dict[str, str]:
+        """SI units of the parameters, as the study of the specimens has them."""
+        found: dict[str, str] = named("workflows.studies.redrawn:units")(self)
+        return found
+
     def summary(self, job: Job) -> dict[str, Any]:
         """There is more in results.nc."""
         return {"specimens": list(self.posteriors)}

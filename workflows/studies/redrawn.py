@@ -161,10 +161,25 @@ class PopulationJob:
 
 def modules(study: PopulationStudy) -> tuple[str, ...]:
     """Return a user's modules of the models of the source."""
+    source = _source(study)
+    return () if source is None else source.modules
+
+
+def units(study: PopulationStudy) -> dict[str, str]:
+    """Return SI units of numbers of the model of the source, by their names there; none where it is gone."""
+    source = _source(study)
+    if source is None:
+        return {}
+    by_candidate = hasattr(source, "candidates")
+    return source.units_of(candidate_of(study.method.source, study.method.model) if by_candidate else "/")
+
+
+def _source(study: PopulationStudy) -> StudyKind | None:
+    """Return the study that the source is of; None where that is gone."""
     from workflows.config.study import parse
 
     try:
         named("workflows.run.own_code:make_visible")(Path(study.method.source))
-        return parse(source_blocks(study.method.source), folder=Path(study.method.source)).modules
+        return parse(source_blocks(study.method.source), folder=Path(study.method.source))
     except (StudyError, ValueError, OSError):
-        return ()
+        return None

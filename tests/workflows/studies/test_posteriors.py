@@ -661,7 +661,10 @@ def test_predictions_are_averaged_over_candidates(selected, tmp_path):
         dict(zip(found["candidate"].values.tolist(), p.tolist(), strict=True))
     )
     assert summary["outputs"]["up"]["between"] == pytest.approx(float(found["between"][0]))
-    assert any("Which candidate is right makes of the variance" in one["text"] for one in summary["findings"])
+    assert any(
+        "Not to know which candidate is right makes up this share of the variance" in one["text"]
+        for one in summary["findings"]
+    )
     assert "Averaged over candidates" in (tmp_path / "out" / "report.html").read_text()
 
 

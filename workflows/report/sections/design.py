@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
-from forward.words import NONE, number
+from forward.words import NONE, number, with_unit
 from workflows.report.blocks import Answer, Block, Card, Heading, Picture, Pictures, Table, Text
 from workflows.report.plots import design as plots
+from workflows.report.readable import size
 from workflows.report.section import Results, Section
+from workflows.results.summary import against_random
 
 WORTH = {
     "information": "What they tell (nat)",
@@ -30,7 +31,7 @@ class ChosenObservations(Section):
     def content(self, results: Results) -> Iterator[Block]:
         """How many random ones they are worth, where they are, and each of them."""
         found, design = results.dataset, results.summary["design"]
-        n, worth = found.sizes["choice"], _worth(design)
+        against = against_random(design)
         yield Heading("Which observations tell most")
         method, known = results.study.method, number(float(found["information"][-1]))
         tell = (
@@ -39,8 +40,7 @@ class ChosenObservations(Section):
             else f"Together they tell {known} nat on average over the draws of what is not known"
         )
         yield Text(
-            f"{n} chosen of {design['candidates']:,} candidates are worth {worth}. {tell}. They are in design.csv in "
-            "their order.",
+            f"{against[0].upper()}{against[1:]}. {tell}. They are in design.csv in their order.",
             "lead",
         )
         ax = plots.against_number(found, WORTH[method.criterion])
@@ -61,9 +61,9 @@ class ChosenObservations(Section):
             yield Text(f"Share of the variance of the field over the body that they take away: {share} %.")
         if "posterior_std" in found:
             rows = [
-                (name, *(number(float(one[f"{which}_std"])) for which in ("prior", "posterior")))
+                (name, *(with_unit(number(float(one[f"{which}_std"])), unit) for which in ("prior", "posterior")))
                 for name in results.leading(found["posterior_std"] / found["prior_std"])
-                for one in [found.sel(parameter=name)]
+                for one, unit in [(found.sel(parameter=name), results.parameter_unit(name))]
             ]
             yield Text("Standard deviations before and after all chosen observations, by the linearised models:")
             yield Table(("parameter", "before", "after"), rows)
@@ -73,17 +73,12 @@ def card(results: Results) -> Card:
     """The first of the chosen observations, and what all are worth."""
     found, design = results.dataset, results.summary["design"]
     together = f"{number(float(found['information'][-1]), 3)} nat"
-    answers = [Answer(f"{found.sizes['choice']} observations", together, (f"worth {_worth(design)}",))]
+    answers = [Answer(f"{found.sizes['choice']} observations", together, (against_random(design),))]
     for k, one in enumerate(design["chosen"], start=1):
-        where = [] if None in one["place"] else [f"at ({', '.join(f'{x:.4g}' for x in one['place'])}) m"]
+        where = [] if None in one["place"] else [f"at ({', '.join(size(x, 'm', 3) for x in one['place'])})"]
         case = [f"load case {one['case']}"] if one["case"] else []
         answers.append(Answer(f"{k}. {one['name']}", f"+{number(one['gain'], 3)} nat", [*case, *where]))
     return Card("Which observations tell most of what is not known?", answers)
-
-
-def _worth(design: Mapping[str, Any]) -> str:
-    equal = design["random_equal"]
-    return f"{equal} random ones" if equal is not None else f"more than {design['random_most']} random ones"
 
 
 def _table(results: Results) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from forward.words import number, with_error
+from forward.words import named, number, with_error
 from workflows.report.blocks import Block, Heading, Table, Text
 from workflows.report.section import Results, Section
 
@@ -24,13 +24,19 @@ class PopulationOfSpecimens(Section):
         """The population, then the specimens."""
         of = results.dataset
         yield Heading("The population")
-        what = "ln |parameter| is normal" if int(of["logarithmic"]) else "parameters are normal"
+        logarithmic = bool(int(of["logarithmic"]))
+        what = (
+            "ln |parameter|, whose standard deviation is given, is normal" if logarithmic else "parameters are normal"
+        )
         yield Text(
             f"Over specimens, {what}. Intervals hold 95 %: that of the typical specimen is what is not known of it, "
             "that of a new one has the spread of the population too."
         )
         rows = [
-            (name, *(_interval(of[f"{which}_quantiles"].sel(parameter=name)) for which in ("typical", "scale", "new")))
+            (
+                named(name, results.parameter_unit(name)),
+                *(_interval(of[f"{which}_quantiles"].sel(parameter=name)) for which in ("typical", "scale", "new")),
+            )
             for name in results.parameters
         ]
         yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
@@ -50,8 +56,8 @@ class PopulationOfSpecimens(Section):
             yield Table(("covariate", "parameter", "change"), changes, text=frozenset({0, 1}))
         yield Heading("Its specimens")
         yield Text(
-            "By its own data alone, and with what the others say on what specimens are like. The effective number is "
-            "that of the draws that the population leaves."
+            "By its own data alone, and with what the others say on what specimens are like. The last column is how "
+            "many of its draws lie where the population is."
         )
         lines = []
         for specimen in map(str, of["specimen"].values):
@@ -61,7 +67,15 @@ class PopulationOfSpecimens(Section):
                 alone, shrunken = (
                     with_error(float(here[f"{who}_mean"]), float(here[f"{who}_std"])) for who in ("own", "specimen")
                 )
-                lines.append((specimen, name, alone, shrunken, number(float(one["specimen_effective"]), 3)))
+                lines.append(
+                    (
+                        specimen,
+                        named(name, results.parameter_unit(name)),
+                        alone,
+                        shrunken,
+                        number(float(one["specimen_effective"]), 3),
+                    )
+                )
         head = ("specimen", "parameter", "by itself", "of the population", "effective")
         yield Table(head, lines, text=frozenset({0, 1}))
 
