@@ -285,7 +285,15 @@ fraction = [0.5, 0.1]         # of the points, for each data set
 missing = 0.0                 # share of components that are lost
 seed = 1
 """
-_HEADS = {"select": _SELECTION, "invert": _SPECIMEN + _INVERT, "synthesize": _SPECIMEN + _SYNTHESIZE}
+_HEADS = {
+    "select": _SELECTION,
+    "invert": _SPECIMEN + _INVERT,
+    "synthesize": _SPECIMEN + _SYNTHESIZE,
+    # a reduced model has no pressures among its unknowns
+    "reduce": _MODEL.replace(
+        '# formulation = "mixed"  # or "displacement";', 'formulation = "displacement"  # not "mixed";'
+    ),
+}
 
 
 def starter(kind: str) -> str:
