@@ -171,12 +171,12 @@ def main(arguments: Sequence[str] = ()) -> None:
             96,
         )
     if given.only in (None, "field"):
-        field = 'model.fields=[{of="stiffness", length=0.05, std=0.5, modes=50}]'
+        field = 'model.fields=[{of="stiffness", length=0.05, std=0.5, modes=30}]'
         beam(
-            "A stiffness field of 50 modes, standard deviation 0.5",
+            "A stiffness field of 30 modes, standard deviation 0.5",
             [outputs, field],
             [COARSE, LINEAR, BOTH],
-            {"kind": "sensitivity-monte-carlo", "samples": 4096, "coefficient": "optimal"},
+            {"kind": "sensitivity-monte-carlo", "samples": 2048, "coefficient": "optimal"},
             given.beam,
             96,
         )

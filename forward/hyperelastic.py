@@ -385,12 +385,17 @@ class Hyperelastic(ModelSpec):
         Raises
         ------
         ModelError
-            If a mesh from a file was not divided as often, or coefficients of fields are those of its vertices.
+            If a mesh from a file was not divided as often, coefficients of fields are those of its vertices, or there
+            are fewer of these than modes.
         """
         objection = adaptive.of_fields(self)
         if objection is not None:
             raise ModelError(objection)
         body = self.body.coarser(times, degree)
+        for field in self.fields:
+            if (field.modes or 0) > body.vertex_count:
+                few = f"has {body.vertex_count} vertices, expected at least as many as a random field has modes"
+                raise ModelError(f"the mesh with cells {times:g} times as long {few}, {field.modes}")
         changed = {"formulation": "displacement"} if body.degree == 1 else {}
         return self.model_copy(update={"body": body, "adapt": None, **changed})
 

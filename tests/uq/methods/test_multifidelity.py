@@ -260,6 +260,10 @@ def test_what_does_not_fit_a_study_is_said():
     ):
         with pytest.raises(StudyError, match=message):
             parse(blocks(cheap=cheap_))
+    many = blocks(cheap=CHEAP[:1])
+    many["model"] = many["model"] | {"fields": [{"of": "stiffness", "length": 0.1, "std": 0.3, "modes": 20}]}
+    with pytest.raises(StudyError, match="has 12 vertices, expected at least as many as a random field has modes, 20"):
+        parse(many)
     other = {"kind": "model", "model": BLOCK | {"outputs": ["uy_max", "ux_max"]}}
     with pytest.raises(StudyError, match="cost: cannot be predicted"):
         parse(blocks(cheap=[other]))
