@@ -106,28 +106,25 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
     blocks = _with_draws(blocks, folder)
     cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
     if isinstance(cheap, list):
-        own = [{**one, "model": _of_file(one["model"], folder)} if _holds_model(one) else one for one in cheap]
-        blocks = blocks | {"method": {**blocks["method"], "cheap": own}}
-    if isinstance(model, Mapping) and model.get("kind") == REDUCED:
-        return blocks | {"model": _of_file(model, folder)}
-    body = model.get("body") if isinstance(model, Mapping) else None
-    file = body.get("file") if isinstance(body, Mapping) else None
-    if not isinstance(file, str) or not isinstance(model, Mapping) or not isinstance(body, Mapping):
-        return blocks
-    return blocks | {"model": {**model, "body": {**body, "file": str((folder / file).resolve())}}}
+        found = [one | {"model": _of_files(one["model"], folder)} if _has(one, "model") else one for one in cheap]
+        blocks = blocks | {"method": {**blocks["method"], "cheap": found}}
+    return blocks | {"model": _of_files(model, folder)} if isinstance(model, Mapping) else blocks
 
 
-def _holds_model(block: Any) -> bool:
-    return isinstance(block, Mapping) and isinstance(block.get("model"), Mapping)
+def _has(block: Any, key: str) -> bool:
+    return isinstance(block, Mapping) and isinstance(block.get(key), Mapping)
 
 
-def _of_file(model: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Give the full path of a reduced model."""
+def _of_files(model: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """Give the full paths of the files of a model, as `_located`."""
     file = model.get("file")
-    if model.get("kind") != REDUCED or not isinstance(file, str):
-        return dict(model)
-    place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
-    return {**model, "file": str(place.resolve())}
+    if model.get("kind") == REDUCED and isinstance(file, str):
+        place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+        return {**model, "file": str(place.resolve())}
+    file = model["body"].get("file") if _has(model, "body") else None
+    if not isinstance(file, str):
+        return model
+    return {**model, "body": {**model["body"], "file": str((folder / file).resolve())}}
 
 
 def _with_draws(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:

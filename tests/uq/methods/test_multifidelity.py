@@ -283,6 +283,15 @@ def test_other_models_are_part_of_what_results_depend_on():
     assert study.modules == ("own_model",)
 
 
+def test_files_of_cheap_models_are_beside_the_study(tmp_path):
+    text = (ROOT / "configs" / "tiny.toml").read_text()
+    cheap_ = "{ kind = 'model', cost = 0.01, model = { kind = 'reduced', file = 'tiny.npz' } }"
+    method = f"[method]\nkind = 'multifidelity'\nsamples = 40\ncheap = [{cheap_}]\n"
+    (tmp_path / "study.toml").write_text(text[: text.index("[method]")] + method)
+    with pytest.raises(StudyError, match=f"{tmp_path}/tiny.npz: cannot be read"):
+        load(tmp_path / "study.toml")
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """The tiny study, run in one process."""
