@@ -15,6 +15,7 @@ from forward.model import FloatArray
 from forward.reduced.separated import Operator, Separated, Stencil, alternating, cubic_stencil, from_snapshots
 
 ORGAN = Path(__file__).parent.parent / "configs" / "organ.toml"
+SPREAD = 0.015  # m: width of a fingertip
 PAIRS = (5, 10, 20, 40, 80, 160, 320)
 LONG, WIDE, YOUNG, FORCE = 400.0, 40.0, 1.0, 320.0  # mm, mm, MPa, N: the rod and the beam of the literature
 
@@ -186,11 +187,16 @@ def organ(most: int) -> None:
     np.add.at(total, outer.ravel(), np.repeat(normal, 3, axis=0))
     places = np.setdiff1d(np.unique(outer), held)
     forces = np.zeros((len(places), 3 * len(mesh.points)))
-    unit = total[places] / np.linalg.norm(total[places], axis=1, keepdims=True)
-    forces[np.arange(len(places))[:, None], 3 * places[:, None] + np.arange(3)] = unit
+    size = np.linalg.norm(total[places], axis=1)
+    forces[np.arange(len(places))[:, None], 3 * places[:, None] + np.arange(3)] = total[places] / size[:, None]
     free = np.repeat(~np.isin(np.arange(len(mesh.points)), held), 3)
     stiffness = elasticity(mesh.points, mesh.cells, 160e3, 0.48)
-    pressed(stiffness, free, forces, "The organ, small strains, E = 160 kPa, ν = 0.48", 1e-4, most)
+    title = "The organ, small strains, E = 160 kPa, ν = 0.48, "
+    pressed(stiffness, free, forces, title + "a force at a vertex", 1e-4, most)
+    away = np.linalg.norm(mesh.points[places][:, None] - mesh.points[places], axis=2)
+    spread = np.exp(-((away / SPREAD) ** 2) / 2) * size
+    spread = spread / spread.sum(axis=1, keepdims=True)
+    pressed(stiffness, free, spread @ forces, title + f"spread over {1e3 * SPREAD:.0f} mm", 1e-4, most)
 
 
 # --- large deformations, from snapshots ------------------------------------------------------------------------------
