@@ -1,0 +1,120 @@
+"""Processor time and memory of a body against its size, with factors and by multigrid."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.beams import CONFIG
+
+CELLS = {  # of tetrahedra of the published beam, by about how many unknowns these have
+    1e4: (20, 2, 8),
+    3e4: (32, 3, 12),
+    1e5: (50, 4, 18),
+    3e5: (74, 6, 26),
+    1e6: (110, 9, 40),
+}
+WITH_FACTORS = 1e5  # most unknowns of these
+PARTS = ("build", "first solve", "of it stability", "tangents", "memory (GiB)")
+SCRIPT = """
+import json, resource, sys, time
+import numpy as np
+from mpi4py import MPI
+from benchmarks.beams import beam
+from forward.fem.linearisation import Linearisation
+cells, linear = json.loads(sys.argv[1]), sys.argv[2]
+changes = ('model.body.cell="tetrahedron"', f"model.solver.linear={linear}")
+study = beam(cells, *changes)
+beam((2, 1, 1), *changes).model.build(MPI.COMM_SELF, study.inputs.names).solve(study.inputs.mean).tangent(np.eye(2))
+counting, count = [0.0], Linearisation.inertia
+def timed(self):
+    begin = time.process_time()
+    found = count(self)
+    counting[0] += time.process_time() - begin
+    return found
+Linearisation.inertia = timed
+marks = [time.process_time()]
+model = study.model.build(MPI.COMM_WORLD, study.inputs.names)
+marks.append(time.process_time())
+solution = model.solve(study.inputs.mean)
+marks.append(time.process_time())
+solution.tangent(np.eye(2))
+marks.append(time.process_time())
+peak = MPI.COMM_WORLD.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 2**20
+build, first, tangents = np.diff(marks)
+if MPI.COMM_WORLD.rank == 0:
+    print(json.dumps([study.model.unknowns, build, first, counting[0], tangents, peak]))
+"""
+
+
+def main(options: Sequence[str] = ()) -> None:
+    """Print processor times of one rank (s), peak memory (GiB), and their slopes against unknowns; draw them if asked.
+
+    Forms are compiled. "first solve" is Newton's method from zero to the solver's tolerance, with the test for
+    stability, which takes Lanczos' method in place of inertia without factors.
+    """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks size")
+    parser.add_argument("--unknowns", type=float, nargs="+", choices=sorted(CELLS), default=sorted(CELLS))
+    parser.add_argument("--linear", nargs="+", choices=("factor", "multigrid"), default=("factor", "multigrid"))
+    parser.add_argument("--ranks", type=int, default=1, help="ranks that share the body")
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args(list(options))
+    found: dict[str, list[list[float]]] = {}
+    print("| solved by | unknowns | " + " | ".join(PARTS) + " |\n|---|" + "---:|" * (len(PARTS) + 1))
+    for linear in given.linear:
+        for size in given.unknowns:
+            if linear == "factor" and size > WITH_FACTORS:
+                continue
+            row = measured(CELLS[size], linear, given.ranks)
+            found.setdefault(linear, []).append(row)
+            print(f"| {linear} | {row[0]:,.0f} | " + " | ".join(f"{value:.2f}" for value in row[1:]) + " |", flush=True)
+    for linear, rows in found.items():
+        if len(rows) > 1:
+            sizes, *columns = np.log(np.maximum(np.array(rows), 1e-3)).T
+            slopes = [np.polyfit(sizes, column, 1)[0] for column in columns]
+            words = ", ".join(f"{part} {slope:.2f}" for part, slope in zip(PARTS, slopes, strict=True))
+            print(f"\nslopes, {linear}: {words}")
+    if given.picture is not None:
+        draw(found, given.picture)
+
+
+def measured(cells: tuple[int, int, int], linear: str, ranks: int) -> list[float]:
+    """Measure one size in a process of its own: unknowns, and `PARTS`."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))}
+    environment = kept | {
+        "OMPI_ALLOW_RUN_AS_ROOT": "1",
+        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    program = [sys.executable, "-c", SCRIPT, json.dumps(cells), linear]
+    if ranks > 1:
+        program = ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", str(ranks), *program]
+    done = subprocess.run(
+        program, env=environment, stdout=subprocess.PIPE, text=True, cwd=CONFIG.parent.parent, check=True
+    )
+    return [float(value) for value in json.loads(done.stdout.splitlines()[-1])]
+
+
+def draw(found: dict[str, list[list[float]]], file: Path) -> None:
+    """Draw first solves and memory against unknowns."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    for axes, column, label in zip(
+        figure.subplots(1, 2), (2, 5), ("first solve (s of processor time)", "memory (GiB)"), strict=True
+    ):
+        for linear, rows in found.items():
+            table = np.array(rows)
+            axes.loglog(table[:, 0], table[:, column], "o-", label=linear)
+        axes.set_xlabel("unknowns")
+        axes.set_ylabel(label)
+        axes.grid(visible=True, alpha=0.3)
+    axes.legend()
+    figure.savefig(file, dpi=150)
