@@ -18,6 +18,7 @@ import xarray as xr
 ROOT = Path(__file__).parent.parent
 SHORTER = {  # what keeps the kind of study, at less cost
     "batch": ("method.samples=32", "method.starts=1"),
+    "beam-million": ("model.body.cells=[4, 1, 2]",),
     "beam-compare": ("method.repeats=2", "method.textbook=1", "model.body.cells=[4, 1, 2]"),
     "beam-coverage": ("method.repeats=2",),
     "four-parameters": ("method.repeats=2", "method.textbook=1"),

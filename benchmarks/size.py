@@ -7,12 +7,15 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.beams import CONFIG
+from forward.bodies.geometry import Box
+from forward.bodies.random_fields import Matern, Smoothness
 
 CELLS = {  # of tetrahedra of the published beam, by about how many unknowns these have
     1e4: (20, 2, 8),
@@ -21,6 +24,8 @@ CELLS = {  # of tetrahedra of the published beam, by about how many unknowns the
     3e5: (74, 6, 26),
     1e6: (110, 9, 40),
 }
+SMOOTHNESS: tuple[Smoothness, ...] = (2, 4)
+LENGTH = 0.3  # of random fields, over the edge of the cube
 WITH_FACTORS = 1e5  # most unknowns of these
 PARTS = ("build", "first solve", "of it stability", "tangents", "memory (GiB)")
 SCRIPT = """
@@ -43,10 +48,20 @@ Linearisation.inertia = timed
 marks = [time.process_time()]
 model = study.model.build(MPI.COMM_WORLD, study.inputs.names)
 marks.append(time.process_time())
-solution = model.solve(study.inputs.mean)
-marks.append(time.process_time())
-solution.tangent(np.eye(2))
-marks.append(time.process_time())
+if sys.argv[3] == "step":
+    equations, zero = model.equations, np.zeros(model.equations.size)
+    equations.set_parameters(study.inputs.mean)
+    equations.at_load(1.0)
+    residual = equations.residual(zero)
+    equations.factorise(zero)
+    equations.solve(-residual.vector)
+    equations.inertia()
+    marks += [time.process_time()] * 2
+else:
+    solution = model.solve(study.inputs.mean)
+    marks.append(time.process_time())
+    solution.tangent(np.eye(2))
+    marks.append(time.process_time())
 peak = MPI.COMM_WORLD.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 2**20
 build, first, tangents = np.diff(marks)
 if MPI.COMM_WORLD.rank == 0:
@@ -64,15 +79,20 @@ def main(options: Sequence[str] = ()) -> None:
     parser.add_argument("--unknowns", type=float, nargs="+", choices=sorted(CELLS), default=sorted(CELLS))
     parser.add_argument("--linear", nargs="+", choices=("factor", "multigrid"), default=("factor", "multigrid"))
     parser.add_argument("--ranks", type=int, default=1, help="ranks that share the body")
+    parser.add_argument("--step", action="store_true", help="one step of Newton's method in place of a solve")
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--fields", action="store_true", help="random fields on cubes, in place of bodies")
     given = parser.parse_args(list(options))
+    if given.fields:
+        of_fields()
+        return
     found: dict[str, list[list[float]]] = {}
     print("| solved by | unknowns | " + " | ".join(PARTS) + " |\n|---|" + "---:|" * (len(PARTS) + 1))
     for linear in given.linear:
         for size in given.unknowns:
             if linear == "factor" and size > WITH_FACTORS:
                 continue
-            row = measured(CELLS[size], linear, given.ranks)
+            row = measured(CELLS[size], linear, given.ranks, step=given.step)
             found.setdefault(linear, []).append(row)
             print(f"| {linear} | {row[0]:,.0f} | " + " | ".join(f"{value:.2f}" for value in row[1:]) + " |", flush=True)
     for linear, rows in found.items():
@@ -85,7 +105,7 @@ def main(options: Sequence[str] = ()) -> None:
         draw(found, given.picture)
 
 
-def measured(cells: tuple[int, int, int], linear: str, ranks: int) -> list[float]:
+def measured(cells: tuple[int, int, int], linear: str, ranks: int, *, step: bool = False) -> list[float]:
     """Measure one size in a process of its own: unknowns, and `PARTS`."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_"))}
     environment = kept | {
@@ -93,13 +113,29 @@ def measured(cells: tuple[int, int, int], linear: str, ranks: int) -> list[float
         "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
         "OMP_NUM_THREADS": "1",
     }
-    program = [sys.executable, "-c", SCRIPT, json.dumps(cells), linear]
+    program = [sys.executable, "-c", SCRIPT, json.dumps(cells), linear, "step" if step else ""]
     if ranks > 1:
         program = ["mpirun", "--bind-to", "none", "--oversubscribe", "-n", str(ranks), *program]
     done = subprocess.run(
         program, env=environment, stdout=subprocess.PIPE, text=True, cwd=CONFIG.parent.parent, check=True
     )
     return [float(value) for value in json.loads(done.stdout.splitlines()[-1])]
+
+
+def of_fields(cells: Sequence[int] = (24, 35)) -> None:
+    """Print what the variance of random fields and their modes take, on cubes with so many cells along each edge."""
+    print("| vertices | smoothness | factor (s) | variance (s) | 20 modes (s) |\n|---:|---:|---:|---:|---:|")
+    for n in cells:
+        for smoothness in SMOOTHNESS:
+            marks = [time.process_time()]
+            matern = Matern.on(Box(size=(1.0, 1.0, 1.0), cells=(n, n, n), degree=1), LENGTH, smoothness)
+            marks.append(time.process_time())
+            assert matern.inflation.min() > 0
+            marks.append(time.process_time())
+            matern.modes(20)
+            marks.append(time.process_time())
+            times = " | ".join(f"{seconds:.2f}" for seconds in np.diff(marks))
+            print(f"| {(n + 1) ** 3:,} | {smoothness} | {times} |", flush=True)
 
 
 def draw(found: dict[str, list[list[float]]], file: Path) -> None:

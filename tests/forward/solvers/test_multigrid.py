@@ -8,6 +8,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError, Stability
 from forward.solvers import multigrid
 from forward.solvers.multigrid import Levels
+from tests.launch import run_script
 
 pytestmark = pytest.mark.fem
 NAMES = ("material.D1", "loads.traction.size")
@@ -217,3 +218,29 @@ def test_an_unstable_state_is_refused():
         spec = spec.model_copy(update={"solver": spec.solver.model_copy(update={"accept_unstable": False})})
         with pytest.raises(SolveError, match="negative eigenvalue"):
             spec.build(MPI.COMM_SELF, ()).solve(np.empty(0))
+
+
+SHARED = """
+import numpy as np
+from mpi4py import MPI
+from tests.forward.solvers.test_multigrid import NAMES, POINT, block, column
+
+found = []
+for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+    model = block("multigrid", body={"kind": "box", "size": (0.1, 0.03, 0.02), "cells": (5, 2, 2)}).build(comm, NAMES)
+    solution = model.solve(POINT)
+    state = comm.bcast(model.space.gather(solution.state[None]))
+    found.append((solution.outputs, state, solution.tangent(np.eye(2)), solution.adjoint(np.ones(1))))
+for shared, alone in zip(*found):
+    np.testing.assert_allclose(shared, alone, rtol=0, atol=1e-7 * np.abs(alone).max())
+for load in (55.0, 70.0):
+    model = column(load, "multigrid").build(MPI.COMM_WORLD, ())
+    count = model.equations.negative_eigenvalues(model.solve(np.empty(0)).state)
+    assert (count > 0) == (load > 60), (load, count)
+"""
+
+
+@pytest.mark.mpi
+def test_ranks_that_share_a_body_agree_with_one():
+    done = run_script(2, SHARED, timeout=900)  # busy machines are slow
+    assert done.returncode == 0, done.stderr
