@@ -65,8 +65,8 @@ def _bash(found: tuple[Command, ...]) -> str:
         f" words={_quoted(' '.join(one.words))} takes={one.takes or 'none'} ;;"
         for one in found
     )
-    valued = {option.name: option.takes for one in found for option in one.options if option.takes is not None}
-    after = "\n".join(f"        {name}) takes={takes or 'none'} options= words= ;;" for name, takes in valued.items())
+    valued = ((f"{one.name} {o.name}", o.takes) for one in found for o in one.options if o.takes is not None)
+    after = "\n".join(f"        {_quoted(pair)}) takes={takes or 'none'} options= words= ;;" for pair, takes in valued)
     return f"""\
 # Completion of tissuq for bash: source <(tissuq completion bash)
 _tissuq() {{
@@ -79,7 +79,7 @@ _tissuq() {{
     case ${{COMP_WORDS[1]}} in
 {cases}
     esac
-    case $before in
+    case "${{COMP_WORDS[1]}} $before" in
 {after}
     esac
     case $word in
