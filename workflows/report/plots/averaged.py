@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from forward.model import FloatArray
 from workflows.report.plots.figure import COLOURS, DARK, axes, text_of
 
 if TYPE_CHECKING:
@@ -14,48 +15,40 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SHOWN = 12  # outputs that have bars
+PARTS = ("within", "between")
 
 
 def within_and_between(predictions: Mapping[str, xr.Dataset], ax: Axes | None = None) -> Axes:
     """Draw a bar for each averaged prediction: the shares of its variance within the models and between them."""
     names = list(predictions)[:SHOWN]
-    ax = ax or axes(height=1.3 + 0.35 * len(names), width=7.0)
-    parts = [
-        np.array([float(predictions[name][f"average_{part}"]) for name in names]) for part in ("within", "between")
-    ]
-    left, places, whole = np.zeros(len(names)), np.arange(len(names))[::-1], sum(parts)
-    for part, colour, label in zip(parts, (COLOURS[0], DARK), ("within the models", "between them"), strict=True):
-        share = np.divide(part, whole, out=np.zeros(len(names)), where=whole > 0)
-        ax.barh(places, share, left=left, height=0.7, color=colour, label=label)
-        left = left + share
-    ax.set_yticks(places, [text_of(name) for name in names])
-    ax.set_xlim(0, 1)
-    ax.set_xlabel("share of the variance")
-    ax.legend(fontsize=7, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
-    return ax
+    of = {part: np.array([float(predictions[name][f"average_{part}"]) for name in names]) for part in PARTS}
+    return _bars(names, {"within the models": of["within"]}, "between them", of["between"], ax)
 
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw a bar for each output: the share of its variance within each candidate, and that between them."""
     outputs = [str(name) for name in dataset["output"].values][:SHOWN]
-    ax = ax or axes(height=1.3 + 0.35 * len(outputs), width=7.0)
     some = dataset.sel(output=outputs)
-    whole = (some["within"] + some["between"]).to_numpy()
-    parts = {
-        f"within {text_of(str(one))}": (
-            float(dataset["candidate_probability"].sel(candidate=one)) * some["candidate_std"].sel(candidate=one) ** 2
-        ).to_numpy()
-        for one in dataset["candidate"].values
-    }
-    left, places = np.zeros(len(outputs)), np.arange(len(outputs))[::-1]
-    colours = [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
-    for (name, part), colour in zip(
-        [*parts.items(), ("between", some["between"].to_numpy())], [*colours, DARK], strict=True
-    ):
-        share = np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0)
-        ax.barh(places, share, left=left, height=0.7, color=colour, label=name)
+    within = {}
+    for name in dataset["candidate"].values:
+        one = some.sel(candidate=name)
+        share = float(one["candidate_probability"]) * one["candidate_std"] ** 2
+        within[f"within {text_of(str(name))}"] = share.to_numpy()
+    return _bars(outputs, within, "between", some["between"].to_numpy(), ax)
+
+
+def _bars(
+    names: Sequence[str], within: Mapping[str, FloatArray], label: str, between: FloatArray, ax: Axes | None
+) -> Axes:
+    """Draw a bar for each of some names: shares of parts (n,) within candidates, and of that between them."""
+    ax = ax or axes(height=1.3 + 0.35 * len(names), width=7.0)
+    left, places, whole = np.zeros(len(names)), np.arange(len(names))[::-1], sum(within.values()) + between
+    colours = [COLOURS[i % len(COLOURS)] for i in range(len(within))]
+    for (said, part), colour in zip([*within.items(), (label, between)], [*colours, DARK], strict=True):
+        share = np.divide(part, whole, out=np.zeros(len(names)), where=whole > 0)
+        ax.barh(places, share, left=left, height=0.7, color=colour, label=said)
         left = left + share
-    ax.set_yticks(places, [text_of(name) for name in outputs])
+    ax.set_yticks(places, [text_of(name) for name in names])
     ax.set_xlim(0, 1)
     ax.set_xlabel("share of the variance")
     ax.legend(fontsize=7, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
