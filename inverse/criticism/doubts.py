@@ -32,6 +32,7 @@ BIASED, WRONG = (
 EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviations that it makes, that are doubted
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
 OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
+UNSEEN, SOME = 0.9, 0.05  # of the prior's deviation, above which data say little; share of vertices that is told
 EXPANDED = 0.3  # error of an expansion over that of a datum that makes intervals wider by more than 4 %
 GRID = np.linspace(-40.0, 40.0, 8001)
 
@@ -89,6 +90,25 @@ def far_from_prior(
         )
         found.append(Doubt("error" if chance < IMPOSSIBLE else "warning", text, "the prior does not allow it"))
     return found
+
+
+def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> list[Doubt]:
+    """Say where a field is what its prior says: deviations (n,) of posterior and prior at places (n, 3)."""
+    left = np.divide(std, prior_std, out=np.ones_like(std), where=prior_std > 0)
+    share = float((left > UNSEEN).mean())
+    if share < SOME:
+        return []
+    best, least = (f"{left[k]:.2g} of it at ({', '.join(f'{x:.3g}' for x in places[k])}) m" for k in _ends(left))
+    text = (
+        f"at {100 * share:.0f} % of the vertices the data say next to nothing: there the standard deviation is above "
+        f"{UNSEEN:g} of the prior's, and the value follows from prior and neighbours (smallest: {best}; largest: "
+        f"{least})"
+    )
+    return [Doubt("note", text, "")]
+
+
+def _ends(values: FloatArray) -> tuple[int, int]:
+    return int(values.argmin()), int(values.argmax())
 
 
 def at_an_end(priors: Mapping[str, Distribution], mode: FloatArray, draws: FloatArray) -> list[Doubt]:

@@ -69,6 +69,8 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     if study.field:
         centre, width = float(one["prior_mean"][0]), float(one["prior_std"][0])
         priors: dict[str, Distribution] = {names[0]: Normal(mean=centre, std=width)}
+        stiffness = (one[name].to_numpy() for name in ("stiffness_std", "stiffness_prior_std", "node_position"))
+        found += criticism.little_seen(*stiffness)
     else:
         priors = dict(study.inputs.marginals)
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d])

@@ -6,6 +6,7 @@ import pytest
 from inverse.criticism.doubts import (
     at_an_end,
     far_from_prior,
+    little_seen,
     mesh_corrected,
     mesh_too_coarse,
     noise_far,
@@ -148,3 +149,15 @@ def test_a_corrected_mesh_is_a_note_unless_it_decides():
         (doubt,) = mesh_corrected(np.full(9, size), {"mean": 0.4}, {"mean": 0.3}, np.full(3, 0.4), settled=True)
         assert doubt.severity == severity
         assert ("what the data determine best" in doubt.text) == (severity == "warning")
+
+
+def test_where_a_field_is_its_prior_is_said():
+    """Of four vertices two are as wide as before; where the prior knows everything, data cannot add to it."""
+    places = np.arange(12.0).reshape(4, 3)
+    (doubt,) = little_seen(np.array([0.1, 0.49, 0.5, 0.3]), np.full(4, 0.5), places)
+    assert doubt.severity == "note"
+    assert "at 50 % of the vertices" in doubt.text
+    assert "0.2 of it at (0, 1, 2) m" in doubt.text
+    assert "1 of it at (6, 7, 8) m" in doubt.text
+    assert little_seen(np.full(4, 0.1), np.full(4, 0.5), places) == []
+    assert little_seen(np.zeros(4), np.zeros(4), places)[0].text.startswith("at 100 %")

@@ -90,6 +90,15 @@ def panels(one: xr.Dataset) -> dict[str, FloatArray]:
     return found
 
 
+def left_of_prior(one: xr.Dataset, cut: Cut) -> Axes:
+    """Draw on a plane the standard deviation over the prior's: 1 where the data say nothing."""
+    (ax,) = grid(1, columns=1, width=4.5)
+    std, prior = (one[name].to_numpy() for name in ("stiffness_std", "stiffness_prior_std"))
+    left = np.divide(std, prior, out=np.ones_like(std), where=prior > 0)
+    _draw(ax, cut, left, "standard deviation over the prior's", "plasma", (0.0, 1.0))
+    return ax
+
+
 def slices(one: xr.Dataset, cut: Cut) -> Axes:
     """Draw truth, mean and standard deviations of ln stiffness on a plane."""
     drawn = panels(one)

@@ -62,6 +62,8 @@ def pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
     """Draw the results for one data set, each with a caption."""
     cut = plots.Cut.of(one)
     yield from on_a_plane(one, cut)
+    words = "What the data see: 0 where they determine the stiffness, 1 where it stays what the prior says,"
+    yield plots.left_of_prior(one, cut), f"{words} on {cut.words}."
     words = "The directions that the data constrain most, and the last that were found"
     yield plots.direction_slices(one, cut), f"{words}, on {cut.words}."
     yield plots.alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {cut.words}."
