@@ -107,7 +107,9 @@ def findings(study: Study) -> Iterator[Finding]:
     if not study.spec.meshed:
         return
     if not study.estimates:
-        why = "it is not estimated" if study.accuracy.mesh_error else "accuracy.mesh_error = false"
+        why = "accuracy.mesh_error = false"
+        if study.accuracy.mesh_error:
+            why = "it is not estimated, so that the tolerance will not be said to be kept"
         yield Finding("warning", f"accuracy.tolerance does not count the error of the mesh: {why}.")
         return
     unknown = [output.name for output in study.spec.returned if not getattr(output, "estimable", True)]
