@@ -21,7 +21,7 @@ from workflows.__main__ import main as command
 
 CONFIG = Path(__file__).parent.parent / "configs" / "slab.toml"
 MODES = (20, 40, 80)
-FRAMES, EVERY = 20_000, 50
+FRAMES, EVERY = 5_000, 100
 POINTS = 20
 
 
