@@ -101,6 +101,6 @@ def _frames(model: ReducedModel) -> None:
     cpu = 1e3 * np.array([np.median(busy), np.quantile(busy, 0.99)])
     print(
         f"frames: processor time {cpu[0]:.3f} ms (99 % {cpu[1]:.3f}); by the clock median {low:.3f} ms, "
-        f"99 % {high:.3f} ms, worst of {FRAMES} {worst:.2f} ms, {(lasted > 1e-3).mean():.2%} over 1 ms; off the equilibrium by at most "
-        f"{off:.2g} % of the spread (the largest stress, linear in between: {held:.2g} %)"
+        f"99 % {high:.3f} ms, worst of {FRAMES} {worst:.2f} ms, {(lasted > 1e-3).mean():.2%} over 1 ms; "
+        f"off the equilibrium by at most {off:.2g} % of the spread (the largest stress, linear in between: {held:.2g} %)"
     )
