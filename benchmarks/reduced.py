@@ -102,5 +102,5 @@ def _frames(model: ReducedModel) -> None:
     print(
         f"frames: processor time {cpu[0]:.3f} ms (99 % {cpu[1]:.3f}); by the clock median {low:.3f} ms, "
         f"99 % {high:.3f} ms, worst of {FRAMES} {worst:.2f} ms, {(lasted > 1e-3).mean():.2%} over 1 ms; "
-        f"off the equilibrium by at most {off:.2g} % of the spread (the largest stress, linear in between: {held:.2g} %)"
+        f"off the equilibrium by at most {off:.2g} % of the spread (stress, linear in between: {held:.2g} %)"
     )
