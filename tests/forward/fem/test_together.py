@@ -1,5 +1,6 @@
 """Samples that are corrected in lockstep: the answers of each alone, whatever becomes of the others."""
 
+import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -7,8 +8,10 @@ from mpi4py import MPI
 from forward.fem import cost, together
 from forward.model import Guess, InadmissibleError, SolveError
 from tests.bodies import loaded_body
+from tests.forward.bodies import test_mesh_file
 from tests.forward.fem.test_mixed import BULK, SHEAR, TRACTION, cantilever
 from tests.launch import ROOT, run_script
+from tests.meshes import box
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -52,9 +55,18 @@ def predicted(model, inputs, n):
     return points, list(map(prediction.on(model), points))
 
 
-@pytest.mark.parametrize("make", [beam, field, mixed, follower])
-def test_states_are_those_of_samples_alone(make):
-    model, inputs = make()
+def regional(folder):
+    """A mesh from a file, of which the right half has numbers of its own."""
+    meshio.write(folder / "box.msh", box(), file_format="gmsh22", binary=True)
+    spec = test_mesh_file.regional(folder / "box.msh")
+    value = dict(zip(test_mesh_file.NUMBERS, (1e4, 2e4, 3e4, 1e5, 1.5), strict=True))
+    inputs = Inputs({path: Uniform(lower=0.8 * number, upper=1.2 * number) for path, number in value.items()})
+    return spec.build(MPI.COMM_SELF, inputs.names), inputs
+
+
+@pytest.mark.parametrize("make", [beam, field, mixed, follower, regional])
+def test_states_are_those_of_samples_alone(make, tmp_path):
+    model, inputs = make(tmp_path) if make is regional else make()
     points, guesses = predicted(model, inputs, 9)
     alone = [model.solve(point, guess) for point, guess in zip(points, guesses, strict=True)]
     slopes = [solution.tangent(np.eye(len(point))) for solution, point in zip(alone, points, strict=True)]
