@@ -4,9 +4,17 @@ Written for DOLFINx 0.5 (Debian 12) and 0.11 (the wheel `dolfinx-solver-real`); 
 Importing any part of it initialises the libraries, in the order that they need.
 """
 
+import sys
 from contextlib import suppress
+from importlib import metadata
+from types import ModuleType, SimpleNamespace
 
 from forward.machine import HOW_TO_INSTALL, reserve_for_linear_algebra
+
+# UFL and FFCx 0.5 ask `pkg_resources` for their version, and nothing else: importing it takes a third of what they do.
+_stand_in = ModuleType("pkg_resources")
+_stand_in.get_distribution = lambda name: SimpleNamespace(version=metadata.version(name))  # type: ignore[attr-defined]
+_stands_in = sys.modules.setdefault("pkg_resources", _stand_in) is _stand_in
 
 try:
     with suppress(ModuleNotFoundError):
@@ -20,6 +28,9 @@ try:
 except ImportError as error:
     error.add_note(HOW_TO_INSTALL)
     raise
+finally:
+    if _stands_in:
+        del sys.modules["pkg_resources"]
 
 reserve_for_linear_algebra()
 basix.create_element(basix.ElementFamily.P, basix.CellType.interval, 1)  # with the linear algebra of DOLFINx, too

@@ -8,6 +8,7 @@ or do not compile, there is no such kernel, and DOLFINx's own loop over cells do
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import re
 import shlex
@@ -17,7 +18,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cffi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,10 +94,6 @@ void assemble(int64_t cells, const double* places, const int32_t* const* nodes, 
   }}
 }}
 """
-_FFI = cffi.FFI()
-_FFI.cdef("""
-void assemble(int64_t, const double*, const int32_t* const*, const double* const*, const double*, double*);
-""")
 _VERSION = hashlib.sha256(_SOURCE.read_bytes() + Path(__file__).read_bytes()).hexdigest()[:12]
 
 
@@ -156,36 +152,29 @@ class Kernel:
         loop = _loop(places.shape[1] * places.shape[2], coefficients, constants, to)
         text = hashlib.sha256(loop.encode()).hexdigest()[:4]  # an expression is stored, or added up
         beside = f"-lanes-{_VERSION}-{text}"
-        self._library = compiled(what, lambda folder: self._load(folder, what, loop, comm), comm, beside)
-        self.available = self._library is not None
+        self._assemble = compiled(what, lambda folder: self._load(folder, what, loop, comm), comm, beside)
+        self.available = self._assemble is not None
         self._cells = len(places)
         self._places = _grouped(places.reshape(-1, places.shape[1] * places.shape[2]))
         self._kept = [_grouped(one.nodes) for one in [*coefficients, *added]], [one.values for one in coefficients]
         nodes, values = self._kept
-        self._nodes = _FFI.new("int32_t*[]", [self._at("int32_t*", one) for one in nodes])
-        self._values = _FFI.new("double*[]", [self._at("double*", one) for one in values])
+        self._nodes, self._values = _addresses(nodes), _addresses(values)
 
     def _load(self, folder: Path, what: Any, loop: str, comm: Any) -> Any:
         library = folder / "lanes.so"
         if comm.rank == 0 and not (folder / "lanes.c").exists():
             _compile(folder_of(what), loop, folder / "lanes.c", library)
         exists = comm.bcast(library.exists() if comm.rank == 0 else None)
-        return _FFI.dlopen(str(library)) if exists else None
-
-    def _at(self, kind: str, array: NDArray[Any]) -> Any:
-        return _FFI.cast(kind, _FFI.from_buffer(array))
+        return ctypes.CDLL(str(library)).assemble if exists else None
 
     def __call__(self, constants: FloatArray, out: FloatArray) -> None:
         """Add the values of all cells to those of the nodes in `out`, or put those of each cell there."""
-        at = self._at
-        self._library.assemble(
-            self._cells,
-            at("double*", self._places),
-            self._nodes,
-            self._values,
-            at("double*", constants),
-            at("double*", out),
-        )
+        places, values, to = (ctypes.c_void_p(array.ctypes.data) for array in (self._places, constants, out))
+        self._assemble(ctypes.c_int64(self._cells), places, self._nodes, self._values, values, to)
+
+
+def _addresses(arrays: Sequence[NDArray[Any]]) -> ctypes.Array[ctypes.c_void_p]:
+    return (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
 
 
 def _compile(folder: Path, loop: str, source: Path, library: Path) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
-from scipy.sparse import csr_matrix
 
 from forward.fem.dolfinx import version
 from forward.fem.dolfinx.spaces import cell_element, owned_nodes, sum_ghosts
@@ -36,6 +35,8 @@ class Transfer:
         columns = from_nodes[cells]
         rows = np.broadcast_to(np.arange(owned)[:, None], columns.shape)
         entries = (values[places].ravel(), (rows.ravel(), columns.ravel()))
+        from scipy.sparse import csr_matrix
+
         self._matrix = csr_matrix(entries, shape=(owned, index_map.size_local + index_map.num_ghosts))
         self._matrix.eliminate_zeros()
         self._transposed = self._matrix.T.tocsr()

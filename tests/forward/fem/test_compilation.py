@@ -99,3 +99,13 @@ def test_a_cache_that_cannot_be_made_is_said_in_one_line(tmp_path):
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith(f"failed: compiled forms cannot be kept in {tmp_path}/tissuq/forms-")
     assert last.endswith("set XDG_CACHE_HOME to a folder of yours")
+
+
+def test_what_is_imported_with_dolfinx():
+    """Not what UFL and FFCx only ask for their versions, nor SciPy before it is used."""
+    code = (
+        "import sys, forward.fem.dolfinx as _, forward.fem.dolfinx.transfer, ufl, ffcx\n"
+        "print(ufl.__version__ == ffcx.__version__ == '', {'pkg_resources', 'scipy.sparse'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment(), capture_output=True, text=True)
+    assert done.stdout.split(maxsplit=1) == ["False", "set()\n"], done.stderr
