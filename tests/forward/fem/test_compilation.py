@@ -107,5 +107,7 @@ def test_what_is_imported_with_dolfinx():
         "import sys, forward.fem.dolfinx as _, forward.fem.dolfinx.transfer, ufl, ffcx\n"
         "print(ufl.__version__ == ffcx.__version__ == '', {'pkg_resources', 'scipy.sparse'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment(), capture_output=True, text=True)
-    assert done.stdout.split(maxsplit=1) == ["False", "set()\n"], done.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True
+    )
+    assert done.stdout.split(maxsplit=1) == ["False", "set()\n"]
