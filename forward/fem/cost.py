@@ -98,11 +98,11 @@ HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, r
 # Linear systems by conjugate gradients with two levels (`forward.fem.dolfinx.multigrid`).
 PER_PRODUCT = 1.5e-9  # of the matrix times a vector, for each non-zero
 BYTES_PER_ENTRY_IN_BLOCKS = 9.0  # of the matrix
-PRODUCTS = 6.5  # an iteration, without the coarse level
+PRODUCTS = 5.5  # an iteration, without the coarse level
 BOUNDING = 13  # products for the bound of the eigenvalues
 ROUGHLY_SOLVED = {True: 9, False: 6}  # iterations of a step of Newton's method, in bodies that are slender and others
-SOLVED = {True: 32, False: 20}  # of a derivative
-LANCZOS = 22  # to know that a state is stable
+SOLVED = {True: 24, False: 16}  # of a derivative
+LANCZOS = 16  # to know that a state is stable
 COARSE = 0.5  # of an assembly, for the coarse level
 NEWTON_FROM_PREDICTION = 3
 WORTH, DERIVATIVES = 0.7, 4  # times a first solve and so many derivatives with factors, below which none are made

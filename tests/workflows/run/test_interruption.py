@@ -136,7 +136,7 @@ def test_a_study_that_runs_out_of_memory_keeps_nothing_of_it(tmp_path):
         (reason,) = reasons(done)
         assert reason.startswith("failed: memory ran out: "), reason
         assert "available (limit of the address space, ulimit -v)" in reason
-        assert any(line.startswith("warning: memory may run out: about 1,5") for line in done.stderr.splitlines())
+        assert any(line.startswith("warning: memory may run out: about 1,6") for line in done.stderr.splitlines())
     assert tissuq("run", *FACTORED, *FEW, "--out", out).returncode == 0
     assert tissuq("run", *FACTORED, *FEW, "--out", whole).returncode == 0
     assert (out / "results.nc").read_bytes() == (whole / "results.nc").read_bytes()
@@ -156,7 +156,7 @@ def test_check_foresees_that_memory_runs_out():
     done = tissuq("check", *FACTORED, limits=[(resource.RLIMIT_AS, 1_100_000 * 1024)])
     assert done.returncode == 0
     (line,) = (line for line in done.stdout.splitlines() if line.startswith("warning"))
-    assert "memory may run out: about 1,5" in line
+    assert "memory may run out: about 1,6" in line
     assert "MiB are available (limit of the address space, ulimit -v)" in line
     assert "warning" not in tissuq("check", *FACTORED).stdout
 
