@@ -39,10 +39,14 @@ def on_files(files: Any, config: Any) -> Any:
 
     for place, text in pages():
         files.append(File.generated(config, place, content=text))
-    package = importlib.metadata.distribution("sphinx-mathjax-offline")
-    script = package.locate_file(f"{package.name}/static/mathjax/tex-svg.js")
-    files.append(File.generated(config, "assets/mathjax.js", abs_src_path=str(script)))
+    files.append(File.generated(config, "assets/mathjax.js", abs_src_path=str(mathjax())))
     return files
+
+
+def mathjax() -> Path:
+    """Return the script that typesets formulas, of a package that holds a copy of MathJax."""
+    package = importlib.metadata.distribution("sphinx-mathjax-offline")
+    return Path(str(package.locate_file(f"{package.name}/static/mathjax/tex-svg.js")))
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
