@@ -22,7 +22,8 @@ def test_a_worker_answers_from_disk_in_turn(page, tmp_path):
     """Two messages before it is there, one after: as the search of the theme uses it."""
     (tmp_path / "helper.js").write_text("self.twice = (x) => 2 * x;")
     (tmp_path / "work.js").write_text(
-        "addEventListener('message', async (e) => { await importScripts('helper.js'); postMessage(twice(e.data)); });"
+        "const there = importScripts('helper.js');"
+        "addEventListener('message', async ({ data }) => { await there; postMessage(twice(data)); });"
     )
     script = "\n".join(
         [
