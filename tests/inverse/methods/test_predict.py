@@ -347,6 +347,58 @@ def test_a_field_predicts_by_adjoints(specimens):
     assert (found["prediction_prior_std"] > found["prediction_std"]).all()
 
 
+KILLED = """
+import os, sys
+from uq.evaluation.kept import KeptModel
+from workflows.__main__ import main
+known, seen = KeptModel.solve, []
+
+def solve(self, *given):
+    seen.extend([1] if "predicted" in self.label and "prior" not in self.label else [])
+    return os._exit(9) if len(seen) > 3 else known(self, *given)
+
+KeptModel.solve = solve
+main(sys.argv[1:])
+"""
+
+
+def asked(study, *changes):
+    words = ["run", study, "--quiet", "--no-report", "--set", "method.mesh_error=false", "--set", "method.rank=20"]
+    return [*words, *(word for change in changes for word in ("--set", change)), "--out"]
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+def test_predictions_of_a_field_do_not_depend_on_groups_nor_kills(specimens, tmp_path):
+    """The same bytes on two groups of ranks, and after an end amid the solves for predictions."""
+    words = asked(specimens / "field.toml", "predict.samples=8")
+    assert run_script(None, KILLED, *words, tmp_path / "cut").returncode == 9
+    assert list((tmp_path / "cut" / "evaluations").iterdir())
+    for ranks, out in ((1, "on-1"), (2, "on-2"), (1, "cut")):
+        done = run(ranks, TISSUQ, *words, tmp_path / out)
+        assert done.returncode in (0, 3), done.stderr
+    for other in ("on-2", "cut"):
+        assert_same_bits(tmp_path / "on-1", tmp_path / other)
+
+
+@pytest.mark.fem
+@pytest.mark.mpi
+@pytest.mark.slow  # on a busy machine ranks of a tiny mesh wait for each other
+@pytest.mark.parametrize("ranks", [2])
+def test_predictions_of_a_field_by_ranks_that_share_a_model(specimens, tmp_path, ranks):
+    words = asked(specimens / "field.toml", "predict.samples=8")
+    assert run(None, TISSUQ, *words, tmp_path / "alone").returncode in (0, 3)
+    more = ["--set", f"parallel.ranks_per_model={ranks}"]
+    done = run(ranks, TISSUQ, *words, tmp_path / "shared", *more, timeout=900)
+    assert done.returncode in (0, 3), done.stderr
+    alone, shared = results(tmp_path / "alone"), results(tmp_path / "shared")
+    names = [name for name in alone.variables if str(name).startswith("prediction_") and alone[name].dtype.kind == "f"]
+    assert names
+    for name in names:
+        size = float(np.nanmax(np.abs(alone[name]), initial=0.0))
+        np.testing.assert_allclose(shared[name], alone[name], rtol=0, atol=1e-9 * size, err_msg=str(name))
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
