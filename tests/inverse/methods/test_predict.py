@@ -384,9 +384,9 @@ def test_predictions_of_a_field_do_not_depend_on_groups_nor_kills(specimens, tmp
 @pytest.mark.fem
 @pytest.mark.mpi
 @pytest.mark.slow  # on a busy machine ranks of a tiny mesh wait for each other
-@pytest.mark.parametrize("ranks", [2])
+@pytest.mark.parametrize("ranks", [2, 3])
 def test_predictions_of_a_field_by_ranks_that_share_a_model(specimens, tmp_path, ranks):
-    words = asked(specimens / "field.toml", "predict.samples=8")
+    words = asked(specimens / "field.toml", "predict.samples=2", "model.body.cells=[1, 1, 3]")
     assert run(None, TISSUQ, *words, tmp_path / "alone").returncode in (0, 3)
     more = ["--set", f"parallel.ranks_per_model={ranks}"]
     done = run(ranks, TISSUQ, *words, tmp_path / "shared", *more, timeout=900)
@@ -395,7 +395,7 @@ def test_predictions_of_a_field_by_ranks_that_share_a_model(specimens, tmp_path,
     names = [name for name in alone.variables if str(name).startswith("prediction_") and alone[name].dtype.kind == "f"]
     assert names
     for name in names:
-        size = float(np.nanmax(np.abs(alone[name]), initial=0.0))
+        size = float(np.abs(alone[name].fillna(0)).max())
         np.testing.assert_allclose(shared[name], alone[name], rtol=0, atol=1e-9 * size, err_msg=str(name))
 
 
