@@ -69,7 +69,7 @@ def job(study: Study, ensemble: Ensemble, directory: Path) -> Job:
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
     }
     function = study.spec.build(ensemble.group, inputs.names)
-    if function.space is None:
+    if function.space is None or not function.space.displacements:  # a specimen has states, but no one field
 
         def described(found: xr.Dataset) -> xr.Dataset:
             found = label(_without_nodes(found), units, None, None, 0)

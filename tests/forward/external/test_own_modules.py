@@ -134,10 +134,10 @@ def test_before_anything_is_computed_the_model_may_change(tmp_path, tissuq):
 def test_versions_of_installed_packages_are_part_of_the_source(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own_versions.py").write_text(
-        "import numpy as np, h5py, yaml, json, uq.inputs.sampling, nowhere_at_all\n"
+        "import numpy as np, pydantic, yaml, json, uq.inputs.sampling, nowhere_at_all\n"
     )
     found = sources(["own_versions"])
-    assert found.versions == {name: version(name) for name in ("numpy", "h5py", "PyYAML")}
+    assert found.versions == {name: version(name) for name in ("numpy", "pydantic", "PyYAML")}
     assert found.files.keys() == {"own_versions"}
     other = Sources(found.files, found.versions | {"numpy": "1.0"})
     assert other.change(found) == f"numpy was 1.0, and is {version('numpy')}"
