@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -10,13 +11,22 @@ import xarray as xr
 
 from inverse.methods.population import LEAST
 from tests.inverse.low_dimensional.test_population import closed_form
-from tests.launch import TISSUQ
+from tests.launch import TISSUQ, assert_same_bits, environment
 from tests.launch import run as on_ranks
 from uq.inputs.distributions import LogNormal, Normal
 from workflows.config.study import load
 from workflows.run.run import run
 
-MODULE = "def value(p):\n    return [p[0]]\ndef slope(p):\n    return [[1.0]]\n"
+MODULE = """
+import itertools, os
+count = itertools.count()
+def value(p):
+    if "KILL" in os.environ and next(count) > 300:
+        os._exit(9)
+    return [p[0]]
+def slope(p):
+    return [[1.0]]
+"""
 INVERT = """
 [model]
 kind = "python"
@@ -75,16 +85,21 @@ def texts(directory):
 
 
 def test_a_batch_is_inverted_again_where_its_draws_do_not_reach(batch, tmp_path):
-    """The same bytes on any number of ranks, and without the data a finding that says where they are missing."""
+    """The same bytes on any number of ranks and after an end amid it, and without the data a finding that says so."""
     mean, std, each = closed_form(VALUES, 1.0, Normal(mean=0.0, std=1.0))
     more = f'distribution = "normal"\nstudy = "{batch / "invert.toml"}"'
     path = population(tmp_path, batch / "results", more)
     assert run(load(path), "population", tmp_path / "one", quiet=True, report=False) == 0
-    done = on_ranks(2, TISSUQ, "run", path, "--out", tmp_path / "two", "--quiet", "--no-report")
+    command = [TISSUQ, "run", path, "--quiet", "--no-report", "--out"]
+    done = on_ranks(2, *command, tmp_path / "two")
     assert done.returncode == 0, done.stderr
-    one, two = (xr.load_dataset(tmp_path / name / "results.nc", engine="h5netcdf") for name in ("one", "two"))
-    assert all(one[name].values.tobytes() == two[name].values.tobytes() for name in one.variables)
-    found = one
+    for kill, status in (({"KILL": "1"}, 9), ({}, 0)):
+        words = list(map(str, [*command, tmp_path / "cut"]))
+        done = subprocess.run(words, env=environment() | kill, capture_output=True, check=False)
+        assert done.returncode == status, done.stderr
+    for other in ("two", "cut"):
+        assert_same_bits(tmp_path / "one", tmp_path / other)
+    found = xr.load_dataset(tmp_path / "one" / "results.nc")
     assert (found["specimen_redrawn"] >= 1).all()
     assert (found["specimen_effective"] >= LEAST).all()
     assert float(found["location_mean"][0]) == pytest.approx(mean, abs=0.5 * std)
