@@ -155,21 +155,9 @@ class Ensemble:
         """
         with self.turns(progress) as turns:
             worker = _Worker(self, _Models(model, others or {}, passing), checkpoint, turns)
-            if self.world.rank > 0:
-                with abort_all(self.world):
-                    while isinstance(order := self.told(None), str | _Order):
-                        worker.work(order)
-                if order is not None:
-                    raise order
-                return None
-            ended = None
-            try:
-                return task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes))
-            except Exception as error:
-                ended = _told_to_others(error)
-                raise
-            finally:
-                self.told(ended)
+            return self._followed(
+                lambda: task(EnsembleEvaluate(worker, OWN, progress, blocks, node_volumes)), worker.work, str | _Order
+            )
 
     def led(self, task: Callable[[Callable[[O], R]], T], step: Callable[[O], R]) -> T | None:
         """Run `task` on rank 0 with a function that runs `step`, which is collective, on all ranks; collective.
@@ -184,22 +172,26 @@ class Ensemble:
         Exception
             What the task raises, on all ranks.
         """
-        if self.world.rank > 0:
-            with abort_all(self.world):
-                while isinstance(order := self.told(None), _Step):
-                    step(order.of)
-            if order is not None:
-                raise order
-            return None
 
         def asked(of: O) -> R:
             self.told(_Step(of))
             with abort_all(self.world):
                 return step(of)
 
+        return self._followed(lambda: task(asked), lambda told: step(told.of), _Step)
+
+    def _followed(self, lead: Callable[[], T], follow: Callable[[Any], object], kinds: Any) -> T | None:
+        """Run `lead` on rank 0, while the others follow all that it tells of these kinds, to its end; collective."""
+        if self.world.rank > 0:
+            with abort_all(self.world):
+                while isinstance(order := self.told(None), kinds):
+                    follow(order)
+            if order is not None:
+                raise order
+            return None
         ended = None
         try:
-            return task(asked)
+            return lead()
         except Exception as error:
             ended = _told_to_others(error)
             raise
