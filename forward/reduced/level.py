@@ -6,7 +6,7 @@ displacement at a point; K = ∂R/∂c. All are the derivatives of one energy wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -97,16 +97,19 @@ class Level:
         The model.
     level
         Which of its levels.
+    which
+        Numbers (m,) of the outputs; None for all.
     """
 
-    def __init__(self, data: ReducedData, level: LevelData) -> None:
+    def __init__(self, data: ReducedData, level: LevelData, which: Iterable[int] | None = None) -> None:
         self.integrals = level.integrals
         self.data, self.modes = data, level.modes
         self.before = data.before
         self.count = self.before + level.modes
         p = len(data.numbers)
         self.works = [Integrand(written, points, p) for written, points in zip(data.works, level.works, strict=True)]
-        self._outputs = [_of_output(output, self, p) for output in data.outputs]
+        outputs = data.outputs if which is None else [data.outputs[i] for i in which]
+        self._outputs = [_of_output(output, self, p) for output in outputs]
         self.free = slice(self.before, self.count)
 
     def coordinates(self, parameters: FloatArray, modes: FloatArray) -> FloatArray:
@@ -183,7 +186,7 @@ class Level:
         return np.array([output.value(c, parameters) for output in self._outputs])
 
     def some_outputs(self, which: Sequence[int], c: FloatArray, parameters: FloatArray) -> list[float]:
-        """Return some of the outputs, by number."""
+        """Return some of these outputs, by number."""
         return [self._outputs[i].value(c, parameters) for i in which]
 
     def output_slopes(

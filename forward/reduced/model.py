@@ -6,8 +6,9 @@ No FEniCSx, unless the full model is asked where an estimate exceeds the toleran
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,7 @@ class ReducedModel(OneByOne):
     data
         What it consists of.
     parameters
-        Paths of the parameters of its vectors; the others keep their means.
+        Paths of the parameters of its vectors; the others keep their means, or the values that are given.
     outputs
         Which of its outputs, by name, in this order; None for all.
     tolerance
@@ -60,6 +61,8 @@ class ReducedModel(OneByOne):
         None: never.
     full
         Makes the full model.
+    kept
+        Values of other parameters, by path, in place of their means.
     """
 
     def __init__(
@@ -69,15 +72,19 @@ class ReducedModel(OneByOne):
         outputs: tuple[str, ...] | None = None,
         tolerance: float | None = None,
         full: Callable[[], ForwardModel] | None = None,
+        kept: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.data, self.parameters = data, parameters
         names = [output.name for output in data.outputs]
         self.outputs = tuple(names) if outputs is None else outputs
         self.which = np.array([names.index(name) for name in self.outputs], dtype=np.int64)
         self.places = np.array([data.parameters.index(path) for path in parameters], dtype=np.int64)
-        self.level = Level(data, data.levels[0])
+        self.base = data.nominal.copy()  # values (d,) of all parameters where nobody says otherwise
+        for path, value in kept.items():
+            self.base[data.parameters.index(path)] = value
+        self.level = Level(data, data.levels[0], self.which)
         self.spec = Hyperelastic.model_validate(data.spec)
-        self.space = ReducedSpace(data, self.places)
+        self.space = ReducedSpace(data, self.places, self.base)
         self.differentiable = True
         self.asked = 0  # how often the full model was asked
         self.tested = not self.spec.solver.accept_unstable
@@ -92,7 +99,7 @@ class ReducedModel(OneByOne):
     @cached_property
     def larger(self) -> Level:
         """The nested larger model."""
-        return Level(self.data, self.data.levels[-1])
+        return Level(self.data, self.data.levels[-1], self.which)
 
     @cached_property
     def full(self) -> ForwardModel:
@@ -102,7 +109,7 @@ class ReducedModel(OneByOne):
 
     def whole(self, parameters: FloatArray) -> FloatArray:
         """Return all parameters (d,) of the reduced model."""
-        found = self.data.nominal.copy()
+        found = self.base.copy()
         found[self.places] = parameters
         return found
 
@@ -226,8 +233,8 @@ def outside_of(data: ReducedData, whole: FloatArray) -> str:
 class ReducedSpace:
     """The `NodalSpace` of a reduced model: every rank has all of it."""
 
-    def __init__(self, data: ReducedData, places: NDArray[np.int64]) -> None:
-        self._data, self._places = data, places
+    def __init__(self, data: ReducedData, places: NDArray[np.int64], base: FloatArray) -> None:
+        self._data, self._places, self._base = data, places, base
         self.coordinates = data.places
         self.displacements = data.places.size
 
@@ -249,7 +256,7 @@ class ReducedSpace:
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), at the nodes."""
-        whole = np.tile(self._data.nominal, (len(points), 1))
+        whole = np.tile(self._base, (len(points), 1))
         whole[:, self._places] = points
         pairs = zip(self._data.coefficients, self._data.factors, strict=True)
         return {label: np.exp(log + whole[:, which] @ slopes.T) for (label, which), (log, slopes, _) in pairs}
@@ -277,7 +284,7 @@ class ReducedSolution:
     ) -> None:
         self._model, self._whole, self.stiffness, self.work = model, whole, K, work
         self.parameters, self.c = np.array(parameters), c
-        self.outputs = model.level.outputs(c, whole)[model.which]
+        self.outputs = model.level.outputs(c, whole)
         self.stability = self._stability()
         for array in (self.parameters, self.c, self.outputs):
             array.flags.writeable = False
@@ -326,7 +333,7 @@ class ReducedSolution:
         by_state, directly = model.level.output_slopes(self.c, self._whole, self.stiffness, self._F)
         free = model.level.free
         found = by_state[:, free] @ self.slopes[free] + directly[:, model.places]
-        return np.asarray(found[model.which])
+        return np.asarray(found)
 
     def tangent(self, direction: FloatArray) -> FloatArray:
         """Return the derivative of the outputs (m,) along a `direction` (d,), or (k, m) for k of them."""
@@ -358,7 +365,7 @@ class ReducedSolution:
         except np.linalg.LinAlgError:
             return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
         c[larger.free] += change
-        errors = larger.outputs(c, self._whole)[model.which] - self.outputs
+        errors = larger.outputs(c, self._whole) - self.outputs
         size = float(np.linalg.norm(c[larger.free])) or 1.0
         return Estimate(errors, float(np.linalg.norm(change)) / size, Work(0, 1, 1, 1, 0))
 

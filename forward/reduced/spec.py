@@ -27,6 +27,8 @@ LETTERS = 16  # of a hash
 BEYOND = 0.05  # of the trained range, and half a standard deviation: farther out is a finding
 DOUBTFUL = 0.05  # error on unseen samples, relative to the spread of an output, above which it is one
 
+_APART = ("outputs", "solver", "stresses")  # blocks of a body in which one and its reduced model may differ
+
 
 class _About(NamedTuple):
     """What a study needs to know of a file."""
@@ -144,9 +146,10 @@ class Reduced(ModelSpec):
 
     def findings_over(self, ranges: Ranges) -> tuple[Finding, ...]:
         """Say where a study goes beyond the snapshots, and which outputs have large errors."""
-        return (*self._outside(ranges), *self._of_errors())
+        return (*self.outside(ranges), *self._of_errors())
 
-    def _outside(self, ranges: Ranges) -> Iterator[Finding]:
+    def outside(self, ranges: Ranges) -> Iterator[Finding]:
+        """Find parameters that go beyond the snapshots."""
         about = self._about
         rows = zip(about.parameters, about.lower, about.upper, about.spread, strict=True)
         for path, low, high, spread in rows:
@@ -171,6 +174,39 @@ class Reduced(ModelSpec):
                 "mean square): more snapshots or modes help, or model.tolerance: then the full model is asked where "
                 "estimates are large.",
             )
+
+    def differences(self, body: Hyperelastic, unknown: Collection[str]) -> Iterator[str]:
+        """Say why it cannot stand for a body with these parameters, one line each."""
+        about = self._about
+        trained = dict(zip(about.parameters, zip(about.lower, about.upper, strict=True), strict=True))
+        for path in unknown:
+            if path not in trained:
+                yield f"'{path}' kept its value when the model was reduced, expected it among the parameters then"
+        here, there = body.scalars, about.body.scalars
+        for path in here:
+            value = here[path].value
+            if path in trained:
+                low, high = trained[path]
+                if path not in unknown and not low <= value <= high:
+                    yield f"{path} = {value:.6g}, but the model was trained from {low:.6g} to {high:.6g}"
+            elif path in there and value != there[path].value:
+                yield f"{path} = {value:.6g}, but the model was made with {there[path].value:.6g}"
+        numbers = {path.rsplit(".", 1)[-1] for path in here}
+        ours, theirs = (_shape(one, numbers) for one in (body, about.body))
+        off = [block for block in ours | theirs if ours.get(block) != theirs.get(block)]
+        if off:
+            yield f"made of another body, which has other {', '.join(off)}"
+        outputs = {output.name: output for output in about.body.outputs}
+        lost = [output.name for output in body.outputs if outputs.get(output.name) != output]
+        if lost:
+            yield f"made without the outputs {', '.join(lost[:5])}"
+
+    def standing_for(self, body: Hyperelastic, parameters: tuple[str, ...]) -> Any:
+        """Load it with the outputs of a body, and its values of all numbers that are not parameters."""
+        data = named("forward.reduced.data:load")(Path(self.file))
+        kept = {path: number.value for path, number in body.scalars.items() if path in data.parameters}
+        names = tuple(output.name for output in body.outputs)
+        return named("forward.reduced.model:ReducedModel")(data, parameters, names, kept=kept)
 
     def identity(self) -> dict[str, Any]:
         """Return everything that results depend on; the file counts by its hash, not by its path."""
@@ -197,3 +233,15 @@ class Reduced(ModelSpec):
         return named("forward.reduced.model:ReducedModel")(
             data, parameters, tolerance=self.tolerance, full=lambda: body.build(comm, parameters)
         )
+
+
+def _shape(body: Hyperelastic, numbers: set[str]) -> dict[str, Any]:
+    """Return the blocks of a body on which a reduced model depends, without numbers that can be parameters."""
+
+    def bare(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: bare(v) for k, v in value.items() if k not in numbers or isinstance(v, dict | list)}
+        return [bare(one) for one in value] if isinstance(value, list) else value
+
+    whole = body.model_dump(mode="json", exclude_none=True)
+    return {name: block if name == "body" else bare(block) for name, block in whole.items() if name not in _APART}

@@ -33,6 +33,7 @@ EXTREME, DECIDES = 20.0, 0.8  # shift by a correction, and share of the deviatio
 FAR = 3.0  # error of the mesh over the noise from which on a correction that has not settled is not to be trusted
 OF_FIELD = 0.3  # error of the mesh over the noise from which on the best seen directions of a corrected field are wrong
 UNSEEN, SOME = 0.9, 0.05  # of the prior's deviation, above which data say little; share of vertices that is told
+SAME, HALF = 0.9, 0.5  # what weights between posteriors are worth where these are alike, and where they are not
 EXPANDED = 0.3  # error of an expansion over that of a datum that makes intervals wider by more than 4 %
 GRID = np.linspace(-40.0, 40.0, 8001)
 
@@ -374,3 +375,27 @@ def expansion_off(error: Any, solves: Any) -> list[Doubt]:
         "have solves of its own"
     )
     return [Doubt("error" if off > 1 else "warning", text, "the expansion that the data sets share is not accurate")]
+
+
+def reduced_off(share: float, shift: Mapping[str, float], solves: int) -> list[Doubt]:
+    """Say how alike the posteriors by a reduced model and by the body are.
+
+    Parameters
+    ----------
+    share
+        Of the draws, that their weights are worth.
+    shift
+        By name, how far the mean moves by the weights, in standard deviations.
+    solves
+        Full solves so far.
+    """
+    name = max(shift, key=lambda one: abs(shift[one]))
+    found = f"by {solves} full solves, draws of it have weights worth {100 * share:.0f} % of their number"
+    if share >= SAME:
+        moved = f"no mean moves by more than {abs(shift[name]):.2g} standard deviations ({name})"
+        return [Doubt("note", f"the posterior by the reduced model is that of the body: {found}, and {moved}", "")]
+    moved = f"the mean of {name} moves by {abs(shift[name]):.2g} standard deviations"
+    advice = "reduce the body with more modes and snapshots, or leave method.reduced out"
+    text = f"the posterior by the reduced model is not quite that of the body: {found}, and {moved}; {advice}"
+    short = "the reduced model does not give the posterior of the body"
+    return [Doubt("error" if share < HALF else "warning", text, short)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from forward.settings import Settings
 from inverse.criticism.chains import FEW, FIELD, walkers
@@ -16,6 +16,24 @@ from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 
 LEAST_SHARED = 8  # solves of an expansion
+
+
+class ByReduced(Settings):
+    """A reduced model in place of the body, and full solves that correct and check what it says.
+
+    Parameters
+    ----------
+    file
+        What `tissuq reduce` has made of the body, over the priors.
+    solves
+        Draws of each posterior that are solved in full.
+    digest
+        Hash of the file, kept with results: another file of the same name is refused.
+    """
+
+    file: str
+    solves: Annotated[int, Field(ge=8)] = 24
+    digest: str | None = None
 
 
 class Invert(MeshTreatment, Settings):
@@ -48,6 +66,9 @@ class Invert(MeshTreatment, Settings):
     expansion
         Solves of an expansion of the outputs over the prior that all data sets share: they are then inverted with it,
         in about a second each, whatever a solve takes. By default every data set has solves of its own.
+    reduced
+        A reduced model that searches and samples in place of the body: "FILE", or { file = "FILE", solves = 24 }. One
+        full solve corrects it at the mode, others check the posterior at its draws and correct it further.
     mesh_check
         An older name: false is mesh_error = false.
     """
@@ -63,7 +84,13 @@ class Invert(MeshTreatment, Settings):
     seed: Annotated[int, Field(ge=0)] = 0
     mesh_error: Literal["correct", "report", False] = "correct"
     expansion: Annotated[int, Field(ge=LEAST_SHARED)] | None = None
+    reduced: ByReduced | None = None
     mesh_check: bool = True
+
+    @field_validator("reduced", mode="before", json_schema_input_type=ByReduced | str)
+    @classmethod
+    def _file_alone(cls, given: Any) -> Any:
+        return {"file": given} if isinstance(given, str) else given
 
     @model_validator(mode="after")
     def _check(self) -> Invert:

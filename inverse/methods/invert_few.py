@@ -84,6 +84,15 @@ class Nearby:
         return lambda point: Guess(self.state + (point - self.point) @ self.slopes, reference)
 
 
+@dataclass(frozen=True, eq=False)
+class Inverted:
+    """What was found of a data set: results, the posterior as it was corrected, and its weighted points."""
+
+    dataset: xr.Dataset
+    posterior: Posterior
+    evidence: Evidence
+
+
 def invert_by_group(
     inputs: Inputs,
     model: ForwardModel,
@@ -120,7 +129,7 @@ def invert_by_group(
     """
     solve = evaluate or SerialEvaluate(model)
     near = partial(Nearby.at, model, spread=inputs.std)
-    return _invert(inputs, solve, data, method, look, errors, finer, near, say, shared)
+    return inverted(inputs, solve, data, method, look, errors, finer, near, say, shared).dataset
 
 
 def invert_by_all(
@@ -135,7 +144,7 @@ def invert_by_all(
     shared: Shared | None = None,
 ) -> xr.Dataset:
     """Invert a data set with all rank groups, each of which solves at other points; raises as `invert_by_group`."""
-    return _invert(
+    return inverted(
         inputs,
         evaluate,
         data,
@@ -146,10 +155,10 @@ def invert_by_all(
         lambda point: linearise(inputs, evaluate, point).prediction,
         say,
         shared,
-    )
+    ).dataset
 
 
-def _invert(
+def inverted(
     inputs: Inputs,
     evaluate: Evaluate,
     data: Data,
@@ -160,7 +169,8 @@ def _invert(
     start: Callable[[FloatArray], Start | None],
     say: Callable[[str], None],
     shared: Shared | None,
-) -> xr.Dataset:
+) -> Inverted:
+    """Invert a data set, as `invert_by_group`; `start` predicts states from a solution at parameters (d,)."""
     counted = Recorder(evaluate)
     posterior = Posterior(inputs, counted, data.values, data.sigma, method.noise, data.which, errors=errors)
     if shared is not None:
@@ -228,7 +238,7 @@ def _invert(
         "start_log_posterior": searched.ends,
         "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(posterior.names) - d))),
     }
-    return as_dataset(record)
+    return Inverted(as_dataset(record), posterior, found)
 
 
 def _chains(posterior: Posterior, gaussian: Laplace, found: Evidence, method: Invert) -> Chains | None:

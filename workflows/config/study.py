@@ -101,14 +101,23 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
     for key in ("source", "study"):
         file = method.get(key) if isinstance(method, Mapping) else None
         if isinstance(file, str):
-            place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
-            blocks = blocks | {"method": {**blocks["method"], key: str(place.resolve())}}
+            blocks = blocks | {"method": {**blocks["method"], key: _beside(file, folder)}}
+    reduced = method.get("reduced") if isinstance(method, Mapping) else None
+    block = {"file": reduced} if isinstance(reduced, str) else reduced
+    if isinstance(block, Mapping) and isinstance(block.get("file"), str):
+        blocks = blocks | {"method": {**blocks["method"], "reduced": {**block, "file": _beside(block["file"], folder)}}}
     blocks = _with_draws(blocks, folder)
     cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
     if isinstance(cheap, list):
         found = [one | {"model": _of_files(one["model"], folder)} if _has(one, "model") else one for one in cheap]
         blocks = blocks | {"method": {**blocks["method"], "cheap": found}}
     return blocks | {"model": _of_files(model, folder)} if isinstance(model, Mapping) else blocks
+
+
+def _beside(file: str, folder: Path) -> str:
+    """Return the full path of a file beside a study, or in the working directory."""
+    place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
+    return str(place.resolve())
 
 
 def _has(block: Any, key: str) -> bool:
@@ -119,8 +128,7 @@ def _of_files(model: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
     """Give the full paths of the files of a model, as `_located`."""
     file = model.get("file")
     if model.get("kind") == REDUCED and isinstance(file, str):
-        place = next((path for path in (folder / file, Path(file)) if path.exists()), folder / file)
-        return {**model, "file": str(place.resolve())}
+        return {**model, "file": _beside(file, folder)}
     file = model["body"].get("file") if _has(model, "body") else None
     if not isinstance(file, str):
         return model
@@ -237,6 +245,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 _FILES = {
     "model.body.contents.digest": "model.body.file",
     "model.digest": "model.file",
+    "method.reduced.digest": "method.reduced.file",
     "parameters.from.digest": "parameters.from.file",
 }
 

@@ -56,6 +56,16 @@ def _verdict(words: str, trust: int, doubts: list[Doubt]) -> tuple[str, int]:
     return words, trust
 
 
+def _of_reduced(one: xr.Dataset, names: list[str]) -> list[Doubt]:
+    """Say how alike the posteriors by a reduced model and by the body are, where there is one."""
+    from inverse.criticism.doubts import reduced_off
+
+    if "reduced_share" not in one:
+        return []
+    shift = dict(zip(names, one["reduced_shift"].to_numpy().tolist(), strict=True))
+    return reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))
+
+
 def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt]:
     """Say what is doubtful about one data set, given by its number."""
     from inverse.criticism import doubts as criticism
@@ -103,6 +113,7 @@ def doubts_of(one: xr.Dataset, study: InversionStudy, number: int) -> list[Doubt
     found += (
         criticism.expansion_off(one["expansion_error"], one["expansion_solves"]) if "expansion_error" in one else []
     )
+    found += _of_reduced(one, names)
     if "mesh_checked" not in one:
         return found
     found += criticism.not_estimable(study.not_estimable(number))

@@ -137,6 +137,8 @@ class InversionStudy(StudyKind):
         method, field = self.method, self.field
         if method.expansion is not None:
             return method.expansion
+        if method.reduced is not None:  # at the mode, and draws
+            return (1 + method.reduced.solves) * sum(measurement is not None for measurement in self.measurements)
         each = method.solves(field=field) + method.chain_solves(len(self.names), field=field)
         each += SOLVES_OF_FIELD + each if field else 12 * method.starts + 2 * len(self.parameters)
         more = 0 if self.predict is None else 1 + self.predict.solves(field=field)
@@ -194,7 +196,10 @@ class InversionStudy(StudyKind):
 
     def identity(self) -> dict[str, Any]:
         """Return everything that evaluations depend on; files count by their contents, not their path."""
-        return super().identity() | {"model": self.model.identity()}
+        found = super().identity() | {"model": self.model.identity()}
+        if self.method.reduced is not None:
+            found["method"] = found["method"] | {"reduced": {**found["method"]["reduced"], "file": ""}}
+        return found
 
     def measured(self, number: int) -> Data:
         """Return a data set that can be used."""
@@ -410,4 +415,7 @@ class Inversion(InversionStudy):
         if self.method.expansion is not None:
             message = "data sets of a specimen are observed at places of their own, expected outputs of another model"
             yield ("method", "expansion"), message, self.method.expansion
+        if self.method.reduced is not None:
+            message = "a specimen has no reduced model yet, expected outputs of a body"
+            yield ("method", "reduced"), message, self.method.reduced.file
         yield from super()._mistakes()

@@ -14,6 +14,7 @@ from forward.external.derivatives import contradicted
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.registry import named
 from inverse.criticism.finer import NOT_LOOKED, Finer
+from inverse.methods.by_reduced import invert_by_reduced
 from inverse.methods.invert_few import Look, invert_by_all, invert_by_group
 from inverse.methods.record import with_record
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from forward.fem.finer import FinerMeshes
     from forward.fem.specimen import SpecimenModel
+    from forward.hyperelastic import Hyperelastic
     from inverse.data.outputs import OutputData
     from inverse.data.shared_motion import Shared, SharedMotion
     from inverse.methods.predict import Band
@@ -190,6 +192,7 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
     names = [one.name for one in study.data.sets]
     rows = Rows(study, made.vertices, lambda text: write_text(directory / BATCH, text))
     solving: list[KeptEvaluate | KeptModel] = []  # of the data set at hand
+    reduced = _reduced(study)
     expanded = cache(partial(_expanded, study, made, ensemble, checkpoint))
 
     def beside(name: str, model: ForwardModel) -> KeptEvaluate:
@@ -229,6 +232,8 @@ def _many(study: InversionStudy, made: _Made, ensemble: Ensemble, directory: Pat
         kept = KeptEvaluate(observed, ensemble.group, checkpoint, names[number], ensemble.count, log=solved)
         solving.append(kept)
         data = study.measured(number)
+        if reduced is not None:
+            return invert_by_reduced(study.inputs, kept, reduced, data, method, errors, finer, ensemble.say)
         return invert_by_group(
             study.inputs, observed, data, method, made.look, errors, finer, kept, ensemble.say, shared
         )
@@ -344,12 +349,21 @@ def _solved(there: There, solved: Callable[[ForwardModel], Finer]) -> Finer | No
     return Finer(None, why) if model is None else solved(model)
 
 
+def _reduced(study: InversionStudy) -> ForwardModel | None:
+    """Load the reduced model that stands for the body; None where the body is asked itself."""
+    if not isinstance(study, OutputInversion) or study.reduced is None:
+        return None
+    found: ForwardModel = study.reduced.standing_for(cast("Hyperelastic", study.spec), study.inputs.names)
+    return found
+
+
 def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
     """One data set, whose solves all groups share; collective over the group."""
     say = ensemble.say
     observed, data = made.observing(0), study.measured(0)
     there = made.finer(observed)
     recorders: dict[str, Recorder] = {}
+    reduced = _reduced(study)
     others: dict[str, Callable[[], ForwardModel]] = {}
     model = None if there is None else there[0]
     if model is not None:
@@ -366,7 +380,11 @@ def _one(study: InversionStudy, made: _Made, ensemble: Ensemble) -> MethodJob:
         finer = _solved(there, lambda _: solved_by(recorders["/"].on(FINER)))
         errors = study.data.errors
         shared = _shared(both, lambda _: evaluate.on(MOVED))  # at other points, whose values are not kept
-        found = invert_by_all(study.inputs, recorders["/"], data, study.method, made.look, errors, finer, say, shared)
+        if reduced is not None:
+            found = invert_by_reduced(study.inputs, recorders["/"], reduced, data, study.method, errors, finer, say)
+        else:
+            full = recorders["/"]
+            found = invert_by_all(study.inputs, full, data, study.method, made.look, errors, finer, say, shared)
         if study.predict is not None:
             recorders[PREDICTED] = Recorder(evaluate.on(PREDICTED))
             before = partial(named("workflows.studies.predicted:prior_band"), study, recorders[PREDICTED])

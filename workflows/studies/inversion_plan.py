@@ -93,6 +93,7 @@ def plan_of_outputs(study: OutputInversion) -> list[str]:
     lines = [
         f"method      {method.kind}",
         *(f"{what:10}  {words}" for what, words in study.model.described(ranges(study.parameters))),
+        *([] if study.reduced is None else [f"by          {study.reduced.description}"]),
         f"unknown     {len(study.names)}: {', '.join(study.names)}",
         f"outputs     {', '.join(study.parts)}",
         f"data sets   {len(counts)}, of {', '.join(f'{count:,}' for count in counts)} values",

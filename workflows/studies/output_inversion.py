@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from forward.model import ForwardModel, ModelError
 from forward.registry import OfKind, named
@@ -18,6 +18,7 @@ from inverse.data.curves import steps_of
 from inverse.data.errors import NORMAL, Errors
 from inverse.data.outputs import OutputData, read_outputs, stated
 from inverse.data.table import DataError
+from inverse.methods.invert import ByReduced
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import findings_of_materials, ranges
 from workflows.studies.inversion import InversionStudy
@@ -26,7 +27,9 @@ from workflows.studies.predictions import never_estimable
 from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
+    from forward.hyperelastic import Hyperelastic
     from forward.model import Finding
+    from forward.reduced.spec import Reduced
 
 STATED = "outputs"  # name of the data set given in the study itself
 Positive = Annotated[float, Field(gt=0)]
@@ -124,6 +127,21 @@ class OutputInversion(InversionStudy):
         """The model, in the form that suits all values of its parameters."""
         return self.model.over(ranges(self.parameters))
 
+    @cached_property
+    def reduced(self) -> Reduced | None:
+        """The reduced model that stands for the body.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If its file cannot be used.
+        """
+        asked = self.method.reduced
+        if asked is None:
+            return None
+        made: Reduced = named("forward.reduced.spec:Reduced")(file=asked.file, digest=asked.digest)
+        return made
+
     @property
     def sampled(self) -> Sampled:
         """The model with its priors."""
@@ -132,7 +150,9 @@ class OutputInversion(InversionStudy):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the model before anything is solved."""
-        return (*self.model.findings_over(ranges(self.parameters)), *findings_of_materials(self.inputs))
+        reach = ranges(self.parameters)
+        reduced = () if self.reduced is None else self.reduced.outside(reach)
+        return (*self.model.findings_over(reach), *findings_of_materials(self.inputs), *reduced)
 
     @property
     def meshes(self) -> tuple[ModelSpec, ...]:
@@ -210,6 +230,8 @@ class OutputInversion(InversionStudy):
         if self.parallel.ranks_per_model > 1 and not self.spec.shareable:
             message = f"a model of kind '{self.model.kind}' is not shared by ranks, expected 1"
             yield ("parallel", "ranks_per_model"), message, self.parallel.ranks_per_model
+        if self.method.reduced is not None:
+            yield from self._mistakes_of_reduced(self.method.reduced)
         if not self.parameters and not self.model.coefficients:
             yield ("parameters",), "nothing is unknown, expected at least one prior", {}
         for block, names in (("outputs", self.data.outputs), ("sigma", self.data.sigma)):
@@ -218,6 +240,25 @@ class OutputInversion(InversionStudy):
                     message = f"not an output of the model; {nearest(name, self.outputs)}"
                     yield ("data", block, name), message, name
         yield from super()._mistakes()
+
+    def _mistakes_of_reduced(self, reduced: ByReduced) -> Iterator[Mistake]:
+        if self.method.expansion is not None:
+            message = "stands for the body in place of a reduced model, expected one of both"
+            yield ("method", "expansion"), message, self.method.expansion
+        if self.model.kind != "hyperelastic":
+            message = f"a reduced model stands for a body, expected kind 'hyperelastic', not '{self.model.kind}'"
+            yield ("method", "reduced"), message, reduced.file
+            return
+        unknown = (*self.parameters, *self.model.coefficients)
+        try:
+            found = self.reduced
+        except ValidationError as error:
+            yield ("method", "reduced"), str(error.errors()[0]["msg"]), reduced.file
+            return
+        assert found is not None
+        object.__setattr__(reduced, "digest", found.digest)
+        for said in found.differences(cast("Hyperelastic", self.spec), unknown):
+            yield ("method", "reduced"), said, reduced.file
 
 
 def derivable(model: ForwardModel, kind: str) -> None:

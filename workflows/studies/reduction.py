@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 FILE = "reduced.npz"
+OF_DATA = ("data", "predict")  # blocks of an inversion that a reduced model does not depend on
 OTHER_METHOD = "method={ kind = 'reduce' }"  # an assignment that makes such a study of one that samples
 
 
@@ -97,6 +98,11 @@ class ReductionStudy(Study):
     stopped: ClassVar[str] = "a reduced model"
 
     method: Reduce
+
+    @classmethod
+    def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
+        """Check the blocks; of an inversion, the priors are what counts, and what was measured does not."""
+        return cls.model_validate({name: block for name, block in blocks.items() if name not in OF_DATA})
 
     @property
     def estimates(self) -> int:

@@ -135,6 +135,9 @@ def _amounts(one: xr.Dataset, directions: int) -> Iterator[tuple[str, str]]:
         yield "expansion", f"of {int(one['expansion_solves'])} solves, which all data sets share; off by up to {off} σ"
     else:
         yield "solves", f"{int(one['solves']):,}"
+    if "reduced_share" in one:
+        share, solves = 100 * float(one["reduced_share"]), int(one["reduced_solves"])
+        yield "reduced model", f"{solves:,} solves; its draws, solved in full, have weights worth {share:.0f} % of them"
 
 
 def posterior(one: xr.Dataset, units: Mapping[str, str]) -> Table:
