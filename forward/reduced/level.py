@@ -69,9 +69,22 @@ class Integrand:
             row[:] = log + slopes @ coefficients[number]
         return found
 
+    def states(self, c: FloatArray) -> FloatArray:
+        """Return the components (s, m, n) of the states at coordinates (s, N) of several samples."""
+        return (c @ self._flat.T).reshape(len(c), self.components, -1)
+
     def values(self, inputs: FloatArray, numbers: FloatArray) -> FloatArray:
         """Return its outputs (k, n)."""
         return self._values(inputs, numbers)
+
+    def at(self, c: FloatArray, parameters: FloatArray, level: Level) -> FloatArray:
+        """Return its outputs (s, k, n) at coordinates (s, N) and parameters (s, d) of several samples."""
+        found, at_rest = [], np.zeros(c.shape[1])
+        for point, components in zip(parameters, self.states(c), strict=True):
+            inputs = self.inputs(at_rest, level.coefficients(point))
+            inputs[: self.components] = components
+            found.append(self.values(inputs, level.numbers(point)))
+        return np.array(found)
 
     def by_state(self, inputs: FloatArray, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return its outputs (k, n), and their derivatives (k, m, n) by the components of the state."""
@@ -132,12 +145,12 @@ class Level:
         """Return the forces (N,) on all coordinates, and the size that they would have if they did not cancel."""
         numbers, coefficients = self.numbers(parameters), self.coefficients(parameters)
         ofs = ((work, work.values(work.inputs(c, coefficients), numbers)) for work in self.works)
-        return self._summed([self._dead(parameters), *(T.ravel() @ work.weighted for work, T in ofs)])
+        return self._summed([self.proportional(parameters), *(T.ravel() @ work.weighted for work, T in ofs)])
 
     def stiffness(self, c: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return the forces (N,), their derivative (N, N) by all coordinates, and that size."""
         numbers, coefficients = self.numbers(parameters), self.coefficients(parameters)
-        parts, K = [self._dead(parameters)], np.zeros((self.count, self.count))
+        parts, K = [self.proportional(parameters)], np.zeros((self.count, self.count))
         for work in self.works:
             inputs = work.inputs(c, coefficients)
             if work.dead:
@@ -175,7 +188,8 @@ class Level:
                 slopes[:, number] += K[:, k]
         return slopes
 
-    def _dead(self, parameters: FloatArray) -> FloatArray:
+    def proportional(self, parameters: FloatArray) -> FloatArray:
+        """Return the forces (N,) of loads that are proportional to a number."""
         R = np.zeros(self.count)
         for number, value, row in self.data.dead:
             R += (value if number < 0 else parameters[number]) * row[: self.count]
@@ -184,6 +198,10 @@ class Level:
     def outputs(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
         """Return the outputs (m,)."""
         return np.array([output.value(c, parameters) for output in self._outputs])
+
+    def outputs_together(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the outputs (s, m) at coordinates (s, N) and parameters (s, d) of several samples."""
+        return np.array([output.values(c, parameters) for output in self._outputs]).reshape(-1, len(c)).T.copy()
 
     def some_outputs(self, which: Sequence[int], c: FloatArray, parameters: FloatArray) -> list[float]:
         """Return some of these outputs, by number."""
@@ -222,6 +240,10 @@ class _Output:
 
     def value(self, c: FloatArray, parameters: FloatArray) -> float:
         raise NotImplementedError
+
+    def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the values (s,) of several samples."""
+        return np.array([self.value(one, point) for one, point in zip(c, parameters, strict=True)])
 
     def slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
@@ -281,6 +303,10 @@ class _Largest(_Output):
     def value(self, c: FloatArray, parameters: FloatArray) -> float:
         return float(np.linalg.norm(self._there(c)[1]))
 
+    def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        squares = np.sum([(c @ rows.T) ** 2 for rows in self._rows], axis=0)
+        return np.sqrt(squares.max(axis=1))
+
     def slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -306,6 +332,10 @@ class _OfDensity(_Output):
         inputs = self._density.inputs(c, level.coefficients(parameters))
         values = self._density.values(inputs, level.numbers(parameters))[0]
         return float(self._weights(values) @ values)
+
+    def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
+        found = self._density.at(c, parameters, self.level)[:, 0]
+        return np.array([self._weights(values) @ values for values in found])
 
     def slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray

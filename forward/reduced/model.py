@@ -6,7 +6,7 @@ No FEniCSx, unless the full model is asked where an estimate exceeds the toleran
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from forward.materials.admissible import Admission
 from forward.model import FloatArray, ForwardModel, Guess, OneByOne, Solution, SolveError, Stability, Work
 from forward.reduced.data import ReducedData
 from forward.reduced.level import Level
+from forward.reduced.together import TOGETHER, equilibria
 
 ITERATIONS = 25
 TOLERANCE = 1e-12  # of the forces, relative to what they would be if they did not cancel
@@ -63,6 +64,10 @@ class ReducedModel(OneByOne):
         Makes the full model.
     kept
         Values of other parameters, by path, in place of their means.
+    alone
+        Whether it is the nested larger model, which nothing estimates the errors of.
+    tested
+        Whether the stability of equilibria is tested. Without, those at many points are found in lockstep.
     """
 
     def __init__(
@@ -73,6 +78,9 @@ class ReducedModel(OneByOne):
         tolerance: float | None = None,
         full: Callable[[], ForwardModel] | None = None,
         kept: Mapping[str, float] = MappingProxyType({}),
+        *,
+        alone: bool = False,
+        tested: bool = True,
     ) -> None:
         self.data, self.parameters = data, parameters
         names = [output.name for output in data.outputs]
@@ -82,19 +90,52 @@ class ReducedModel(OneByOne):
         self.base = data.nominal.copy()  # values (d,) of all parameters where nobody says otherwise
         for path, value in kept.items():
             self.base[data.parameters.index(path)] = value
-        self.level = Level(data, data.levels[0], self.which)
+        self.alone = alone
+        self.level = Level(data, data.levels[-1 if alone else 0], self.which)
         self.spec = Hyperelastic.model_validate(data.spec)
         self.space = ReducedSpace(data, self.places, self.base)
         self.differentiable = True
         self.asked = 0  # how often the full model was asked
-        self.tested = not self.spec.solver.accept_unstable
+        self.tested = tested and not self.spec.solver.accept_unstable
         self._admission = Admission(self.spec, data.parameters)
         self._tolerance, self._full = tolerance, full
 
     @property
     def together(self) -> int:
-        """Points are solved one by one."""
-        return 1
+        """How many points are solved in lockstep; one where the stiffness at each is needed."""
+        return TOGETHER if not self.tested and self._tolerance is None else 1
+
+    def solve_many(
+        self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
+    ) -> Iterator[Solution | SolveError]:
+        """Find the equilibria at points (n, d), some in lockstep; which ones depends only on the points."""
+        if self.together == 1:
+            yield from super().solve_many(points, guesses)
+            return
+        for i in range(0, len(points), self.together):
+            yield from self._solve_together(points[i : i + self.together])
+
+    def _solve_together(self, points: FloatArray) -> Iterator[Solution | SolveError]:
+        wholes, refused = np.array([self.whole(point) for point in points]), dict[int, SolveError]()
+        for i, whole in enumerate(wholes):
+            try:
+                self._admission.require(whole)
+            except SolveError as error:
+                refused[i] = error
+        good = [i for i in range(len(points)) if i not in refused]
+        starts = np.array([self.first(wholes[i]) for i in good]).reshape(len(good), self.level.modes)
+        found, iterations = equilibria(self.level, wholes[good], starts)
+        ok = np.isfinite(found).all(axis=1)
+        outputs = iter(self.level.outputs_together(found[ok], wholes[good][ok]))
+        of = {i: (c, Work(residuals=n)) for i, c, n, fine in zip(good, found, iterations, ok, strict=True) if fine}
+        for i, point in enumerate(points):
+            if i in refused:
+                yield refused[i]
+            elif i in of:
+                c, work = of[i]
+                yield ReducedSolution(self, point, wholes[i], c, None, work, next(outputs))
+            else:  # Newton's method goes farther
+                yield from super().solve_many(point[None])
 
     @cached_property
     def larger(self) -> Level:
@@ -279,12 +320,13 @@ class ReducedSolution:
         parameters: FloatArray,
         whole: FloatArray,
         c: FloatArray,
-        K: FloatArray,
+        K: FloatArray | None,
         work: Work,
+        outputs: FloatArray | None = None,
     ) -> None:
-        self._model, self._whole, self.stiffness, self.work = model, whole, K, work
+        self._model, self._whole, self._K, self.work = model, whole, K, work
         self.parameters, self.c = np.array(parameters), c
-        self.outputs = model.level.outputs(c, whole)
+        self.outputs = model.level.outputs(c, whole) if outputs is None else outputs
         self.stability = self._stability()
         for array in (self.parameters, self.c, self.outputs):
             array.flags.writeable = False
@@ -301,6 +343,14 @@ class ReducedSolution:
             message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
             raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
         return Stability.SCREENED
+
+    @cached_property
+    def stiffness(self) -> FloatArray:
+        """Derivative (N, N) of the forces by the coordinates."""
+        if self._K is None:
+            self.work.assemblies += 1
+            return self._model.level.stiffness(self.c, self._whole)[1]
+        return self._K
 
     @cached_property
     def state(self) -> FloatArray:
@@ -356,6 +406,8 @@ class ReducedSolution:
         R. Rannacher, Acta Numerica 10 (2001) 1–102).
         """
         model, larger = self._model, self._model.larger
+        if model.alone:
+            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
         modes = np.zeros(larger.modes)
         modes[: model.level.modes] = self.c[model.level.free]
         c = larger.coordinates(self._whole, modes)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from forward.model import ModelError
-from forward.registry import Kinds, OfKind
+from forward.registry import Kinds, OfKind, named
 from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from uq.methods.stopping import seconds_per_solve
@@ -146,6 +146,41 @@ class FewIterations(CheapModel):
             yield ("kind",), f"a model of kind '{spec.kind}' has no iterations of a solver", self.kind
 
 
+class ReducedModel(CheapModel):
+    """A reduced model of the body, without tests of stability and in lockstep.
+
+    Parameters
+    ----------
+    file
+        What `tissuq reduce` has made, with the random parameters of the study among its own.
+    larger
+        Take the nested larger model in it, which follows the body more closely; both may be named.
+    """
+
+    kind: Literal["reduced"] = "reduced"
+    file: str
+    larger: bool = False
+
+    @property
+    def label(self) -> str:
+        """Its name in results."""
+        return self.name or ("larger reduced" if self.larger else "reduced")
+
+    def of(self, spec: ModelSpec) -> ModelSpec:
+        """Return the reduced model."""
+        made: ModelSpec = named("forward.reduced.spec:Reduced")(
+            file=self.file, larger=self.larger, accept_unstable=True
+        )
+        return made
+
+    def predicted(self, unknowns: int, own: int) -> float | None:
+        """Cost of a solve over that of the study's model, from numbers of modes and points."""
+        if self.cost is not None or not own:
+            return self.cost
+        made = named("forward.reduced.spec:Reduced")(file=self.file, larger=self.larger)
+        return float(made.seconds_together / seconds_per_solve(own))
+
+
 class OtherModel(CheapModel):
     """Any other model, with the same parameters and outputs by name.
 
@@ -173,6 +208,7 @@ CHEAP = Kinds(
     {
         "mesh": "uq.methods.cheap:Coarser",
         "iterations": "uq.methods.cheap:FewIterations",
+        "reduced": "uq.methods.cheap:ReducedModel",
         "model": "uq.methods.cheap:OtherModel",
     },
     CheapModel,

@@ -102,18 +102,20 @@ class Team:
         self.groups: list[Group] = subsets(len(self.members))
         self.costs = np.array([sum(self.members[k].cost for k in group) for group in self.groups])
         self.offsets = np.array([one.centre.middle for one in self.members])
-        self.slopes = [self._slopes(k) for k in range(len(self.members))]
+        self.slopes = [self._slopes()] * len(self.members)
         # E[T²] (K, m).
         self.variances = np.array([np.einsum("mi,ij,mj->m", s, inputs.correlation, s) for s in self.slopes])
         self.taken: dict[int, Taken] = {}
         self.pilot: Evaluations | None = None
 
-    def _slopes(self, k: int) -> FloatArray:
-        """Slopes (m, d) of the control of a model: its own tangent, or that of the study's model where it has none."""
-        own, first = self.members[k].centre.output_slopes, self.members[0].centre.output_slopes
-        if not self.controlled:
-            return np.zeros_like(first)
-        return own if np.isfinite(own).all() else first
+    def _slopes(self) -> FloatArray:
+        """Slopes (m, d) of the control: the tangent of the study's model, for all of them.
+
+        Tangents of models that follow each other may differ (where the largest stress jumps at the mean parameters, say);
+        each would then take off something else, and what is left would no longer be correlated.
+        """
+        first = self.members[0].centre.output_slopes
+        return first if self.controlled else np.zeros_like(first)
 
     @property
     def count(self) -> int:

@@ -47,6 +47,9 @@ class Reduce(Method):
         What the modes may leave of the snapshots: root mean square in the norm of the stiffness, relative.
     cubature
         What the points may miss of the forces of the snapshots, relative.
+    derivatives
+        Whether states are differentiated and adjoints solved for at the snapshots, which takes a factorisation each.
+        Estimates of errors need them; a control variate beside the body (`multifidelity`) does without.
     unseen
         Further solves, at random samples, on which its errors are measured.
     seed
@@ -59,6 +62,7 @@ class Reduce(Method):
     modes: Annotated[int, Field(ge=1)] | None = None
     truncation: Annotated[float, Field(gt=0, lt=1)] = 2e-3
     cubature: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    derivatives: bool = True
     unseen: Annotated[int, Field(ge=0)] = 32
     seed: Annotated[int, Field(ge=0)] = 0
 

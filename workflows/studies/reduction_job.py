@@ -38,7 +38,7 @@ TRUSTED = (0.5, 2.0)  # effectivities, outside of which estimates cannot be take
 
 @dataclass(frozen=True)
 class KeptStates:
-    """Keep the state of each point and, where its parameters spread, adjoint states and changes of the state there."""
+    """Keep the state of each point and, if the spread of its parameters is given, adjoint states and its changes."""
 
     spread: FloatArray | None
 
@@ -142,13 +142,14 @@ class _Making:
 
     def _solved(self, points: FloatArray) -> Snapshots:
         """Solve at points (n, d); those without an answer are left out."""
-        found = self._evaluate(Request(points, fields=KeptStates(self._inputs.std), start=self._start))
+        kept = KeptStates(self._inputs.std if self._method.derivatives else None)
+        found = self._evaluate(Request(points, fields=kept, start=self._start))
         rows, ok = found.sketches, found.ok
         if rows is None or not ok.any():
             reason = found.failures[0].reason if found.failures else "none was solved"
             message = f"no snapshot has an answer: {reason}"
             raise SolveError(message)
-        m, size = found.outputs.shape[1], rows.shape[2]
+        m, size = found.outputs.shape[1] if self._method.derivatives else 0, rows.shape[2]
         adjoints, tangents = rows[:, 1 : 1 + m].reshape(-1, size), rows[:, 1 + m :].reshape(-1, size)
         return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
 

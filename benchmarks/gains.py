@@ -1,0 +1,150 @@
+"""Where expansions fail: 50 modes of a stiffness field, a load that may press anywhere, the largest stress; the gain.
+
+A slab of tissue (configs/slab.toml) with 57 random parameters. `tissuq reduce` makes a model of it; studies of
+`multifidelity` take that model and its nested larger one beside the body. Costs are processor times of everything,
+measured in one run: solves of the body in lockstep are what plain Monte Carlo would be charged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from forward.model import FloatArray
+from uq.evaluation.evaluate import OWN, Recorder, SerialEvaluate
+from uq.findings import findings
+from uq.methods.multifidelity import Multifidelity
+from workflows.__main__ import main as command
+from workflows.config.study import load
+
+CONFIG = Path(__file__).parent.parent / "configs" / "slab.toml"
+FIELD = 'model.fields=[{of="stiffness", length=0.04, std=0.3, modes=50}]'
+OUTPUTS = (
+    'model.outputs=[{name="deepest", kind="max-displacement"}, {name="middle", kind="displacement", '
+    'at=[0.06, 0.045, 0.03], component="z"}, {name="stress", kind="max-von-mises"}]'
+)
+PERCENT = (1.0, 0.5, 0.25)  # errors, of the standard deviation, for which a making is charged
+
+
+def main(arguments: Sequence[str] = ()) -> None:
+    """Make the reduced model, and print gains and coverage of repeated studies."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks gains")
+    parser.add_argument("--cells", default="[16,12,6]", help="of the slab")
+    parser.add_argument("--snapshots", type=int, default=128)
+    parser.add_argument("--modes", type=int, default=40)
+    parser.add_argument("--samples", type=int, default=64, help="what a study may spend, in solves of the body")
+    parser.add_argument("--pilot", type=int, default=16)
+    parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--file", default="", help="a reduced model that is there already")
+    given = parser.parse_args(arguments)
+    changes = [f"model.body.cells={given.cells}", FIELD, OUTPUTS]
+    with tempfile.TemporaryDirectory() as folder:
+        file, off_line = given.file, 0.0
+        if not file:
+            file, off_line = _made(Path(folder) / "slab", changes, given)
+        _studies(file, off_line, changes, given)
+
+
+def _made(out: Path, changes: Sequence[str], given: argparse.Namespace) -> tuple[str, float]:
+    """Make the reduced model: its file, and the processor time of the making."""
+    method = {"snapshots": given.snapshots, "modes": given.modes, "cubature": 3e-3, "rounds": 0, "unseen": 0}
+    sets = [*changes, *(f"method.{key}={value}" for key, value in method.items()), "method.derivatives=false"]
+    options = [part for one in sets for part in ("--set", one)]
+    begin = time.process_time()
+    command(["reduce", str(CONFIG), "--out", str(out), "--quiet", "--no-report", *options])
+    seconds = time.process_time() - begin
+    told = json.loads((out / "summary.json").read_text())["reduced"]
+    parts = told["seconds"]
+    print(
+        f"{told['snapshots']} snapshots in {parts['snapshots']:.0f} s, reduction {parts['reduction']:.0f} s, all "
+        f"{seconds:.0f} s: {told['modes']} modes at {told['points']} points, {told['modes of the larger model']} at "
+        f"{told['points of the larger model']}",
+        flush=True,
+    )
+    return str(out / told["file"]), seconds
+
+
+def _studies(file: str, off_line: float, changes: Sequence[str], given: argparse.Namespace) -> None:
+    study: Any = load(CONFIG, [*changes, "method={kind='monte-carlo', samples=16}"])
+    cheap = ({"kind": "reduced", "file": file}, {"kind": "reduced", "file": file, "larger": True})
+    first = Multifidelity(samples=given.samples, cheap=cheap, pilot=given.pilot, control="tangent")  # type: ignore[arg-type]
+    names = study.inputs.names
+    others = {name: spec.build(MPI.COMM_SELF, names) for name, spec in first.models(study.spec).items()}
+    model = study.spec.build(MPI.COMM_SELF, names)
+    rows, own, times = [], [], []
+    for seed in range(given.repeats):
+        recorder = Recorder(SerialEvaluate(model, others=others))
+        begin = time.process_time()
+        data = first.model_copy(update={"seed": seed}).run(study.inputs, recorder)
+        cpu = time.process_time() - begin
+        outputs = list(data["output"].values)
+        of_own = [one for one, name in zip(recorder.log, recorder.models, strict=True) if name == OWN][1:]
+        own.append(np.concatenate([one.outputs[one.ok] for one in of_own]))
+        times.append(np.concatenate([one.seconds for one in of_own]))
+        needed = data["alternative_solves"]
+        tangent = needed.sel(alternative="monte-carlo") / needed.sel(alternative="sensitivity-monte-carlo")
+        rows.append([data["mean"].values, data["mean_error"].values, np.full(len(outputs), cpu), tangent.values])
+        if seed == 0:
+            _described(data, recorder, outputs)
+    plain, per_solve = np.concatenate(own), float(np.concatenate(times).mean())
+    _gains(np.array(rows), plain, per_solve, off_line, outputs)
+
+
+def _described(data: Any, recorder: Recorder, outputs: list[str]) -> None:
+    """Print what the first study took, and how models follow the body."""
+    log: dict[str, tuple[int, float]] = {}
+    for one, name in zip(recorder.log, recorder.models, strict=True):
+        n, s = log.get(name, (0, 0.0))
+        log[name] = (n + len(one.points), s + float(one.seconds.sum()))
+    for name, (n, s) in log.items():
+        print(f"{name or 'the body'}: {n} solves, {1e3 * s / n:.2g} ms each")
+    print("predicted costs", np.round(data["fidelity_cost"].values, 4))
+    for name, rho, left in zip(
+        outputs, data["fidelity_correlation"].values, data["fidelity_remainder_correlation"].values, strict=True
+    ):
+        print(f"{name}: 1 − ρ² {1 - rho[1:] ** 2}, of what tangents leave {1 - left[1:] ** 2}")
+    for finding in findings(data):
+        print(f"{finding.severity}: {finding.text}")
+    print(data.attrs["stopped"], flush=True)
+
+
+def _gains(rows: FloatArray, plain: FloatArray, per_solve: float, off_line: float, outputs: list[str]) -> None:
+    """Print errors, claims and gains."""
+    means, errors, cpu = rows[:, 0], rows[:, 1], rows[:, 2, 0].mean()
+    n, spread = len(means), plain.std(axis=0, ddof=1)
+    print(f"\n{n} studies of {cpu:.0f} s each; a solve of the body in lockstep {per_solve:.3g} s; making {off_line:.0f} s")
+    print("| output | spread | error of a study, claimed (% of it) | true | 95 % intervals hold | gain | of the tangent |")
+    print("|---|---|---|---|---|---|---|")
+    middle = means.mean(axis=0)
+    scatter = means.std(axis=0, ddof=1) if n > 1 else np.full(len(outputs), np.nan)
+    claimed = np.sqrt((errors**2).mean(axis=0))
+    # The mean of all studies is uncertain itself, and each is a part of it.
+    held = (np.abs(means - middle) <= 1.96 * errors * np.sqrt(1 - 1 / n)).mean(axis=0)
+    for j, name in enumerate(outputs):
+        error = scatter[j] if n >= 16 else claimed[j]
+        gain = spread[j] ** 2 / error**2 * per_solve / cpu
+        print(
+            f"| {name} | {spread[j]:.3g} | {100 * claimed[j] / spread[j]:.3g} | {100 * scatter[j] / spread[j]:.3g} | "
+            f"{held[j]:.0%} | {gain:.3g} | {rows[:, 3, j].mean():.2g} |"
+        )
+    print("\n| error wanted, % of the spread | plain Monte Carlo (s) | " + " | ".join(outputs) + " |")
+    print("|---|---|" + "---|" * len(outputs))
+    for percent in PERCENT:
+        alone = per_solve * (100 / percent) ** 2
+        best = scatter if n >= 16 else claimed
+        with_making = off_line + cpu * (best / spread * 100 / percent) ** 2
+        gains = " | ".join(f"{alone / one:.3g}" for one in with_making)
+        print(f"| {percent:g} | {alone:.3g} | {gains} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,84 @@
+"""Equilibria of a reduced model at many points in lockstep: one product with the modes for all of them.
+
+Modes are orthonormal in the stiffness at rest, so that forces are corrections already: u ← u − R(u) with Anderson mixing
+needs no stiffness at all, ten residuals in place of four assemblies with factorisations. What is read from memory, the
+values of the modes at the points, is read once for all samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from forward.model import FloatArray
+from forward.reduced.level import Integrand, Level
+from forward.solvers.anderson import AndersonMixing
+
+TOGETHER = 16  # samples
+WINDOW = 8  # differences that Anderson mixing keeps
+ITERATIONS = 40
+TOLERANCE = 1e-9  # of the forces, relative to what they would be if they did not cancel
+
+
+def equilibria(level: Level, parameters: FloatArray, modes: FloatArray) -> tuple[FloatArray, list[int]]:
+    """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes.
+
+    Returns
+    -------
+    tuple of numpy.ndarray and list of int
+        All coordinates (s, N), NaN where they are not found; and the iterations of each.
+    """
+    s, free = len(parameters), level.free
+    c = np.array([level.coordinates(point, some) for point, some in zip(parameters, modes, strict=True)])
+    found, iterations = np.full_like(c, np.nan), [0] * s
+    moving = [_Moving(work, level, parameters) for work in level.works if not work.dead]
+    still = np.array([_still(level, point) for point in parameters])
+    mixing = [AndersonMixing(WINDOW, level.modes, lambda values: values) for _ in range(s)]
+    active = np.arange(s)
+    for _ in range(ITERATIONS):
+        parts = [still[active], *(one.forces(c[active], active) for one in moving)]
+        R = np.sum(parts, axis=0)
+        size = np.max([np.abs(part[:, free]).max(axis=1, initial=0.0) for part in parts], axis=0)
+        size = np.maximum(size, np.abs(R[:, : level.before]).max(axis=1, initial=0.0))
+        left = np.abs(R[:, free]).max(axis=1, initial=0.0)
+        for i in active:
+            iterations[i] += 1
+        done = left <= TOLERANCE * size
+        found[active[done]] = c[active[done]]
+        on = ~done & np.isfinite(R).all(axis=1)
+        for i, forces in zip(active[on], R[on][:, free], strict=True):
+            c[i, free] = mixing[i].next(c[i, free], forces, forces)
+        active = active[on]
+        if not len(active):
+            break
+    return found, iterations
+
+
+def _still(level: Level, parameters: FloatArray) -> FloatArray:
+    """Forces (N,) that do not depend on the state."""
+    numbers, coefficients = level.numbers(parameters), level.coefficients(parameters)
+    at_rest = np.zeros(level.count)
+    R = level.proportional(parameters)
+    for work in level.works:
+        if work.dead:
+            R = R + work.values(work.inputs(at_rest, coefficients), numbers).ravel() @ work.weighted
+    return R
+
+
+class _Moving:
+    """A virtual work that depends on the state, at the parameters (s, d) of several samples."""
+
+    def __init__(self, work: Integrand, level: Level, parameters: FloatArray) -> None:
+        self._work = work
+        at_rest = np.zeros(level.count)
+        self._numbers = [level.numbers(point) for point in parameters]
+        self._inputs = np.array([work.inputs(at_rest, level.coefficients(point)) for point in parameters])
+
+    def forces(self, c: FloatArray, which: FloatArray) -> FloatArray:
+        """Return the forces (k, N) of the samples `which` (k,) at coordinates (k, N)."""
+        work = self._work
+        components = work.states(c)
+        acting = []
+        for i, of_state in zip(which, components, strict=True):
+            self._inputs[i, : work.components] = of_state
+            acting.append(work.values(self._inputs[i], self._numbers[i]).ravel())
+        return np.asarray(np.array(acting) @ work.weighted)
