@@ -121,8 +121,12 @@ def _gains(rows: FloatArray, plain: FloatArray, per_solve: float, off_line: floa
     """Print errors, claims and gains."""
     means, errors, cpu = rows[:, 0], rows[:, 1], rows[:, 2, 0].mean()
     n, spread = len(means), plain.std(axis=0, ddof=1)
-    print(f"\n{n} studies of {cpu:.0f} s each; a solve of the body in lockstep {per_solve:.3g} s; making {off_line:.0f} s")
-    print("| output | spread | error of a study, claimed (% of it) | true | 95 % intervals hold | gain | of the tangent |")
+    print(
+        f"\n{n} studies of {cpu:.0f} s each; a solve of the body in lockstep {per_solve:.3g} s; making {off_line:.0f} s"
+    )
+    print(
+        "| output | spread | error of a study, claimed (% of it) | true | 95 % intervals hold | gain | of the tangent |"
+    )
     print("|---|---|---|---|---|---|---|")
     middle = means.mean(axis=0)
     scatter = means.std(axis=0, ddof=1) if n > 1 else np.full(len(outputs), np.nan)

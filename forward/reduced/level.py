@@ -71,7 +71,7 @@ class Integrand:
 
     def states(self, c: FloatArray) -> FloatArray:
         """Return the components (s, m, n) of the states at coordinates (s, N) of several samples."""
-        return (c @ self._flat.T).reshape(len(c), self.components, -1)
+        return np.asarray((c @ self._flat.T).reshape(len(c), self.components, -1))
 
     def values(self, inputs: FloatArray, numbers: FloatArray) -> FloatArray:
         """Return its outputs (k, n)."""
@@ -201,7 +201,9 @@ class Level:
 
     def outputs_together(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
         """Return the outputs (s, m) at coordinates (s, N) and parameters (s, d) of several samples."""
-        return np.array([output.values(c, parameters) for output in self._outputs]).reshape(-1, len(c)).T.copy()
+        if not len(c):
+            return np.zeros((0, len(self._outputs)))
+        return np.array([output.values(c, parameters) for output in self._outputs]).T.copy()
 
     def some_outputs(self, which: Sequence[int], c: FloatArray, parameters: FloatArray) -> list[float]:
         """Return some of these outputs, by number."""
@@ -305,7 +307,7 @@ class _Largest(_Output):
 
     def values(self, c: FloatArray, parameters: FloatArray) -> FloatArray:
         squares = np.sum([(c @ rows.T) ** 2 for rows in self._rows], axis=0)
-        return np.sqrt(squares.max(axis=1))
+        return np.asarray(np.sqrt(squares.max(axis=1)))
 
     def slopes(
         self, c: FloatArray, parameters: FloatArray, K: FloatArray, F: FloatArray

@@ -115,6 +115,12 @@ class ReducedModel(OneByOne):
         for i in range(0, len(points), self.together):
             yield from self._solve_together(points[i : i + self.together])
 
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        """Inverse (n, n) of the stiffness at the equilibrium of the nominal parameters."""
+        free = self.level.free
+        return np.linalg.inv(self.reduced(self.data.nominal[self.places]).stiffness[free, free])
+
     def _solve_together(self, points: FloatArray) -> Iterator[Solution | SolveError]:
         wholes, refused = np.array([self.whole(point) for point in points]), dict[int, SolveError]()
         for i, whole in enumerate(wholes):
@@ -124,7 +130,7 @@ class ReducedModel(OneByOne):
                 refused[i] = error
         good = [i for i in range(len(points)) if i not in refused]
         starts = np.array([self.first(wholes[i]) for i in good]).reshape(len(good), self.level.modes)
-        found, iterations = equilibria(self.level, wholes[good], starts)
+        found, iterations = equilibria(self.level, wholes[good], starts, self._inverse)
         ok = np.isfinite(found).all(axis=1)
         outputs = iter(self.level.outputs_together(found[ok], wholes[good][ok]))
         of = {i: (c, Work(residuals=n)) for i, c, n, fine in zip(good, found, iterations, ok, strict=True) if fine}

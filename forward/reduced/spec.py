@@ -82,7 +82,9 @@ class Reduced(ModelSpec):
             message = f"{self.file} has changed since the study was begun: hash {self.digest} → {about.digest}"
             raise PydanticCustomError("model", "{message}", {"message": message})
         if self.larger and self.tolerance is not None:
-            message = "larger = true with a tolerance, expected one of them: nothing estimates errors of the larger model"
+            message = (
+                "larger = true with a tolerance, expected one of them: nothing estimates errors of the larger model"
+            )
             raise PydanticCustomError("model", "{message}", {"message": message})
         object.__setattr__(self, "digest", about.digest)
         return self

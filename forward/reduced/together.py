@@ -1,13 +1,14 @@
 """Equilibria of a reduced model at many points in lockstep: one product with the modes for all of them.
 
-Modes are orthonormal in the stiffness at rest, so that forces are corrections already: u ← u − R(u) with Anderson mixing
-needs no stiffness at all, ten residuals in place of four assemblies with factorisations. What is read from memory, the
-values of the modes at the points, is read once for all samples.
+Corrections u ← u − K̄⁻¹R(u) by the stiffness of one equilibrium, with Anderson mixing: about ten residuals in place of
+four assemblies with factorisations. What is read from memory, the values of the modes at the points, is read once for
+all samples.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.reduced.level import Integrand, Level
@@ -19,8 +20,10 @@ ITERATIONS = 40
 TOLERANCE = 1e-9  # of the forces, relative to what they would be if they did not cancel
 
 
-def equilibria(level: Level, parameters: FloatArray, modes: FloatArray) -> tuple[FloatArray, list[int]]:
-    """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes.
+def equilibria(
+    level: Level, parameters: FloatArray, modes: FloatArray, inverse: FloatArray
+) -> tuple[FloatArray, list[int]]:
+    """Find equilibria at parameters (s, d) from coordinates (s, n) of the modes, with an inverse stiffness (n, n).
 
     Returns
     -------
@@ -45,8 +48,9 @@ def equilibria(level: Level, parameters: FloatArray, modes: FloatArray) -> tuple
         done = left <= TOLERANCE * size
         found[active[done]] = c[active[done]]
         on = ~done & np.isfinite(R).all(axis=1)
-        for i, forces in zip(active[on], R[on][:, free], strict=True):
-            c[i, free] = mixing[i].next(c[i, free], forces, forces)
+        forces = R[on][:, free]
+        for i, force, correction in zip(active[on], forces, forces @ inverse.T, strict=True):
+            c[i, free] = mixing[i].next(c[i, free], force, correction)
         active = active[on]
         if not len(active):
             break
@@ -73,7 +77,7 @@ class _Moving:
         self._numbers = [level.numbers(point) for point in parameters]
         self._inputs = np.array([work.inputs(at_rest, level.coefficients(point)) for point in parameters])
 
-    def forces(self, c: FloatArray, which: FloatArray) -> FloatArray:
+    def forces(self, c: FloatArray, which: NDArray[np.int64]) -> FloatArray:
         """Return the forces (k, N) of the samples `which` (k,) at coordinates (k, N)."""
         work = self._work
         components = work.states(c)

@@ -175,10 +175,10 @@ class ReducedModel(CheapModel):
 
     def predicted(self, unknowns: int, own: int) -> float | None:
         """Cost of a solve over that of the study's model, from numbers of modes and points."""
-        if self.cost is not None or not own:
+        if self.cost is not None or not unknowns:
             return self.cost
         made = named("forward.reduced.spec:Reduced")(file=self.file, larger=self.larger)
-        return float(made.seconds_together / seconds_per_solve(own))
+        return float(made.seconds_together / seconds_per_solve(unknowns))
 
 
 class OtherModel(CheapModel):

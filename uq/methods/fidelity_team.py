@@ -111,8 +111,8 @@ class Team:
     def _slopes(self) -> FloatArray:
         """Slopes (m, d) of the control: the tangent of the study's model, for all of them.
 
-        Tangents of models that follow each other may differ (where the largest stress jumps at the mean parameters, say);
-        each would then take off something else, and what is left would no longer be correlated.
+        Tangents of models that follow each other may differ, where the place of the largest stress jumps at the mean
+        parameters, say. Each would take off something else then, and what is left would not be correlated.
         """
         first = self.members[0].centre.output_slopes
         return first if self.controlled else np.zeros_like(first)

@@ -109,7 +109,7 @@ def _located(blocks: dict[str, Any], folder: Path) -> dict[str, Any]:
     blocks = _with_draws(blocks, folder)
     cheap = blocks["method"].get("cheap") if isinstance(method, Mapping) else None
     if isinstance(cheap, list):
-        found = [_of_files(one, folder) if isinstance(one, Mapping) else one for one in cheap]
+        found = [dict(_of_files(one, folder)) if isinstance(one, Mapping) else one for one in cheap]
         found = [one | {"model": _of_files(one["model"], folder)} if _has(one, "model") else one for one in found]
         blocks = blocks | {"method": {**blocks["method"], "cheap": found}}
     return blocks | {"model": _of_files(model, folder)} if isinstance(model, Mapping) else blocks

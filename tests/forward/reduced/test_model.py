@@ -124,6 +124,35 @@ def test_some_parameters_keep_their_means(full, small):
     np.testing.assert_allclose(found.adjoint(np.eye(7)), every.adjoint(np.eye(7))[:, [2, 6]], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_in_lockstep_the_equilibria_are_those_of_newtons_method(full, small, alone, monkeypatch):
+    points = NOMINAL + SPREAD * np.random.default_rng(3).uniform(-1, 1, (7, 7))
+    points[3, 0] = -3
+    model = ReducedModel(small, full.parameters, alone=alone, tested=False)
+    monkeypatch.setattr("forward.reduced.model.TOGETHER", 5)
+    found = list(model.solve_many(points))
+    assert isinstance(found.pop(3), InadmissibleError)
+    one_by_one = ReducedModel(small, full.parameters, alone=alone)
+    assert (model.together, one_by_one.together) == (5, 1)
+    for one, point in zip(found, np.delete(points, 3, axis=0), strict=True):
+        expected = one_by_one.solve(point)
+        assert one.work.assemblies == 0 < one.work.residuals
+        np.testing.assert_allclose(one.outputs, expected.outputs, rtol=1e-7)
+        np.testing.assert_allclose(one.c, expected.c, atol=1e-8 * np.abs(expected.c).max())
+        size = np.abs(expected.jacobian).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(one.jacobian / size, expected.jacobian / size, atol=1e-6)
+        assert np.isnan(one.estimate.outputs).all() == alone
+
+
+def test_what_lockstep_does_not_find_newtons_method_does(full, small, monkeypatch):
+    monkeypatch.setattr("forward.reduced.together.ITERATIONS", 2)
+    model = ReducedModel(small, full.parameters, tested=False)
+    (found,) = model.solve_many(NOMINAL[None] + 0.5 * SPREAD)
+    expected = ReducedModel(small, full.parameters).solve(NOMINAL + 0.5 * SPREAD)
+    np.testing.assert_array_equal(found.outputs, expected.outputs)
+    assert found.work.assemblies > 0
+
+
 def test_estimates_see_the_errors_where_the_larger_model_holds_the_state(full, snapshots, small):
     model = ReducedModel(small, full.parameters)
     errors, estimates = [], []

@@ -151,6 +151,15 @@ def test_tangents_are_taken_off_first():
     assert abs(float(tangent["mean"][0]) - exact) < 4 * float(tangent["mean_error"][0])
 
 
+def test_a_cheap_model_with_another_tangent_stays_as_close_as_it_is():
+    """Of a kinked output, the largest stress say, two models that agree everywhere may have any slopes at the mean."""
+    own = FunctionModel(lambda p: [np.exp(p[0]) + p[1]], ("a", "b"), ("f",), lambda p: [[np.exp(p[0]), 1.0]])
+    other = FunctionModel(lambda p: [np.exp(p[0]) + p[1]], ("a", "b"), ("f",), lambda p: [[0.0, -4.0]])
+    method = Multifidelity(samples=40, cheap=cheap(0.01), control="tangent")
+    data = method.run(INPUTS, team(other, own=own))
+    assert float(data["fidelity_remainder_correlation"][0, 1]) > 0.999
+
+
 def test_an_expansion_is_taken_where_it_is_better():
     evaluate = team(wave(0.0, 0.1), own=wave(0.0, derivatives=True))
     data = Multifidelity(samples=48, cheap=cheap(0.3)).run(INPUTS, evaluate)

@@ -117,6 +117,34 @@ cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "re
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 
 
+def test_the_model_and_its_nested_larger_one_are_cheap_models(folder):
+    method = """
+[method]
+kind = "multifidelity"
+samples = 40
+control = "tangent"
+cheap = [{ kind = "reduced", file = "model.npz" }, { kind = "reduced", file = "model.npz", larger = true, cost = 0.5 }]
+"""
+    (folder / "both.toml").write_text(BODY + method)
+    assert main(["run", str(folder / "both.toml"), "--out", str(folder / "both"), "--quiet", "--no-report"]) == 0
+    found, body = (xr.load_dataset(folder / name / "results.nc") for name in ("both", "direct"))
+    assert list(found["fidelity"].values) == ["model", "reduced", "larger reduced"]
+    assert 0 < float(found["fidelity_cost"][1]) < float(found["fidelity_cost"][2]) == 0.5
+    left = 1 - found["fidelity_correlation"].values[:, 1:] ** 2
+    assert (left[:, 1] <= left[:, 0]).all()
+    assert (left < 1e-2).all()
+    assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
+
+
+def test_without_derivatives_there_are_no_adjoints_and_nothing_is_factorised(folder):
+    out, sizes = folder / "states", [*SIZES, "--set", "method.derivatives=false"]
+    assert main(["reduce", str(folder / "body.toml"), *sizes, "--out", str(out), "--quiet", "--no-report"]) == 0
+    told = json.loads((out / "summary.json").read_text())["reduced"]
+    with_them = json.loads((folder / "made" / "summary.json").read_text())["reduced"]
+    assert told["modes of the larger model"] <= told["snapshots"] < with_them["modes of the larger model"]
+    assert max(told["errors"].values()) < 0.1
+
+
 def test_a_number_that_was_kept_is_no_parameter(folder):
     text = USED.format(upper=1200, more="").replace("loads.gravity.density", "material.D1")
     text = text.replace("900, upper = 1100", "1e3, upper = 2e3")
