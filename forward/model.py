@@ -49,7 +49,7 @@ class Stability(IntEnum):
 
     NOT_TESTED = 0  # not requested, or the model has no equilibria, or the state is not one
     SCREENED = 1  # directions that are likely to show an instability show none
-    COUNTED = 2  # the stiffness at the state has no negative eigenvalue
+    COUNTED = 2  # the stiffness at the state has no negative eigenvalue, by a factor or Lanczos' process
     REFUSED = 3  # the stiffness has negative eigenvalues, and no stable equilibrium was found
     MISSED = 4  # as REFUSED, but the screen had shown none, or another equilibrium was found afterwards
 

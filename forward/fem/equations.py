@@ -46,6 +46,7 @@ class Discretisation(Linearisation):
         super().__init__(spec, comm, parameters, beside)
         self._jacobians = self.at_points(self.J, often=True)
         self._external = 0.0
+        self._full_targets = np.zeros(len(self.fixed))
         self._sizes: dict[tuple[float, ...], float] = {}
         self._stretch = self._small_stretch()
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
@@ -61,9 +62,11 @@ class Discretisation(Linearisation):
         self.latest.parameters = np.array(parameters, dtype=float)
         self.latest.moved()
         self._values |= {self.parameters[i]: float(parameters[i]) for i in self.scalars}
-        for path, constant in self._constants.items():
-            constant.value = self._values[path]
-        self._full_targets = np.zeros(len(self.fixed))
+        for i in self.scalars:  # the other numbers stay
+            if (constant := self._constants.get(self.parameters[i])) is not None:
+                constant.value = parameters[i]
+        if self._movers:
+            self._full_targets = np.zeros(len(self.fixed))
         for path, mover in self._movers.items():
             self._full_targets += self._values[path] * mover
         self._moves = any(self._values[path] != 0 for path in self._movers)

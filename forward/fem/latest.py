@@ -22,7 +22,7 @@ class Latest:
     factorised
         The solution to which the current factor belongs; None if there is no such solution.
     factorised_at
-        State (U_local,) whose stiffness is factorised.
+        State (U_local,) whose stiffness this solve has factorised last; None if it has factorised none.
     rounding
         Size of the rounding errors (N) in the forces of the body without loads, once known.
     """
@@ -39,7 +39,7 @@ class Latest:
 
     def begin(self) -> None:
         """A solve at another point begins."""
-        self.solution = self.factorised = None
+        self.solution = self.factorised = self.factorised_at = None
 
     def forget_parameters(self) -> None:
         """Fields have changed: the parameters must be set again next time, whatever they are."""

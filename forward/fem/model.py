@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import copy
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
-from itertools import islice, repeat
+from itertools import chain, islice, repeat
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from forward.fem.equations import Discretisation
 from forward.fem.reference import ReferenceFactor
 from forward.fem.saturation import factors, typical
 from forward.fem.space import BodySpace
-from forward.fem.together import find_together, from_one_reference
+from forward.fem.together import by_reference, refused, task
 from forward.hyperelastic import Hyperelastic
 from forward.materials.admissible import Admission
 from forward.model import (
@@ -45,7 +46,7 @@ from forward.solvers.anderson import block_galerkin
 from forward.solvers.equilibrium import solve
 from forward.solvers.rotations import turn
 from forward.solvers.stability import NOT_SCREENED, Screened, draw
-from forward.solvers.steps import Corrector, Steps
+from forward.solvers.steps import Corrector, Steps, Task, finish_all
 from forward.solvers.system import Found, Residual
 
 FEW = 4  # number of derivatives up to which products with the stiffness are cheaper than a factorisation
@@ -139,7 +140,7 @@ class HyperelasticModel(OneByOne):
             if found.converged and equations.contact:
                 found, stiffer = self._kept_out(found, parameters)
         solution = self.solution(parameters, found, equations.work, way, stiffer)
-        if found.stability >= Stability.COUNTED and equations.symmetric:
+        if equations.symmetric and equations.latest.factorised_at is found.state:  # to count its eigenvalues
             equations.latest.factorised = solution
         return solution
 
@@ -171,41 +172,47 @@ class HyperelasticModel(OneByOne):
     def solve_many(
         self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
     ) -> Iterator[Solution | SolveError]:
-        """Find the equilibria at points (n, d), those with a prediction from the same reference `together`; collective.
+        """Find the equilibria at points (n, d); some of those from one reference are found `together`; collective.
 
-        Which go together depends only on the points and their guesses.
+        Which are corrected together depends only on the points and their guesses.
         """
         pairs = zip(points, guesses or repeat(None), strict=False)
-        while some := list(islice(pairs, self.together)):
-            at = np.array([point for point, _ in some])
-            predicted = from_one_reference([guess for _, guess in some]) if len(some) > 1 else None
-            if predicted is None:
-                yield from super().solve_many(at, [guess for _, guess in some])
+        for predicted, group in by_reference(pairs):
+            some = list(islice(group, 2 if predicted and self.together > 1 else 0))
+            if len(some) == 2:
+                yield from self._solve_together(chain(some, group))
             else:
-                yield from self._solve_together(at, predicted)
+                for point, guess in chain(some, group):
+                    yield from super().solve_many(point[None], [guess])
 
-    def _solve_together(self, points: FloatArray, guesses: list[Guess]) -> Iterator[Solution | SolveError]:
-        equations = self.equations
-        equations.latest.begin()
-        refused: dict[int, SolveError] = {}
-        ways: dict[int, _Way] = {}
-        for i, (point, guess) in enumerate(zip(points, guesses, strict=True)):
-            try:
-                self.require_admissible(point)
-            except InadmissibleError as error:
-                refused[i] = error
-            else:
-                way = self.way(point, guess)
-                assert way is not None
-                ways[i] = way
-        starts = [(way, guesses[i]) for i, way in ways.items()]
-        zero = np.zeros(equations.size)
-        found = find_together(equations, self.spec.solver, zero, starts, self.reference.solve_uncounted)
-        outcomes = dict(zip(ways, found, strict=True))
-        equations.latest.begin()  # the last factor may be that of any of them
-        for i, point in enumerate(points):
-            state = refused[i] if i in refused else outcomes[i].found
-            yield state if isinstance(state, SolveError) else self.solution(point, state, outcomes[i].work, ways[i])
+    def _solve_together(self, starts: Iterable[tuple[FloatArray, Guess]]) -> Iterator[Solution | SolveError]:
+        equations, zero = self.equations, np.zeros(self.equations.size)
+        begun: deque[tuple[FloatArray, _Way | None, Work]] = deque()
+
+        def tasks() -> Iterator[Task[Found]]:
+            for point, guess in starts:
+                way, work = None, Work()
+                try:
+                    self.require_admissible(point)
+                except InadmissibleError as error:
+                    one = refused(error)
+                else:
+                    way = self.way(point, guess)
+                    assert way is not None
+                    one = task(equations, self.spec.solver, zero, way, guess, work)
+                begun.append((point, way, work))
+                yield one
+
+        def solve(right: FloatArray) -> FloatArray:
+            way = begun[0][1]
+            if way is not None and self.reference.prepare(way.reference):  # others may have had theirs meanwhile
+                self.reference.prepare_screen()
+            return self.reference.solve_uncounted(right)
+
+        for found in finish_all(tasks(), solve, self.together):
+            equations.latest.begin()  # the last factor may be that of any of them
+            point, way, work = begun.popleft()
+            yield found if isinstance(found, SolveError) else self.solution(point, found, work, way)
 
     def require_admissible(self, parameters: FloatArray) -> None:
         """Refuse parameters (d,) for which there is no model."""
@@ -355,6 +362,11 @@ class _Way:
         if not self._screen or self.rotation is None:
             return NOT_SCREENED
         return (yield from self._factor.screen(u, residual.vector, self.rotation))
+
+    def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
+        if not self._screen or self.rotation is None:
+            return False
+        return (yield from self._factor.definite(u, residual.vector, self.rotation))
 
     def at(self, fraction: float) -> None:
         self._fraction = fraction

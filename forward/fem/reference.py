@@ -10,12 +10,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from forward.fem.equations import Discretisation
-from forward.model import FloatArray, ReferenceSolution, Work
+from forward.model import FloatArray, ReferenceSolution, SolveError, Work
 from forward.solvers.anderson import Inverse
+from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.linear import LinearSolver
 from forward.solvers.rotations import Turned, rotations, turn
 from forward.solvers.stability import BLOCK, Rows, Screened, screen, screening_vectors
-from forward.solvers.steps import Corrector, Steps, finished
+from forward.solvers.steps import Corrector, Steps, finished, through
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
@@ -31,17 +32,22 @@ class ReferenceFactor:
         self._reference: ReferenceSolution | None = None
         self._slopes: FloatArray | None = None
         self._vectors: FloatArray | None = None
+        self._random: FloatArray | None = None  # forces that Lanczos' process begins with
         self._screening: LinearSolver | None = None  # where the stiffness is not symmetric
 
-    def prepare(self, reference: ReferenceSolution) -> None:
-        """Factorise at a reference, unless the current factor is its own; this changes parameters and state."""
+    def prepare(self, reference: ReferenceSolution) -> bool:
+        """Factorise at a reference, unless the current factor is its own; this changes parameters and state.
+
+        Returns whether there was another factor, or none.
+        """
         if self._reference is not None and self._reference.same(reference):
-            return
+            return False
         self._reference = self._slopes = self._vectors = None
         equations = self._set(reference)
         self._solver.factorise()
         self._rotations = rotations(equations.gradients())
         self._reference = reference
+        return True
 
     def release(self) -> None:
         """Free the factor, if there is one."""
@@ -165,6 +171,28 @@ class ReferenceFactor:
         )
         # Where the stiffness is not symmetric, its symmetric part has a factor of its own.
         return steps if equations.symmetric else finished(steps, self._counted(self._definite()))
+
+    def definite(self, u: FloatArray, imbalance: FloatArray, R: FloatArray) -> Steps[bool]:
+        """Whether the stiffness at a state u (U_local,) with its imbalance, rotated by R, is surely positive definite.
+
+        Seen by Lanczos' process with the factor, where that is positive definite itself. False says nothing.
+        """
+        equations = self._equations
+        if not equations.symmetric or equations.unknowns.pressures > 0:
+            return False
+        if self._random is None:
+            random = np.random.default_rng(1).standard_normal((1, equations.layout.size))
+            self._random = equations.layout.scatter(random)[0] * equations.free_displacements
+        steps = negative_eigenvalues(
+            lambda row: equations.stiffness_near(u, imbalance, row[None])[0],
+            self._random,
+            equations.total,
+            equations.layout.size,
+        )
+        try:
+            return (yield from through(steps, Turned(R, equations.fixed))) == 0
+        except SolveError:
+            return False
 
     def rotation(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to a state u (U_local,)."""

@@ -8,14 +8,15 @@ when to stop, what to do if the reference is too far away) is each sample's own
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import NamedTuple, Protocol
+from itertools import groupby
+from typing import Protocol, TypeVar
 
-from forward.model import FloatArray, Guess, SolveError, Work
+from forward.model import FloatArray, Guess, ReferenceSolution, SolveError, Work
 from forward.solvers.equilibrium import solving
 from forward.solvers.settings import SolverSettings
-from forward.solvers.steps import Task, finish_all
+from forward.solvers.steps import Task, failed
 from forward.solvers.system import Found, System, Way
 
 
@@ -26,42 +27,40 @@ class ResumableWay(Way, Protocol):
         """Set the equations to where they were on this path, and count their work and back-substitutions there."""
 
 
-class Outcome(NamedTuple):
-    """What became of a point.
+P = TypeVar("P")
 
-    Attributes
-    ----------
-    found
-        The state, or why there is none.
-    work
-        What it took.
+
+def by_reference(pairs: Iterable[tuple[P, Guess | None]]) -> Iterator[tuple[bool, Iterator[tuple[P, Guess]]]]:
+    """Group consecutive points, with their guesses, by the reference from which their states are predicted.
+
+    Yields
+    ------
+    tuple
+        Whether states of the group are predicted from one reference, and the group.
     """
+    last: ReferenceSolution | None = None
 
-    found: Found | SolveError
-    work: Work
+    def reference(pair: tuple[P, Guess | None]) -> ReferenceSolution | None:
+        nonlocal last
+        guess = pair[1]
+        if guess is None or guess.state is None or guess.reference is None:
+            return None
+        if last is None or not last.same(guess.reference):
+            last = guess.reference
+        return last
+
+    for one, group in groupby(pairs, reference):
+        yield one is not None, ((point, guess or Guess()) for point, guess in group)
 
 
-def from_one_reference(guesses: Sequence[Guess | None]) -> list[Guess] | None:
-    """Return the guesses if all of them predict a state from the same reference."""
-    found = [guess for guess in guesses if guess is not None and guess.state is not None]
-    references = [guess.reference for guess in found if guess.reference is not None]
-    if len(references) < len(guesses) or not all(references[0].same(other) for other in references[1:]):
-        return None
-    return found
+def task(
+    system: System, settings: SolverSettings, zero: FloatArray, way: ResumableWay, guess: Guess, work: Work
+) -> Task[Found]:
+    """Return the search for an equilibrium from a prediction, among others; its work is added to `work`."""
+    steps = solving(system, settings, zero, guess.state, way, guess.iterations)
+    return Task(steps, partial(way.resume, work))
 
 
-def find_together(
-    system: System,
-    settings: SolverSettings,
-    zero: FloatArray,
-    starts: Sequence[tuple[ResumableWay, Guess]],
-    solve: Callable[[FloatArray], FloatArray],
-) -> list[Outcome]:
-    """Find equilibria from predictions with one reference, whose factor solves for (k, n) right-hand sides."""
-    works = [Work() for _ in starts]
-    tasks = [
-        Task(solving(system, settings, zero, guess.state, way, guess.iterations), partial(way.resume, work))
-        for (way, guess), work in zip(starts, works, strict=True)
-    ]
-    results = finish_all(tasks, solve)
-    return [Outcome(found, work) for found, work in zip(results, works, strict=True)]
+def refused(error: SolveError) -> Task[Found]:
+    """Return the search where there is no model."""
+    return Task(failed(error), lambda _: None)

@@ -58,7 +58,7 @@ def accepted(
     """Check that an equilibrium has no inverted cell and is not unstable, or raise `Diverged`.
 
     What counts is the stiffness at the state itself, however it was found. Only with a reference solution may a screen
-    replace counting its negative eigenvalues.
+    replace counting its negative eigenvalues, and Lanczos' process the factor that they are counted with.
     """
     check_jacobian(system, u)
     if settings.accept_unstable:
@@ -70,6 +70,8 @@ def accepted(
             history.append(f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}")
         if way.draw >= seen.chance:
             return Stability.SCREENED
+        if seen.clear and (yield from way.definite(u, residual)):
+            return Stability.COUNTED
     try:
         negative = system.negative_eigenvalues(u)
     except SolveError as error:

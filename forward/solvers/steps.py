@@ -6,7 +6,7 @@ others may use the same equations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -35,6 +35,17 @@ def finish(steps: Steps[T], solve: Callable[[FloatArray], FloatArray]) -> T:
         return result
 
 
+def through(steps: Steps[T], correct: Corrector) -> Steps[T]:
+    """Return a solver whose back-substitutions are those of an approximate inverse."""
+    try:
+        right = next(steps)
+        while True:
+            right = steps.send((yield from correct(right)))
+    except StopIteration as stop:
+        result: T = stop.value
+        return result
+
+
 def finished(steps: Steps[T], solve: Callable[[FloatArray], FloatArray]) -> Steps[T]:
     """Return a solver that asks for nothing: `finish`."""
     return finish(steps, solve)
@@ -57,30 +68,54 @@ class Task(Generic[T]):
     resume: Callable[[int], None]
 
 
-def finish_all(tasks: Sequence[Task[T]], solve: Callable[[FloatArray], FloatArray]) -> list[T | SolveError]:
-    """Make the back-substitutions (k, n) → (k, n) that several solvers ask for together.
+def failed(error: SolveError) -> Steps[T]:
+    """Return a solver that has failed before it asks for anything."""
+    raise error
+    yield  # a generator
 
-    Returns
-    -------
-    list
-        The result of each, or why it has none. One without a result does not change those of the others, but for
-        rounding: how many right-hand sides are solved for at once decides in which order numbers are added.
+
+def finish_all(
+    tasks: Iterable[Task[T]], solve: Callable[[FloatArray], FloatArray], most: int
+) -> Iterator[T | SolveError]:
+    """Make the back-substitutions (k, n) → (k, n) that up to `most` solvers ask for together.
+
+    As one ends, the next begins; no further ahead of the first one that has not ended than twice as many. Which are
+    together depends on them alone, not on when results are asked for.
+
+    Yields
+    ------
+    object
+        The result of each in turn, or why it has none. One without a result does not change those of the others, but
+        for rounding: how many right-hand sides are solved for at once decides in which order numbers are added.
     """
-    results: list[T | SolveError | None] = [None] * len(tasks)
-    active, answers = list(range(len(tasks))), None
-    while active:
-        waiting, rights = [], []
-        for row, i in enumerate(active):
-            task = tasks[i]
-            task.resume(0 if answers is None else 1)
-            try:
-                rights.append(next(task.steps) if answers is None else task.steps.send(answers[row]))
-                waiting.append(i)
-            except StopIteration as stop:
-                results[i] = stop.value
-            except SolveError as error:
-                results[i] = error
-        active = waiting
-        if rights:
-            answers = solve(np.array(rights))
-    return results  # type: ignore[return-value]
+    coming = enumerate(tasks)
+    results: dict[int, T | SolveError] = {}
+    waiting: list[tuple[int, Task[T], FloatArray]] = []  # for the solution of a right-hand side
+    due = 0  # the next result
+    more = True
+
+    def moved(i: int, task: Task[T], answer: FloatArray | None) -> None:
+        task.resume(0 if answer is None else 1)
+        try:
+            waiting.append((i, task, next(task.steps) if answer is None else task.steps.send(answer)))
+        except StopIteration as stop:
+            results[i] = stop.value
+        except SolveError as error:
+            results[i] = error
+
+    while waiting or more:
+        if waiting:
+            answers = solve(np.array([right for _, _, right in waiting]))
+            before, waiting = waiting, []
+            for (i, task, _), answer in zip(before, answers, strict=True):
+                moved(i, task, answer)
+        begun = due + len(results) + len(waiting)
+        while more and len(waiting) < most and begun < due + 2 * most:
+            found = next(coming, None)
+            more = found is not None
+            if found is not None:
+                moved(*found, None)
+                begun += 1
+        while due in results:
+            yield results.pop(due)
+            due += 1

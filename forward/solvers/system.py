@@ -127,6 +127,9 @@ class Way(Protocol):
     def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
         """Find the result of `forward.solvers.stability`'s screen for an equilibrium."""
 
+    def definite(self, u: FloatArray, residual: Residual) -> Steps[bool]:
+        """Whether Lanczos' process shows that the stiffness at an equilibrium is positive definite."""
+
     def at(self, fraction: float) -> None:
         """Set the parameters of the system to those after a fraction of the path."""
 
@@ -151,7 +154,7 @@ class Found(NamedTuple):
     corrected
         Whether it was found with the factor of the reference.
     stability
-        How its stability was tested; if by counting, the last factor is that of the stiffness there.
+        How its stability was tested.
     """
 
     state: FloatArray

@@ -12,9 +12,11 @@ from forward.fem.dolfinx.linear import StiffnessMatrix
 from forward.fem.dolfinx.transfer import Transfer
 from forward.model import FloatArray, SolveError
 from forward.solvers import multigrid
+from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.linear import TIGHT, LinearSolver, NoConvergence
 from forward.solvers.multigrid import MARGIN, Levels
 from forward.solvers.smoothing import minimised
+from forward.solvers.steps import finish
 
 ITERATIONS = 400  # of conjugate gradients
 RESIDUALS = 100  # of generalised conjugate residuals, which remember all directions
@@ -166,7 +168,7 @@ class MultigridSolver:
         if below:
             return below
         levels, size = self._levels, self._stiffness.matrix.getSize()[0]
-        found = multigrid.negative_eigenvalues(levels.multiply, levels.cycle, self._random, self._total, size)
+        found = finish(negative_eigenvalues(levels.multiply, self._random, self._total, size), levels.cycle)
         if found is None:
             message = "the stiffness is nearly singular: its lowest eigenvalue cannot be told from zero"
             raise NoConvergence(message)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from forward.fem import cost, together
+from forward.fem import cost
 from forward.model import Guess, InadmissibleError, SolveError
 from tests.bodies import loaded_body
 from tests.forward.bodies import test_mesh_file
@@ -121,23 +121,46 @@ def test_a_sample_that_fails_leaves_the_others_alone():
 
 
 def test_only_points_with_one_reference_go_together(monkeypatch):
-    calls = []
-    inner = together.finish_all
-    monkeypatch.setattr(together, "finish_all", lambda tasks, solve: calls.append(len(tasks)) or inner(tasks, solve))
+    columns = []
     model, inputs = beam()
+    inner = model.reference.solve_uncounted
+    monkeypatch.setattr(model.reference, "solve_uncounted", lambda right: columns.append(len(right)) or inner(right))
     points, guesses = predicted(model, inputs, 3)
     elsewhere = linearise(inputs, SerialEvaluate(model), inputs.mean * 1.02).prediction.on(model)(points[2])
-    list(model.solve_many(points, guesses))
-    assert calls == [3]
-    list(model.solve_many(points))
-    list(model.solve_many(points, [None, *guesses[1:]]))
-    list(model.solve_many(points, [Guess(guesses[0].state), *guesses[1:]]))
-    list(model.solve_many(points, [*guesses[:2], elsewhere]))
-    assert calls == [3]
+    for start, together in (
+        (guesses, 3),
+        (None, 0),
+        ([None, *guesses[1:]], 2),
+        ([guesses[0], Guess(guesses[1].state), guesses[2]], 0),
+        ([*guesses[:2], elsewhere], 2),
+    ):
+        columns.clear()
+        assert len(list(model.solve_many(points, start))) == 3
+        assert max(columns, default=0) == together
     for changes in (("model.solver.kind='newton'",), ("model.solver.solve_seconds=1e3",)):
         assert beam(*changes)[0].together == 1
     assert cost.together(10**4) == cost.MOST_TOGETHER
     assert 1 <= cost.together(10**6) < cost.together(10**5) < cost.MOST_TOGETHER
+
+
+def test_as_one_ends_the_next_begins(monkeypatch):
+    """More samples than go together; what becomes of the equations between results changes none of them."""
+    model, inputs = beam()
+    points, guesses = predicted(model, inputs, 12)
+    elsewhere = linearise(inputs, SerialEvaluate(model), inputs.mean * 1.02).prediction.on(model)
+    alone = [model.solve(point, guess) for point, guess in zip(points, guesses, strict=True)]
+    monkeypatch.setitem(vars(model), "together", 3)
+    columns, inner = [], model.reference.solve_uncounted
+    monkeypatch.setattr(model.reference, "solve_uncounted", lambda right: columns.append(len(right)) or inner(right))
+    found = list(model.solve_many(points, guesses))
+    assert max(columns) == 3
+    assert len(columns) < 1.3 * sum(columns) / 3  # most of the time there are three
+    for one, other, between in zip(found, alone, model.solve_many(points, guesses), strict=True):
+        np.testing.assert_allclose(one.state, other.state, atol=1e-9)
+        np.testing.assert_array_equal(between.state, one.state)
+        assert between.work == one.work
+        between.tangent(np.eye(2))
+        model.solve(points[0] * 1.01, elsewhere(points[0] * 1.01)).tangent(np.eye(2))
 
 
 SCRIPT = """

@@ -157,6 +157,29 @@ def test_the_answer_does_not_depend_on_the_path(column):
 
 
 @pytest.mark.fem
+def test_lanczos_takes_the_place_of_the_factor_for_counting_where_there_is_nothing_to_count(column, monkeypatch):
+    problem, centre = column
+    model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)
+    guess = centre.prediction.on(model)
+    monkeypatch.setattr(stability.Screened, "clear", property(lambda seen: True))
+    monkeypatch.setattr(stability.Screened, "chance", property(lambda seen: 1.0))
+    refused = 0
+    for load in np.linspace(100, 140, 9):
+        point = np.array([load])
+        try:
+            solution = model.solve(point, guess(point))
+        except SolveError as error:
+            refused += 1
+            assert error.stability == Stability.MISSED
+            assert error.work.factorisations > 0
+        else:
+            assert solution.stability == Stability.COUNTED
+            assert solution.work.factorisations == 0
+            assert model.equations.negative_eigenvalues(solution.state) == 0
+    assert 2 < refused < 6
+
+
+@pytest.mark.fem
 def test_what_a_derivative_sees_counts(column, monkeypatch):
     problem, centre = column
     model = problem.spec.build(MPI.COMM_SELF, problem.inputs.names)

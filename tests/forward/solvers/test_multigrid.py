@@ -7,7 +7,9 @@ from mpi4py import MPI
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, SolveError, Stability
 from forward.solvers import multigrid
+from forward.solvers.lanczos import negative_eigenvalues
 from forward.solvers.multigrid import Levels
+from forward.solvers.steps import finish
 from tests.launch import run_script
 
 pytestmark = pytest.mark.fem
@@ -140,7 +142,7 @@ def test_the_cycle_is_positive_for_every_stiffness(shift):
     assert (np.linalg.eigvalsh(M)[0] > 0) == coarse
     if coarse:
         start = np.random.default_rng(1).standard_normal(len(K))
-        found = multigrid.negative_eigenvalues(one.multiply, one.cycle, start, lambda values: values, len(K))
+        found = finish(negative_eigenvalues(one.multiply, start, lambda values: values, len(K)), one.cycle)
         assert found == (np.linalg.eigvalsh(K) < 0).sum()
 
 
@@ -153,19 +155,19 @@ def test_a_single_negative_eigenvalue_is_found_from_any_start():
         K = (vectors * values) @ vectors.T
         for _ in range(5):
             start = rng.standard_normal(n)
-            assert multigrid.negative_eigenvalues(lambda x, K=K: K @ x, lambda x: x, start, lambda v: v, n) == 1
+            assert finish(negative_eigenvalues(lambda x, K=K: K @ x, start, lambda v: v, n), lambda x: x) == 1
 
 
 def test_what_is_nearly_singular_is_not_called_stable():
     n = 400
     values = np.logspace(-9, 0, n)
     start = np.random.default_rng(0).standard_normal(n)
-    assert multigrid.negative_eigenvalues(lambda x: values * x, lambda x: x, start, lambda v: v, n) is None
+    assert finish(negative_eigenvalues(lambda x: values * x, start, lambda v: v, n), lambda x: x) is None
 
 
 def test_a_preconditioner_that_is_not_positive_is_refused():
     with pytest.raises(SolveError, match="not positive"):
-        multigrid.negative_eigenvalues(lambda x: x, lambda x: -x, np.ones(5), lambda v: v, 5)
+        finish(negative_eigenvalues(lambda x: x, np.ones(5), lambda v: v, 5), lambda x: -x)
 
 
 def test_conjugate_gradients_report_a_direction_of_negative_energy():

@@ -1,0 +1,69 @@
+"""Solvers that ask for back-substitutions, many at once."""
+
+import numpy as np
+import pytest
+
+from forward.model import SolveError
+from forward.solvers.steps import Task, failed, finish, finish_all, through
+
+
+def asking(times, value):
+    """Ask for so many solutions, starting with a value; return the last."""
+    x = np.array([float(value)])
+    for _ in range(times):
+        x = yield x
+    return float(x[0])
+
+
+def run(lengths, most, broken=()):
+    columns, begun = [], []
+
+    def doubled(rights):
+        columns.append(len(rights))
+        return 2 * rights
+
+    def tasks():
+        for i, length in enumerate(lengths):
+            begun.append(i)
+            yield Task(failed(SolveError("broken")) if i in broken else asking(length, i), lambda _: None)
+
+    seen = []
+    for result in finish_all(tasks(), doubled, most):
+        seen.append(result)
+        assert len(begun) <= len(seen) + 2 * most
+    return seen, columns
+
+
+@pytest.mark.parametrize("most", [1, 3, 50])
+def test_results_come_in_turn_whatever_is_together(most):
+    lengths = [3, 1, 0, 9, 2, 2, 0, 0, 5, 1, 1, 4]
+    seen, columns = run(lengths, most)
+    assert seen == [i * 2.0**n for i, n in enumerate(lengths)]
+    assert sum(columns) == sum(lengths)
+    assert max(columns) == min(most, sum(n > 0 for n in lengths))
+
+
+def test_as_many_as_possible_are_together():
+    _, columns = run([1, 2, 3, 4] * 25, 4)
+    assert columns[:-4] == [4] * (len(columns) - 4)
+
+
+def test_one_that_takes_long_does_not_let_results_pile_up():
+    seen, columns = run([40] + [1] * 30, 4)
+    assert seen[1:] == [2.0 * i for i in range(1, 31)]
+    assert columns[0] == 4
+    assert 1 in columns  # the others wait for the first
+
+
+def test_what_fails_is_returned_in_its_place():
+    seen, _ = run([2, 2, 2, 2], 2, broken={1, 3})
+    assert [isinstance(one, SolveError) for one in seen] == [False, True, False, True]
+    assert seen[2] == 8.0
+    assert run([], 4) == ([], [])
+
+
+def test_a_solver_through_an_approximate_inverse():
+    def halved(x):
+        return (yield x / 2) + 1
+
+    assert finish(through(asking(3, 8.0), halved), lambda x: 2 * x) == 11.0
